@@ -1,0 +1,1 @@
+"""What ships: C projects of one observer step."""

@@ -1,0 +1,1 @@
+"""What estimates: LMIs, certificates and observers."""

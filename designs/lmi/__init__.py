@@ -1,0 +1,1 @@
+"""Affine matrix expressions, conic solvers and proofs of definiteness."""
