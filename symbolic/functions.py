@@ -1,0 +1,191 @@
+"""The functions that equations may use: their name, their SymPy and their CasADi form."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import sympy as sp
+
+__all__ = ["ALIASES", "BY_CLASS", "BY_NAME", "NamedFunction", "phi1", "tanhc"]
+
+# Inside |x| < 1/8 a quotient by x is replaced by its Taylor polynomial, whose first term
+# left out is below 1e-16 there. A constant patch would have a wrong derivative, and a
+# division by x itself would have no bound on an interval that contains zero.
+_PATCH = 1.0 / 8.0
+_SINC = (1, -6, 120, -5040, 362880, -39916800)
+_PHI1 = (1, 2, 6, 24, 120, 720, 5040, 40320, 362880, 3628800, 39916800)
+_TANHC = (
+    1.0,
+    -1.0 / 3.0,
+    2.0 / 15.0,
+    -17.0 / 315.0,
+    62.0 / 2835.0,
+    -1382.0 / 155925.0,
+    21844.0 / 6081075.0,
+    -929569.0 / 638512875.0,
+)
+
+
+class phi1(sp.Function):  # type: ignore[misc]
+    """(exp(x) - 1)/x, continued by 1 at x = 0.
+
+    Examples
+    --------
+    >>> phi1(sp.Integer(0))
+    1
+    """
+
+    nargs = 1
+
+    @classmethod
+    def eval(cls, x: sp.Expr) -> sp.Expr | None:
+        """Return the value at zero; keep everything else as it is."""
+        return sp.Integer(1) if x.is_zero else None
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the derivative, as a quotient away from zero."""
+        x = self.args[0]
+        return sp.Piecewise(((sp.exp(x) - phi1(x)) / x, sp.Ne(x, 0)), (sp.Rational(1, 2), True))
+
+    def _eval_is_extended_real(self) -> bool | None:
+        return True if self.args[0].is_extended_real else None
+
+    def _eval_evalf(self, prec: int) -> sp.Expr | None:
+        x = self.args[0]._eval_evalf(prec + 60)
+        if x is None or not x.is_number:
+            return None
+        return ((sp.exp(x) - 1) / x)._eval_evalf(prec)
+
+
+class tanhc(sp.Function):  # type: ignore[misc]
+    """tanh(x)/x, continued by 1 at x = 0.
+
+    Examples
+    --------
+    >>> tanhc(sp.Integer(0))
+    1
+    """
+
+    nargs = 1
+
+    @classmethod
+    def eval(cls, x: sp.Expr) -> sp.Expr | None:
+        """Return the value at zero; an even function drops its argument's sign."""
+        if x.is_zero:
+            return sp.Integer(1)
+        return cls(-x) if x.could_extract_minus_sign() else None
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the derivative, as a quotient away from zero."""
+        x = self.args[0]
+        slope = (1 - sp.tanh(x) ** 2 - tanhc(x)) / x
+        return sp.Piecewise((slope, sp.Ne(x, 0)), (0, True))
+
+    def _eval_is_extended_real(self) -> bool | None:
+        return True if self.args[0].is_extended_real else None
+
+    def _eval_evalf(self, prec: int) -> sp.Expr | None:
+        x = self.args[0]._eval_evalf(prec + 60)
+        if x is None or not x.is_number:
+            return None
+        return (sp.tanh(x) / x)._eval_evalf(prec)
+
+
+def _patched(x: ca.SX, numerator: ca.SX, variable: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:
+    """Return numerator/x, or the polynomial in ``variable`` near zero."""
+    polynomial = ca.SX(coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        polynomial = polynomial * variable + coefficient
+    quotient = x * numerator / ca.fmax(x * x, _PATCH**2)
+    return ca.if_else(ca.fabs(x) < _PATCH, polynomial, quotient)
+
+
+def _sinc(x: ca.SX) -> ca.SX:
+    return _patched(x, ca.sin(x), x * x, tuple(1.0 / c for c in _SINC))
+
+
+def _phi1(x: ca.SX) -> ca.SX:
+    return _patched(x, ca.expm1(x), x, tuple(1.0 / c for c in _PHI1))
+
+
+def _tanhc(x: ca.SX) -> ca.SX:
+    return _patched(x, ca.tanh(x), x * x, _TANHC)
+
+
+def _heaviside(x: ca.SX, at_zero: ca.SX | None = None) -> ca.SX:
+    middle = ca.SX(0.5) if at_zero is None else at_zero
+    return ca.if_else(x > 0, 1.0, ca.if_else(x < 0, 0.0, middle))
+
+
+def _fold(binary: Callable[[Any, Any], Any]) -> Callable[..., Any]:
+    def folded(*items: Any) -> Any:
+        result = items[0]
+        for item in items[1:]:
+            result = binary(result, item)
+        return result
+
+    return folded
+
+
+@dataclass(frozen=True)
+class NamedFunction:
+    """A function by its name in text, its SymPy constructor and its CasADi builder.
+
+    Parameters
+    ----------
+    name : str
+        The name in text.
+    sympy : callable
+        Builds the SymPy expression from SymPy arguments.
+    casadi : callable
+        Builds the SX expression from SX arguments.
+    least, most : int or None
+        How many arguments it takes; ``most=None`` is any number.
+    """
+
+    name: str
+    sympy: Callable[..., Any]
+    casadi: Callable[..., Any]
+    least: int = 1
+    most: int | None = 1
+
+
+_TABLE = (
+    NamedFunction("sqrt", sp.sqrt, ca.sqrt),
+    NamedFunction("exp", sp.exp, ca.exp),
+    NamedFunction("log", sp.log, ca.log),
+    NamedFunction("sin", sp.sin, ca.sin),
+    NamedFunction("cos", sp.cos, ca.cos),
+    NamedFunction("tan", sp.tan, ca.tan),
+    NamedFunction("asin", sp.asin, ca.asin),
+    NamedFunction("acos", sp.acos, ca.acos),
+    NamedFunction("atan", sp.atan, ca.atan),
+    NamedFunction("atan2", sp.atan2, ca.atan2, 2, 2),
+    NamedFunction("sinh", sp.sinh, ca.sinh),
+    NamedFunction("cosh", sp.cosh, ca.cosh),
+    NamedFunction("tanh", sp.tanh, ca.tanh),
+    NamedFunction("asinh", sp.asinh, ca.asinh),
+    NamedFunction("acosh", sp.acosh, ca.acosh),
+    NamedFunction("atanh", sp.atanh, ca.atanh),
+    NamedFunction("Abs", sp.Abs, ca.fabs),
+    NamedFunction("sign", sp.sign, ca.sign),
+    NamedFunction("floor", sp.floor, ca.floor),
+    NamedFunction("ceiling", sp.ceiling, ca.ceil),
+    NamedFunction("erf", sp.erf, ca.erf),
+    NamedFunction("Max", sp.Max, _fold(ca.fmax), 1, None),
+    NamedFunction("Min", sp.Min, _fold(ca.fmin), 1, None),
+    NamedFunction("Heaviside", sp.Heaviside, _heaviside, 1, 2),
+    NamedFunction("sinc", sp.sinc, _sinc),
+    NamedFunction("phi1", phi1, _phi1),
+    NamedFunction("tanhc", tanhc, _tanhc),
+)
+
+BY_NAME = {function.name: function for function in _TABLE}
+"""Every supported function under the name it has in text."""
+
+BY_CLASS = {function.sympy: function for function in _TABLE if isinstance(function.sympy, type)}
+"""The same under the SymPy class; ``sqrt`` is a power there and has none."""
+
+ALIASES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "fabs": "Abs", "ceil": "ceiling"}
+"""Other spellings the reader of text accepts."""

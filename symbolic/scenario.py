@@ -1,0 +1,193 @@
+"""Scenarios: what happens to a plant, as a value that simulation only runs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.symbolic.errors import PlantError
+
+if TYPE_CHECKING:
+    from obsynth.symbolic.plant import Plant
+
+__all__ = ["Scenario"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """Initial state, inputs, faults and disturbances over the samples 0..steps.
+
+    Parameters
+    ----------
+    name : str
+        What plots and tables call it.
+    steps : int
+        N; the samples are 0..N.
+    x0 : array (n,)
+        The plant's true initial state.
+    guess : array (n,)
+        What the observer believes at the start.
+    inputs : array (N+1, n_u) or callable
+        Samples, or a function of k, or a feedback (k, y) for a plant without feed-through.
+    faults : array (N+1, n_f), optional
+        None: no fault.
+    unknown_inputs : array (N+1, n_d), optional
+        None: zero.
+    scheduling : array (N+1, n_rho), optional
+        None: nominal value, or the middle of the range.
+    disturbances : array (N+1, n_w) or callable (rng, k) -> array, optional
+        None: uniform in the declared box.
+    x_range : array (n, 2), optional
+        Box of the initial state that a design may assume.
+    f_range : array (n_f, 2), optional
+        Box of the initial fault that a design may assume.
+    feedback : bool
+        True when ``inputs`` is a function of (k, y).
+
+    Raises
+    ------
+    PlantError
+        Data that are not finite or not shaped for N + 1 samples.
+
+    Examples
+    --------
+    >>> Scenario("step", 3, x0=[1], guess=[0], inputs=np.ones((4, 1))).steps
+    3
+    """
+
+    name: str
+    steps: int
+    x0: Array
+    guess: Array
+    inputs: Array | Callable[..., ArrayLike]
+    faults: Array | None = None
+    unknown_inputs: Array | None = None
+    scheduling: Array | None = None
+    disturbances: Array | Callable[[np.random.Generator, int], ArrayLike] | None = None
+    x_range: Array | None = None
+    f_range: Array | None = None
+    feedback: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
+            raise PlantError(f"scenario {self.name!r}: steps={self.steps!r} is no positive integer")
+        object.__setattr__(self, "x0", self._array("x0", self.x0, (None,)))
+        object.__setattr__(self, "guess", self._array("guess", self.guess, self.x0.shape))
+        for field in ("inputs", "faults", "unknown_inputs", "scheduling", "disturbances"):
+            value = getattr(self, field)
+            if value is not None and not callable(value):
+                object.__setattr__(self, field, self._array(field, value, (self.steps + 1, None)))
+        for field, count in (("x_range", len(self.x0)), ("f_range", None)):
+            value = getattr(self, field)
+            if value is not None:
+                box = self._array(field, value, (count, 2))
+                if np.any(box[:, 0] > box[:, 1]):
+                    raise PlantError(f"scenario {self.name!r}: {field} has lower above upper")
+                object.__setattr__(self, field, box)
+
+    def arrays(self, model: "Plant", seed: int | None = 0) -> dict[str, Array | None]:
+        """Return the samples of u, d, f, w and rho for a plant.
+
+        Parameters
+        ----------
+        model : Plant
+            Tells how many signals there are and where unspecified ones lie.
+        seed : int, optional
+            Seed of the disturbances.
+
+        Returns
+        -------
+        dict
+            Arrays (N+1, number of signals); ``u`` is None when the inputs are a feedback.
+
+        Raises
+        ------
+        PlantError
+            The scenario does not fit the plant, or an unbounded disturbance has no samples.
+
+        Examples
+        --------
+        >>> from obsynth.symbolic.plants import quadruple_tank
+        >>> from obsynth.symbolic.scenarios import quadruple_tank as scenario
+        >>> scenario("FS1").arrays(quadruple_tank(), seed=0)["w"].shape
+        (5001, 3)
+        """
+        if len(self.x0) != len(model.x):
+            raise PlantError(
+                f"scenario {self.name!r} has {len(self.x0)} initial states, "
+                f"plant {model.name!r} {len(model.x)}"
+            )
+        samples = self.steps + 1
+        u = None
+        if not self.feedback:
+            values = self.inputs
+            if callable(values):
+                values = np.array([np.ravel(values(k)) for k in range(samples)], dtype=np.float64)
+            u = self._fit("inputs", values, model.names("u"))
+        middle = [_middle(s.lower, s.upper, s.nominal) for s in model.rho]
+        return {
+            "u": u,
+            "d": self._fit("unknown_inputs", self.unknown_inputs, model.names("d")),
+            "f": self._fit("faults", self.faults, model.names("f")),
+            "w": self._disturbances(model, seed),
+            "rho": self._fit("scheduling", self.scheduling, model.names("rho"), middle),
+        }
+
+    def _disturbances(self, model: "Plant", seed: int | None) -> Array:
+        rng = np.random.default_rng(seed)
+        samples = self.steps + 1
+        if self.disturbances is None:
+            box = model.box("w")
+            if not np.all(np.isfinite(box)):
+                raise PlantError(
+                    f"scenario {self.name!r}: plant {model.name!r} has unbounded disturbances; "
+                    "give disturbances= as samples or as a function (rng, k)"
+                )
+            return rng.uniform(box[:, 0], box[:, 1], (samples, len(box)))
+        values = self.disturbances
+        if callable(values):
+            values = np.array([np.ravel(values(rng, k)) for k in range(samples)], dtype=np.float64)
+        return self._fit("disturbances", values, model.names("w"))
+
+    def _fit(
+        self, field: str, value: Any, names: tuple[str, ...], default: list[float] | None = None
+    ) -> Array:
+        shape = (self.steps + 1, len(names))
+        if value is None:
+            return (
+                np.broadcast_to(np.zeros(len(names)) if default is None else default, shape) + 0.0
+            )
+        if np.shape(value) != shape:
+            raise PlantError(
+                f"scenario {self.name!r}: {field} has shape {np.shape(value)}, "
+                f"the plant needs {shape} ({', '.join(names) or 'no such signals'})",
+                field=field,
+            )
+        return self._array(field, value, shape)
+
+    def _array(self, field: str, value: Any, shape: tuple[int | None, ...]) -> Array:
+        array = np.array(value, dtype=np.float64)
+        fits = array.ndim == len(shape) and all(
+            want is None or have == want for have, want in zip(array.shape, shape, strict=True)
+        )
+        if not fits:
+            wanted = ", ".join("any" if want is None else str(want) for want in shape)
+            raise PlantError(
+                f"scenario {self.name!r}: {field} has shape {array.shape}, not ({wanted})",
+                field=field,
+            )
+        if not np.all(np.isfinite(array)):
+            raise PlantError(f"scenario {self.name!r}: {field} holds non-finite data", field=field)
+        array.flags.writeable = False
+        return array
+
+
+def _middle(lower: float, upper: float, nominal: float | None) -> float:
+    if nominal is not None:
+        return nominal
+    middle = (lower + upper) / 2.0
+    return middle if np.isfinite(middle) else 0.0
