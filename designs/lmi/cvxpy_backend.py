@@ -1,0 +1,137 @@
+"""The same problem in cvxpy: transparent, any solver, and the second opinion in tests."""
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi.expression import Affine
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.solution import Solution
+from obsynth.designs.lmi.variables import Structure, Variable
+
+__all__ = ["solve_with_cvxpy", "to_cvxpy"]
+
+
+def to_cvxpy(problem: Problem) -> Any:
+    """Translate; see :meth:`Problem.to_cvxpy`.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to translate.
+
+    Returns
+    -------
+    cvxpy.Problem
+        One constraint per vertex, variables with the names of the problem.
+
+    Examples
+    --------
+    >>> from obsynth.designs.lmi import Problem, symmetric, trace
+    >>> problem = Problem()
+    >>> P = symmetric("P", 2)
+    >>> problem.add("floor", P >> np.eye(2))
+    >>> problem.minimise(trace(P))
+    >>> round(float(to_cvxpy(problem).solve(solver="CLARABEL")), 5)
+    2.0
+    """
+    import cvxpy as cp
+
+    unknowns = {v: _variable(v) for v in problem.variables.values()}
+    constraints: list[Any] = []
+    for item in problem.blocks.values():
+        for k in range(item.expression.members or 1):
+            matrix = _matrix(item.expression.member(k), unknowns)
+            if item.cone == "psd":
+                constraints.append(0.5 * (matrix + matrix.T) >> 0)
+            elif item.cone == "nonnegative":
+                constraints.append(matrix >= 0)
+            elif item.cone == "zero":
+                constraints.append(matrix == 0)
+            else:
+                constraints.append(cp.ExpCone(matrix[:, 0], matrix[:, 1], matrix[:, 2]))
+    goal = cp.sum(_matrix(problem.objective, unknowns))
+    return cp.Problem(cp.Maximize(goal) if problem.maximising else cp.Minimize(goal), constraints)
+
+
+def solve_with_cvxpy(
+    problem: Problem, solver: str, *, accept_inaccurate: bool = False, **options: Any
+) -> Solution:
+    """Solve by any solver cvxpy knows.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to solve.
+    solver : str
+        cvxpy's name, as ``"SCS"`` or ``"SDPA"``.
+    accept_inaccurate : bool
+        Return any outcome flagged instead of raising.
+    **options
+        Passed to the solver.
+
+    Raises
+    ------
+    InfeasibleDesign, SolverTrouble
+        As :meth:`Problem.solve`.
+    """
+    import cvxpy as cp
+
+    translated = to_cvxpy(problem)
+    try:
+        translated.solve(solver=solver, **options)
+    except cp.error.SolverError as trouble:
+        raise SolverTrouble(
+            f"{problem.name}: {solver} failed", [str(trouble).splitlines()[0]], solver=solver
+        ) from trouble
+    status = str(translated.status)
+    found = translated.var_dict
+    values = {
+        name: _value(found.get(name), variable) for name, variable in problem.variables.items()
+    }
+    statistics = translated.solver_stats
+    solution = Solution(
+        values=values,
+        status=status,
+        solved=status == "optimal",
+        objective=float(translated.value) if translated.value is not None else np.nan,
+        solver=solver,
+        solve_time=float(statistics.solve_time or 0.0),
+        iterations=int(statistics.num_iters or 0),
+    )
+    if solution.solved or accept_inaccurate:
+        return solution
+    kind = InfeasibleDesign if status == "infeasible" else SolverTrouble
+    raise kind(f"{problem.name}: {solver} ended with {status}", **solution.facts())
+
+
+def _variable(variable: Variable) -> Any:
+    import cvxpy as cp
+
+    options = {
+        Structure.SYMMETRIC: {"symmetric": True},
+        Structure.DIAGONAL: {"diag": True},
+    }.get(variable.structure, {})
+    return cp.Variable(variable.shape, name=variable.name, **options)
+
+
+def _matrix(expression: Affine, unknowns: dict[Variable, Any]) -> Any:
+    import cvxpy as cp
+
+    stacked = expression.constant.T.ravel()
+    for variable, operator in expression.terms.items():
+        rows, columns = variable.free_entries
+        entries = cp.vec(unknowns[variable], order="F")[columns * variable.shape[0] + rows]
+        stacked = stacked + operator @ entries
+    if not expression.terms:
+        return cp.Constant(expression.constant)
+    return cp.reshape(stacked, expression.shape, order="F")
+
+
+def _value(found: Any, variable: Variable) -> np.ndarray[Any, np.dtype[np.float64]]:
+    value = None if found is None else found.value
+    if value is None:
+        return np.full(variable.shape, np.nan)
+    dense = value.toarray() if hasattr(value, "toarray") else value
+    return np.asarray(dense, dtype=float).reshape(variable.shape)

@@ -1,0 +1,222 @@
+"""Exact rational matrices: the independent check of a proof of definiteness.
+
+Every double is a rational with a power of two below, so the blocks of an LMI can be formed
+without any rounding and decided by elimination over the integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["ExactMatrix", "is_positive_definite"]
+
+
+@dataclass(frozen=True, eq=False)
+class ExactMatrix:
+    """A rational matrix with the operators of the other arithmetics.
+
+    Parameters
+    ----------
+    entries : flint.fmpq_mat
+        The value; use :meth:`of` to make one from doubles, integers or fractions.
+
+    Examples
+    --------
+    >>> third = ExactMatrix.of([[Fraction(1, 3)]])
+    >>> (3 * third).to_fractions()
+    [[Fraction(1, 1)]]
+    """
+
+    entries: Any
+
+    __array_ufunc__ = None
+
+    @classmethod
+    def of(cls, value: Any) -> ExactMatrix:
+        """From a number, a nested sequence of numbers or an array, without rounding."""
+        from flint import fmpq_mat
+
+        if isinstance(value, ExactMatrix):
+            return value
+        array = np.asarray(value, dtype=object)
+        if array.ndim == 0:
+            array = array.reshape(1, 1)
+        if array.ndim != 2:
+            raise ObsynthError(
+                f"an exact matrix of shape {array.shape}: take one vertex of a family at a time",
+                shape=array.shape,
+            )
+        return cls(fmpq_mat(*array.shape, [_rational(x) for x in array.ravel()]))
+
+    @classmethod
+    def from_blocks(cls, rows: Sequence[Sequence[ExactMatrix]]) -> ExactMatrix:
+        """Matrix of blocks whose sizes fit."""
+        table = [
+            [x for cell in row for x in cell.entries.table()[i]]
+            for row in rows
+            for i in range(row[0].shape[0])
+        ]
+        from flint import fmpq_mat
+
+        return cls(fmpq_mat(table))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.entries.nrows(), self.entries.ncols()
+
+    @property
+    def T(self) -> ExactMatrix:
+        """Transpose."""
+        return ExactMatrix(self.entries.transpose())
+
+    def to_fractions(self) -> list[list[Fraction]]:
+        """Nested list of fractions."""
+        return [[Fraction(int(x.p), int(x.q)) for x in row] for row in self.entries.table()]
+
+    def to_floats(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Entries rounded to the nearest double."""
+        return np.array([[float(x) for x in row] for row in self.to_fractions()])
+
+    def inverse(self) -> ExactMatrix:
+        """Exact inverse; a singular matrix raises."""
+        try:
+            return ExactMatrix(self.entries.inv())
+        except ZeroDivisionError:
+            raise ObsynthError(f"the exact {self.shape} matrix is singular") from None
+
+    def __getitem__(self, key: Any) -> ExactMatrix:
+        numbers = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
+        rows, columns = key if isinstance(key, tuple) else (key, slice(None))
+        rows, columns = (
+            slice(k, k + 1 or None) if isinstance(k, (int, np.integer)) else k
+            for k in (rows, columns)
+        )
+        picked = numbers[rows, :][:, columns]
+        from flint import fmpq_mat
+
+        flat = self.entries.entries()
+        return ExactMatrix(fmpq_mat(*picked.shape, [flat[i] for i in picked.ravel()]))
+
+    def __neg__(self) -> ExactMatrix:
+        return ExactMatrix(-self.entries)
+
+    def __add__(self, other: Any) -> ExactMatrix:
+        if _is_zero(other):
+            return self
+        right = ExactMatrix.of(other)
+        _check_shapes(self, right)
+        return ExactMatrix(self.entries + right.entries)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> ExactMatrix:
+        return self if _is_zero(other) else self + (-ExactMatrix.of(other))
+
+    def __rsub__(self, other: Any) -> ExactMatrix:
+        return -self if _is_zero(other) else ExactMatrix.of(other) - self
+
+    def __mul__(self, other: Any) -> ExactMatrix:
+        left, right = self, ExactMatrix.of(other)
+        if left.shape == (1, 1):
+            return ExactMatrix(right.entries * left.entries[0, 0])
+        if right.shape == (1, 1):
+            return ExactMatrix(left.entries * right.entries[0, 0])
+        _check_shapes(left, right)
+        from flint import fmpq_mat
+
+        pairs = zip(left.entries.entries(), right.entries.entries(), strict=True)
+        return ExactMatrix(fmpq_mat(*left.shape, [a * b for a, b in pairs]))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> ExactMatrix:
+        divisor = ExactMatrix.of(other)
+        if divisor.shape != (1, 1) or divisor.entries[0, 0] == 0:
+            raise ObsynthError("an exact matrix is divided by a number that is not zero")
+        return ExactMatrix(self.entries * (1 / divisor.entries[0, 0]))
+
+    def __rtruediv__(self, other: Any) -> ExactMatrix:
+        return ExactMatrix.of(other) / self
+
+    def __matmul__(self, other: Any) -> ExactMatrix:
+        return ExactMatrix(self.entries * ExactMatrix.of(other).entries)
+
+    def __rmatmul__(self, other: Any) -> ExactMatrix:
+        return ExactMatrix.of(other) @ self
+
+
+def is_positive_definite(matrix: Any) -> bool:
+    """Decide definiteness exactly, by the signs of the leading minors.
+
+    Parameters
+    ----------
+    matrix : ExactMatrix, or anything :meth:`ExactMatrix.of` takes
+        Square and exactly symmetric.
+
+    Returns
+    -------
+    bool
+        True exactly if x'Ax > 0 for every x other than zero.
+
+    Raises
+    ------
+    ObsynthError
+        If the matrix is not symmetric.
+
+    Examples
+    --------
+    >>> is_positive_definite([[2, 1], [1, 2]]), is_positive_definite([[1, 1], [1, 1]])
+    (True, False)
+    """
+    exact = ExactMatrix.of(matrix)
+    if exact.shape[0] != exact.shape[1] or exact.entries != exact.entries.transpose():
+        raise ObsynthError(f"the exact {exact.shape} matrix is not symmetric")
+    scaled, _ = exact.entries.numer_denom()
+    rows = scaled.tolist()
+    n = len(rows)
+    previous: Any = 1
+    # Bareiss: after step k every entry is a minor, the pivots are the leading ones, and every
+    # division is exact. L D L' follows with D the quotients of successive pivots.
+    for k in range(n):
+        pivot = rows[k][k]
+        if pivot <= 0:
+            return False
+        for i in range(k + 1, n):
+            head = rows[k][i]
+            for j in range(i, n):
+                rows[i][j] = (rows[i][j] * pivot - head * rows[k][j]) // previous
+        previous = pivot
+    return True
+
+
+def _rational(number: Any) -> Any:
+    from flint import fmpq
+
+    if isinstance(number, (float, np.floating)):
+        if not np.isfinite(number):
+            raise ObsynthError(f"{number} is no rational number")
+        return fmpq(*float(number).as_integer_ratio())
+    if isinstance(number, (int, np.integer)):
+        return fmpq(int(number))
+    if isinstance(number, Fraction):
+        return fmpq(number.numerator, number.denominator)
+    if hasattr(number, "p") and hasattr(number, "q"):
+        return fmpq(int(number.p), int(number.q))
+    raise ObsynthError(f"{number!r} ({type(number).__name__}) is no exact number")
+
+
+def _is_zero(value: Any) -> bool:
+    return isinstance(value, (int, float)) and value == 0
+
+
+def _check_shapes(left: ExactMatrix, right: ExactMatrix) -> None:
+    if left.shape != right.shape:
+        raise ObsynthError(f"exact matrices of shapes {left.shape} and {right.shape} do not fit")

@@ -1,0 +1,388 @@
+"""Affine matrix expressions, alone or as a family with one member per vertex."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.lmi.variables import Structure, Variable
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = [
+    "Affine",
+    "ExpressionError",
+    "Inequality",
+    "constant",
+    "diagonal",
+    "full",
+    "scalar",
+    "symmetric",
+    "trace",
+]
+
+Matrix = NDArray[np.float64]
+
+
+class ExpressionError(ObsynthError):
+    """An expression that is not affine, or whose shapes do not fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Affine:
+    """constant + sum over the variables of a linear operator.
+
+    NumPy arrays stand beside expressions as in ``A.T @ P @ A - P``. An array with a leading
+    axis, (N, r, c), makes a family: one member per vertex, and arithmetic broadcasts over it
+    as ``numpy.matmul`` does.
+
+    Parameters
+    ----------
+    constant : ndarray, shape (r, c) or (N, r, c)
+        Value where every variable is zero.
+    terms : mapping of Variable to sparse array
+        Operators from the free entries of the variable to the entries of the expression,
+        vertex after vertex, each stacked by columns.
+
+    Examples
+    --------
+    >>> P = symmetric("P", 2)
+    >>> decay = np.array([[0.5, 0.0], [0.1, 0.2]])
+    >>> (decay.T @ P @ decay - P).shape
+    (2, 2)
+    """
+
+    constant: Matrix
+    terms: Mapping[Variable, sparse.csr_array]
+
+    # NumPy leaves the operators to this class when an array stands on the left.
+    __array_ufunc__ = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of one member."""
+        return self.constant.shape[-2], self.constant.shape[-1]
+
+    @property
+    def members(self) -> int | None:
+        """Number of vertices, or None for an expression that is no family."""
+        return None if self.constant.ndim == 2 else self.constant.shape[0]
+
+    @property
+    def T(self) -> Affine:
+        """Transpose of every member."""
+        return self._take(np.swapaxes(self._numbers(), -1, -2))
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Affine]) -> Affine:
+        """All entries of several expressions in one column, each stacked by columns."""
+        sizes = [part.constant.size for part in parts]
+        starts = np.cumsum([0, *sizes])
+        pieces: dict[Variable, list[tuple[int, sparse.coo_array]]] = {}
+        for part, start in zip(parts, starts, strict=False):
+            for variable, operator in part.terms.items():
+                pieces.setdefault(variable, []).append((int(start), operator.tocoo()))
+        terms = {
+            variable: sparse.csr_array(
+                (
+                    np.concatenate([op.data for _, op in found]),
+                    (
+                        np.concatenate([op.row + start for start, op in found]),
+                        np.concatenate([op.col for _, op in found]),
+                    ),
+                ),
+                shape=(int(starts[-1]), variable.size),
+            )
+            for variable, found in pieces.items()
+        }
+        return cls(np.concatenate([_stack(part.constant) for part in parts])[:, None], terms)
+
+    def value(self, values: Mapping[str, ArrayLike]) -> Matrix:
+        """Insert values by name.
+
+        Parameters
+        ----------
+        values : mapping of str to array_like
+            One matrix (or number) for every variable of the expression.
+
+        Returns
+        -------
+        ndarray, shape (r, c) or (N, r, c)
+            Rounded to nearest; for a proof use an enclosure of the same formula.
+        """
+        stacked = _stack(self.constant)
+        for variable, operator in self.terms.items():
+            stacked = stacked + operator @ variable.pack(values[variable.name])
+        return _unstack(stacked, self.constant.shape)
+
+    def member(self, index: int | slice | NDArray[Any]) -> Affine:
+        """Select vertices of a family: an integer gives one matrix, an array a smaller family."""
+        if self.members is None:
+            return self
+        return self._take(self._numbers()[index])
+
+    def __getitem__(self, key: Any) -> Affine:
+        """Entries or sub-blocks of every member; the result has two dimensions."""
+        rows, columns = key if isinstance(key, tuple) else (key, slice(None))
+        picked = self._numbers()[..., _as_slice(rows), :][..., :, _as_slice(columns)]
+        return self._take(picked)
+
+    def __neg__(self) -> Affine:
+        return Affine(-self.constant, {v: -op for v, op in self.terms.items()})
+
+    def __add__(self, other: Any) -> Affine:
+        if _is_zero(other):
+            return self
+        right = constant(other)
+        shape = _common_shape(self, right, "+")
+        left, right = self._broadcast(shape), right._broadcast(shape)
+        terms = dict(left.terms)
+        for variable, operator in right.terms.items():
+            terms[variable] = terms[variable] + operator if variable in terms else operator
+        return Affine(left.constant + right.constant, terms)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Affine:
+        return self if _is_zero(other) else self + (-constant(other))
+
+    def __rsub__(self, other: Any) -> Affine:
+        return -self if _is_zero(other) else constant(other) - self
+
+    def __mul__(self, other: Any) -> Affine:
+        """Elementwise product with a constant that broadcasts (a number, or (N, 1, 1))."""
+        if isinstance(other, Affine):
+            return _product_of_variables(self, other, "*")
+        factor = _as_matrix(other)
+        shape = np.broadcast_shapes(self.constant.shape, factor.shape)
+        wide = self._broadcast(shape)
+        scale = _stack(np.broadcast_to(factor, shape))
+        terms = {v: op.multiply(scale[:, None]).tocsr() for v, op in wide.terms.items()}
+        return Affine(wide.constant * factor, terms)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: float) -> Affine:
+        return self * (1.0 / other)
+
+    def __matmul__(self, other: Any) -> Affine:
+        if isinstance(other, Affine):
+            return _product_of_variables(self, other, "@")
+        return self._times(_as_matrix(other))
+
+    def __rmatmul__(self, other: Any) -> Affine:
+        # X' A' has the entries of A X, and transposing only renumbers.
+        return self.T._times(np.swapaxes(_as_matrix(other), -1, -2)).T
+
+    def __rshift__(self, other: Any) -> Inequality:
+        return Inequality("psd", self - other)
+
+    def __lshift__(self, other: Any) -> Inequality:
+        return Inequality("psd", -(self - other))
+
+    def __ge__(self, other: Any) -> Inequality:
+        return Inequality("nonnegative", self - _as_bound(other, self))
+
+    def __le__(self, other: Any) -> Inequality:
+        return Inequality("nonnegative", _as_bound(other, self) - self)
+
+    def _numbers(self) -> NDArray[np.intp]:
+        """Row number in the operators of every entry."""
+        count = self.constant.size
+        return _unstack(np.arange(count), self.constant.shape)
+
+    def _take(self, numbers: NDArray[np.intp]) -> Affine:
+        rows = _stack(numbers)
+        picked = _stack(self.constant)[rows]
+        return Affine(
+            _unstack(picked, numbers.shape), {v: op[rows] for v, op in self.terms.items()}
+        )
+
+    def _broadcast(self, shape: tuple[int, ...]) -> Affine:
+        if self.constant.shape == shape:
+            return self
+        return self._take(np.broadcast_to(self._numbers(), shape))
+
+    def _times(self, factor: Matrix) -> Affine:
+        rows, inner = self.shape
+        if factor.shape[-2] != inner:
+            raise ExpressionError(
+                f"product of shapes {self.shape} and {factor.shape[-2:]}: {inner} columns meet "
+                f"{factor.shape[-2]} rows",
+                left=self.shape,
+                right=factor.shape,
+            )
+        value = self.constant @ factor
+        stacked = factor if factor.ndim == 3 else factor[None]
+        member, k, column = np.nonzero(stacked)
+        entries = stacked[member, k, column]
+        count = 1 if value.ndim == 2 else value.shape[0]
+        if factor.ndim == 2 and count > 1:
+            member = np.repeat(np.arange(count), len(k))
+            k, column, entries = np.tile(k, count), np.tile(column, count), np.tile(entries, count)
+        source = member if self.members is not None else np.zeros_like(member)
+        lines = np.arange(rows)
+        target = ((member * value.shape[-1] + column) * rows)[:, None] + lines
+        origin = ((source * inner + k) * rows)[:, None] + lines
+        product = sparse.csr_array(
+            (np.repeat(entries, rows), (target.ravel(), origin.ravel())),
+            shape=(value.size, self.constant.size),
+        )
+        return Affine(value, {v: product @ op for v, op in self.terms.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Inequality:
+    """An expression and the cone it lies in: ``"psd"`` or elementwise ``"nonnegative"``."""
+
+    cone: str
+    expression: Affine
+
+
+def symmetric(name: str, n: int) -> Affine:
+    """Symmetric n x n variable.
+
+    Examples
+    --------
+    >>> symmetric("P", 3).shape
+    (3, 3)
+    """
+    return _variable(Variable(name, (n, n), Structure.SYMMETRIC))
+
+
+def full(name: str, rows: int, columns: int) -> Affine:
+    """Rows x columns variable without structure.
+
+    Examples
+    --------
+    >>> full("H", 3, 2).shape
+    (3, 2)
+    """
+    return _variable(Variable(name, (rows, columns), Structure.FULL))
+
+
+def diagonal(name: str, n: int) -> Affine:
+    """Diagonal n x n variable.
+
+    Examples
+    --------
+    >>> diagonal("T", 2).value({"T": np.diag([1.0, 2.0])}).tolist()
+    [[1.0, 0.0], [0.0, 2.0]]
+    """
+    return _variable(Variable(name, (n, n), Structure.DIAGONAL))
+
+
+def scalar(name: str) -> Affine:
+    """One number, as a 1 x 1 expression that multiplies constant matrices with ``*``.
+
+    Examples
+    --------
+    >>> (scalar("t") * np.eye(3)).shape
+    (3, 3)
+    """
+    return _variable(Variable(name, (1, 1), Structure.SCALAR))
+
+
+def constant(value: Any) -> Affine:
+    """Make an expression without variables; expressions pass unchanged.
+
+    Examples
+    --------
+    >>> constant([[1.0, 2.0]]).shape
+    (1, 2)
+    """
+    return value if isinstance(value, Affine) else Affine(_as_matrix(value), {})
+
+
+def trace(expression: Affine) -> Affine:
+    """Sum of the diagonal of every member, as a 1 x 1 expression.
+
+    Examples
+    --------
+    >>> float(trace(symmetric("P", 2)).value({"P": [[1.0, 5.0], [5.0, 2.0]]})[0, 0])
+    3.0
+    """
+    n = expression.shape[0]
+    numbers = np.diagonal(expression._numbers(), axis1=-2, axis2=-1)[..., None, :]
+    return expression._take(numbers) @ np.ones((n, 1))
+
+
+def _variable(variable: Variable) -> Affine:
+    if not variable.name or min(variable.shape) < 1:
+        raise ExpressionError(
+            f"variable {variable.name!r} of shape {variable.shape}: a name and at least one "
+            "row and column are needed",
+            name=variable.name,
+            shape=variable.shape,
+        )
+    return Affine(np.zeros(variable.shape), {variable: variable.operator()})
+
+
+def _as_matrix(value: Any) -> Matrix:
+    array = np.asarray(value, dtype=float)
+    if array.ndim == 0:
+        return array.reshape(1, 1)
+    if array.ndim not in (2, 3):
+        raise ExpressionError(
+            f"a constant of shape {array.shape}: expressions take numbers, matrices (r, c) and "
+            "families (N, r, c); write a vector as a column, v[:, None]",
+            shape=array.shape,
+        )
+    return array
+
+
+def _is_zero(value: Any) -> bool:
+    return isinstance(value, (int, float)) and value == 0
+
+
+def _as_bound(value: Any, expression: Affine) -> Any:
+    """Widen a number to bound every entry; matrices have to fit."""
+    if isinstance(value, (int, float, np.number)):
+        return np.full(expression.shape, float(value))
+    return value
+
+
+def _as_slice(key: Any) -> Any:
+    if isinstance(key, (int, np.integer)):
+        return slice(key, key + 1 or None)
+    return key
+
+
+def _stack(array: NDArray[Any]) -> NDArray[Any]:
+    return np.swapaxes(array, -1, -2).reshape(-1)
+
+
+def _unstack(stacked: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    swapped = (*shape[:-2], shape[-1], shape[-2])
+    return np.swapaxes(stacked.reshape(swapped), -1, -2)
+
+
+def _common_shape(left: Affine, right: Affine, sign: str) -> tuple[int, ...]:
+    if left.shape == right.shape and (
+        left.members == right.members or None in (left.members, right.members)
+    ):
+        return np.broadcast_shapes(left.constant.shape, right.constant.shape)
+    raise ExpressionError(
+        f"shapes {left.constant.shape} {sign} {right.constant.shape} do not fit; a multiple of "
+        "the identity is written t * np.eye(n)",
+        left=left.constant.shape,
+        right=right.constant.shape,
+    )
+
+
+def _product_of_variables(left: Affine, right: Affine, sign: str) -> Affine:
+    if not right.terms:
+        return left * right.constant if sign == "*" else left @ right.constant
+    if not left.terms:
+        return right * left.constant if sign == "*" else left.constant @ right
+    names = [", ".join(v.name for v in side.terms) for side in (left, right)]
+    raise ExpressionError(
+        f"({names[0]}) {sign} ({names[1]}) is a product of variables, not an affine expression; "
+        "introduce a variable for the product, as H = P K",
+        left=names[0],
+        right=names[1],
+    )

@@ -1,0 +1,268 @@
+"""A semidefinite program of named blocks, built line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.designs.lmi.blocks import block, symmetric_block
+from obsynth.designs.lmi.expression import (
+    Affine,
+    ExpressionError,
+    Inequality,
+    constant,
+    diagonal,
+    full,
+    scalar,
+    symmetric,
+    trace,
+)
+from obsynth.designs.lmi.solution import Solution
+from obsynth.designs.lmi.variables import Variable
+
+__all__ = ["Block", "Problem"]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A named constraint: an expression and the cone it lies in.
+
+    Parameters
+    ----------
+    name : str
+        Name in reports and in the duals of the solution.
+    cone : str
+        ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three).
+    expression : Affine
+        For ``"psd"`` with sense ``<<`` the negative of what was typed, margin included.
+    strict : bool
+        Whether a margin is asked of the block; helpers that only define an auxiliary
+        variable are not strict.
+    """
+
+    name: str
+    cone: str
+    expression: Affine
+    strict: bool = True
+
+
+class Problem:
+    """Linear objective, named matrix inequalities.
+
+    Parameters
+    ----------
+    name : str
+        Used in messages.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> A = np.array([[0.9, 0.5], [0.0, 0.8]])
+    >>> problem = Problem("Lyapunov")
+    >>> P = symmetric("P", 2)
+    >>> problem.add_lmi("decay", A.T @ P @ A - P, "<<", margin=1.0)
+    >>> problem.minimise(trace(P))
+    >>> solution = problem.solve()
+    >>> solution.status, round(float(np.trace(solution["P"])), 3)
+    ('Solved', 30.493)
+    """
+
+    def __init__(self, name: str = "problem") -> None:
+        self.name = name
+        self._blocks: dict[str, Block] = {}
+        self._variables: dict[str, Variable] = {}
+        self.objective: Affine = constant(0.0)
+        self.maximising = False
+
+    @property
+    def blocks(self) -> Mapping[str, Block]:
+        """Constraints by name, in the order they were added."""
+        return dict(self._blocks)
+
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """Variables by name, in the order they appeared."""
+        return dict(self._variables)
+
+    @property
+    def size(self) -> int:
+        """Number of free entries of all variables."""
+        return sum(variable.size for variable in self._variables.values())
+
+    def add_lmi(self, name: str, expression: Affine, sense: str, margin: float = 0.0) -> None:
+        """Matrix inequality ``expression >> margin I`` or ``expression << -margin I``.
+
+        Parameters
+        ----------
+        name : str
+            Name of the block.
+        expression : Affine, shape (n, n) or a family (N, n, n)
+            Symmetric; a family makes one inequality per vertex.
+        sense : str
+            ``">>"`` or ``"<<"``.
+        margin : float
+            Smallest eigenvalue asked for.
+        """
+        if sense not in (">>", "<<"):
+            raise ExpressionError(f"{name}: sense {sense!r}; write '>>' or '<<'", block=name)
+        positive = expression if sense == ">>" else -expression
+        if margin:
+            positive = positive - margin * np.eye(expression.shape[0])
+        self._add(Block(name, "psd", positive))
+
+    def add(self, name: str, inequality: Inequality) -> None:
+        """Constraint written with an operator: ``P >> 0``, ``X << Y``, ``t <= 3`` (elementwise)."""
+        if not isinstance(inequality, Inequality):
+            raise ExpressionError(
+                f"{name}: {type(inequality).__name__} is no inequality; write P >> 0, P << Q, "
+                "t >= 0 or t <= 1 with an expression on the left",
+                block=name,
+            )
+        self._add(Block(name, inequality.cone, inequality.expression))
+
+    def add_equality(self, name: str, expression: Affine) -> None:
+        """Every entry of the expression is zero; two inequalities would leave no interior."""
+        self._add(Block(name, "zero", expression))
+
+    def minimise(self, objective: Affine) -> None:
+        """Minimise a 1 x 1 expression."""
+        self._set_objective(objective, maximising=False)
+
+    def maximise(self, objective: Affine) -> None:
+        """Maximise a 1 x 1 expression."""
+        self._set_objective(objective, maximising=True)
+
+    def minimise_trace_inverse(self, P: Affine, weight: Any = None) -> None:
+        """Minimise trace(W P^-1) of a symmetric expression, by a Schur complement.
+
+        Parameters
+        ----------
+        P : Affine, shape (n, n)
+            Positive definite at the solution.
+        weight : array_like, shape (n, k), optional
+            R with W = R R'; the identity without it.
+        """
+        n = P.shape[0]
+        factor = np.eye(n) if weight is None else np.asarray(weight, dtype=float).reshape(n, -1)
+        Z = symmetric("inverse.Z", factor.shape[1])
+        self._add(Block("inverse", "psd", symmetric_block([[Z], [factor, P]]), strict=False))
+        self.minimise(trace(Z))
+
+    def maximise_lambda_min(self, P: Affine) -> None:
+        """Maximise the smallest eigenvalue of a symmetric expression."""
+        least = scalar("lambda_min.t")
+        floor = P - least * np.eye(P.shape[0])
+        self._add(Block("lambda_min", "psd", floor, strict=False))
+        self.maximise(least)
+
+    def maximise_log_det(self, P: Affine) -> None:
+        """Maximise log det of a symmetric expression, with one exponential cone per row.
+
+        With Z lower triangular and [P, Z; Z', diag(Z)] >= 0, log det P is at least the sum of
+        log Z_ii, with equality for the Cholesky factor times its diagonal.
+        """
+        n = P.shape[0]
+        Z = full("log_det.Z", n, n)
+        D = diagonal("log_det.D", n)
+        t = full("log_det.t", n, 1)
+        upper = [Z[i, i + 1 :] for i in range(n - 1)]
+        ends = block([[D[i, i] - Z[i, i] for i in range(n)]])
+        self._add(Block("log_det", "psd", symmetric_block([[P], [Z.T, D]]), strict=False))
+        self._add(Block("log_det.triangle", "zero", block([[*upper, ends]]), strict=False))
+        rows = [[t[i, 0], np.ones((1, 1)), D[i, i]] for i in range(n)]
+        self._add(Block("log_det.exponential", "exponential", block(rows), strict=False))
+        self.maximise(np.ones((1, n)) @ t)
+
+    def members(self, chosen: Mapping[str, Iterable[int]]) -> Problem:
+        """Copy the problem with some vertices of the named families only."""
+        copy = Problem(self.name)
+        copy.objective, copy.maximising = self.objective, self.maximising
+        copy._variables = dict(self._variables)
+        for name, item in self._blocks.items():
+            expression = item.expression
+            if name in chosen:
+                expression = expression.member(np.fromiter(chosen[name], dtype=np.intp))
+            copy._blocks[name] = replace(item, expression=expression)
+        return copy
+
+    def solve(self, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:
+        """Solve with Clarabel.
+
+        Parameters
+        ----------
+        accept_inaccurate : bool
+            Return whatever the solver ended with, flagged by ``Solution.solved``, instead of
+            raising.
+        **settings
+            Fields of Clarabel's settings, as ``tol_feas=1e-9``.
+
+        Returns
+        -------
+        Solution
+            With ``solved`` True, unless asked otherwise.
+
+        Raises
+        ------
+        InfeasibleDesign
+            The solver reports infeasibility (with its dual ray as ``duals``).
+        SolverTrouble
+            Any other status than Solved.
+        """
+        from obsynth.designs.lmi.clarabel_backend import solve
+
+        return solve(self, accept_inaccurate=accept_inaccurate, **settings)
+
+    def to_cvxpy(self) -> Any:
+        """Translate for cvxpy; variables have the same names.
+
+        Returns
+        -------
+        cvxpy.Problem
+            ``problem.var_dict[name].value`` after any cvxpy solver.
+        """
+        from obsynth.designs.lmi.cvxpy_backend import to_cvxpy
+
+        return to_cvxpy(self)
+
+    def __repr__(self) -> str:
+        counts = ", ".join(
+            f"{item.name} ({item.cone}, {item.expression.members or 1} x "
+            f"{item.expression.shape[0]} x {item.expression.shape[1]})"
+            for item in self._blocks.values()
+        )
+        return f"Problem {self.name!r}: {self.size} unknowns; {counts}"
+
+    def _add(self, item: Block) -> None:
+        if item.name in self._blocks:
+            raise ExpressionError(
+                f"{self.name}: two blocks are called {item.name!r}", block=item.name
+            )
+        rows, columns = item.expression.shape
+        if item.cone == "psd" and rows != columns:
+            raise ExpressionError(
+                f"{item.name}: a matrix inequality of shape {rows} x {columns} is not square",
+                block=item.name,
+            )
+        self._learn(item.expression, item.name)
+        self._blocks[item.name] = item
+
+    def _learn(self, expression: Affine, where: str) -> None:
+        for variable in expression.terms:
+            known = self._variables.setdefault(variable.name, variable)
+            if known != variable:
+                raise ExpressionError(
+                    f"{where}: variable {variable.name!r} is {variable.structure} "
+                    f"{variable.shape} here and {known.structure} {known.shape} elsewhere",
+                    variable=variable.name,
+                )
+
+    def _set_objective(self, objective: Affine, *, maximising: bool) -> None:
+        if objective.constant.size != 1:
+            raise ExpressionError(
+                f"{self.name}: an objective of shape {objective.shape}; take its trace"
+            )
+        self._learn(objective, "objective")
+        self.objective, self.maximising = objective, maximising

@@ -1,0 +1,72 @@
+"""What a solver returned, before anything is proved about it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.lmi.expression import Affine
+
+__all__ = ["Solution"]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Values by variable name. A status is not a certificate: prove what matters.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray
+        Every variable as a matrix (numbers are 1 x 1).
+    status : str
+        In the words of the solver.
+    solved : bool
+        True only for the status that means solved to full accuracy.
+    objective : float
+        In the sense of the problem (what was minimised or maximised).
+    solver : str
+        Name of the solver.
+    solve_time : float
+        Seconds inside the solver.
+    duals : mapping of str to ndarray
+        Dual matrix of every block, (r, c) or (N, r, c); empty when the solver gives none.
+    """
+
+    values: Mapping[str, NDArray[np.float64]]
+    status: str
+    solved: bool
+    objective: float
+    solver: str
+    solve_time: float
+    iterations: int = 0
+    duals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        return self.values[name]
+
+    def value(self, expression: Affine) -> NDArray[np.float64]:
+        """Value of an expression, (r, c) or (N, r, c)."""
+        return expression.value(self.values)
+
+    def number(self, name: str) -> float:
+        """Read a 1 x 1 variable as a float."""
+        return float(self.values[name].item())
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{value.shape}</td></tr>" for name, value in self.values.items()
+        )
+        head = f"{self.solver}: {self.status}, objective {self.objective:.6g}"
+        return f"<table><caption>{head}</caption>{rows}</table>"
+
+    def facts(self) -> dict[str, Any]:
+        """Status, objective, solver and time, for errors and reports."""
+        return {
+            "status": self.status,
+            "objective": self.objective,
+            "solver": self.solver,
+            "solve_time": self.solve_time,
+            "iterations": self.iterations,
+        }
