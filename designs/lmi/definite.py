@@ -8,8 +8,6 @@ but not for whatever a tuned library may do.
 """
 
 from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,8 +20,10 @@ __all__ = ["ProofResult", "prove_positive_definite"]
 # diagonal: n (n + 2) 2^-1074 and the same again for the scaling.
 _UNDERFLOW = 1e-290
 
-# Matrices factorised at a time: the work array stays in the cache.
-_CHUNK = 512
+# Entries treated at a time, so that the work arrays stay in the cache.
+_CHUNK_ENTRIES = 2**17
+
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,25 +87,19 @@ def prove_positive_definite(
     >>> prove_positive_definite([[1.0, 1.0], [1.0, 1.0]]).all_proved
     False
     """
-    centre, radius, scale = _scaled(mid if isinstance(mid, Enclosure) else Enclosure.of(mid, rad))
-    spread = _norm_bound(radius)
-    n = centre.shape[-1]
-    finite = np.isfinite(centre).all(axis=(1, 2)) & np.isfinite(spread)
-    centre = np.where(finite[:, None, None], centre, 0.0)
-    size = np.abs(np.diagonal(centre, axis1=1, axis2=2)).sum(axis=1)
-    needed = spread + (2.0 * gamma_bound(n + 4)) * (size + n) + 4 * _UNDERFLOW
-    lower = _lower_bounds(centre, np.where(finite, needed, np.inf), spread)
-    if sharp and finite.any():
-        estimate = np.full(len(centre), -np.inf)
-        estimate[finite] = np.linalg.eigvalsh(centre[finite])[:, 0]
-        for fraction in (1.0 - 2.0**-10, 0.75):
-            shift = fraction * estimate
-            worthwhile = finite & (shift > needed) & (shift > lower)
-            tried = _lower_bounds(centre[worthwhile], shift[worthwhile], spread[worthwhile])
-            lower[worthwhile] = np.maximum(lower[worthwhile], tried)
+    matrices = mid if isinstance(mid, Enclosure) else Enclosure.of(mid, rad)
+    if matrices.shape[0] != matrices.shape[1]:
+        raise ObsynthError(f"a matrix of shape {matrices.shape} is not square")
+    n = matrices.shape[0]
+    stack = matrices.mid if matrices.mid.ndim == 3 else matrices.mid[None]
+    radii = np.broadcast_to(matrices.rad, stack.shape)
+    chunk = max(1, _CHUNK_ENTRIES // (n * n))
+    pieces = [
+        _prove(stack[start : start + chunk], radii[start : start + chunk], start, sharp)
+        for start in range(0, len(stack), chunk)
+    ]
+    lower, unscaled = np.concatenate(pieces, axis=1) if pieces else np.zeros((2, 0))
     proved = lower > 0
-    # D B D = A with D diagonal: the smallest eigenvalue of A is at least min(D^2) that of B.
-    unscaled = lower * scale.min(axis=1) ** 2 * (1.0 - 4 * UNIT_ROUNDOFF)
     return ProofResult(
         proved=proved,
         margin=np.where(proved, unscaled, -np.inf),
@@ -113,77 +107,85 @@ def prove_positive_definite(
     )
 
 
-def _scaled(
-    matrices: Enclosure,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Symmetric midpoints and radii with a diagonal near one, and the scale taken out."""
-    if matrices.shape[0] != matrices.shape[1]:
-        raise ObsynthError(f"a matrix of shape {matrices.shape} is not square")
-    mid = np.atleast_3d(matrices.mid) if matrices.mid.ndim == 3 else matrices.mid[None]
-    rad = matrices.rad if matrices.rad.ndim == 3 else matrices.rad[None]
-    rad = np.broadcast_to(rad, mid.shape)
+def _prove(mid: Matrix, rad: Matrix, first: int, sharp: bool) -> Matrix:
+    """Lower bounds of the smallest eigenvalues, scaled and unscaled, as two rows."""
+    n = mid.shape[-1]
     with np.errstate(all="ignore"):
-        gap = np.abs(mid - np.swapaxes(mid, 1, 2))
+        centre, spread, scale = _scaled(mid, rad, first)
+        finite = np.isfinite(centre.sum(axis=(1, 2))) & np.isfinite(spread)
+        if not finite.all():
+            centre = np.where(finite[:, None, None], centre, 0.0)
+        trace = np.abs(np.diagonal(centre, axis1=1, axis2=2)).sum(axis=1)
+        needed = spread + (2.0 * gamma_bound(n + 4)) * (trace + n) + 4 * _UNDERFLOW
+        lower = _factorise(centre, np.where(finite, needed, np.inf), spread)
+        if sharp and finite.any():
+            estimate = np.full(len(centre), -np.inf)
+            estimate[finite] = np.linalg.eigvalsh(centre[finite])[:, 0]
+            for fraction in (1.0 - 2.0**-10, 0.75):
+                shift = fraction * estimate
+                tried = finite & (shift > needed) & (shift > lower)
+                better = _factorise(centre[tried], shift[tried], spread[tried])
+                lower[tried] = np.maximum(lower[tried], better)
+        # D B D = A with D diagonal: the smallest eigenvalue of A is at least min(D^2) that of B.
+        unscaled = lower * scale.min(axis=1) ** 2 * (1.0 - 4 * UNIT_ROUNDOFF)
+    return np.stack([lower, unscaled])
+
+
+def _scaled(mid: Matrix, rad: Matrix, first: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Symmetric midpoints with a diagonal near one, bounds of the radii's norms, the scale."""
+    mirrored = np.swapaxes(mid, 1, 2)
+    gap = np.abs(mid - mirrored)
+    symmetric = not gap.any()
+    if not symmetric:
         allowed = (rad + np.swapaxes(rad, 1, 2)) * (1.0 + 8 * UNIT_ROUNDOFF)
         if np.any(gap > allowed):
             member, i, j = np.argwhere(gap > allowed)[0]
             raise ObsynthError(
-                f"matrix {member} is not symmetric: entries ({i}, {j}) and ({j}, {i}) differ by "
-                f"{gap[member, i, j]:.3g}, more than their radii explain",
-                member=int(member),
+                f"matrix {first + member} is not symmetric: entries ({i}, {j}) and ({j}, {i}) "
+                f"differ by {gap[member, i, j]:.3g}, more than their radii explain",
+                member=int(first + member),
                 entry=(int(i), int(j)),
             )
-        diagonal = np.abs(np.diagonal(mid, axis1=1, axis2=2))
-        usable = np.isfinite(diagonal) & (diagonal > 0)
-        exponent = np.where(usable, np.frexp(np.where(usable, diagonal, 1.0))[1], 0)
-        half = np.clip(exponent // 2, -400, 400)
-        scale = np.ldexp(1.0, half)
-        factor = 1.0 / (scale[:, :, None] * scale[:, None, :])
-        centre = 0.5 * (mid + np.swapaxes(mid, 1, 2))
-        radius = 0.5 * (rad + np.swapaxes(rad, 1, 2)) * (1.0 + 4 * UNIT_ROUNDOFF)
-        radius = radius + np.where(gap > 0, 2 * UNIT_ROUNDOFF * np.abs(centre), 0.0)
-        return centre * factor, radius * factor, scale
+        mid = 0.5 * (mid + mirrored)
+        rad = 0.5 * (rad + np.swapaxes(rad, 1, 2)) * (1.0 + 4 * UNIT_ROUNDOFF)
+        rad = rad + 2 * UNIT_ROUNDOFF * np.abs(mid)
+    diagonal = np.abs(np.diagonal(mid, axis1=1, axis2=2))
+    usable = np.isfinite(diagonal) & (diagonal > 0)
+    exponent = np.where(usable, np.frexp(np.where(usable, diagonal, 1.0))[1], 0)
+    scale = np.ldexp(1.0, np.clip(exponent // 2, -400, 400))
+    factor = 1.0 / (scale[:, :, None] * scale[:, None, :])
+    return mid * factor, _norm_bound(rad, factor), scale
 
 
-def _norm_bound(radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Upper bound of the spectral norm of any symmetric matrix within the radius."""
-    n = radius.shape[-1]
-    sums = np.minimum(radius.sum(axis=2).max(axis=1), np.sqrt((radius * radius).sum(axis=(1, 2))))
-    bound: NDArray[np.float64] = sums * (1.0 + 2 * gamma_bound(n * n + 8)) + _UNDERFLOW
+def _norm_bound(rad: Matrix, factor: Matrix) -> NDArray[np.float64]:
+    """Upper bound of the spectral norm of any symmetric matrix within the scaled radius."""
+    n = rad.shape[-1]
+    if rad.strides[0] == 0 and not rad[:1].any():
+        return np.zeros(len(rad))
+    scaled = rad * factor
+    sums = np.minimum(scaled.sum(axis=2).max(axis=1), np.sqrt((scaled * scaled).sum(axis=(1, 2))))
+    bound: Matrix = sums * (1.0 + 2 * gamma_bound(n * n + 8)) + _UNDERFLOW
     return bound
 
 
-def _lower_bounds(
-    centre: NDArray[np.float64], shift: NDArray[np.float64], spread: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _factorise(centre: Matrix, shift: Matrix, spread: Matrix) -> Matrix:
     """Proved lower bounds of the smallest eigenvalues, -inf where the factorisation fails."""
-    result = np.full(len(centre), -np.inf)
-    for start in range(0, len(centre), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        result[part] = _factorise(centre[part], shift[part], spread[part])
-    return result
-
-
-def _factorise(
-    centre: NDArray[np.float64], shift: NDArray[np.float64], spread: NDArray[np.float64]
-) -> NDArray[Any]:
     n = centre.shape[-1]
-    # The batch runs along the last, contiguous axis; row k of ``factor`` is row k of R.
+    # The batch runs along the last, contiguous axis; row k of ``work`` becomes row k of R.
     work = np.array(np.moveaxis(centre, 0, -1), order="C")
     diagonal = np.einsum("iib->ib", work)
-    with np.errstate(all="ignore"):
-        diagonal -= shift
-        trace = np.abs(diagonal).sum(axis=0)
-        largest = np.abs(diagonal).max(axis=0)
-        complete = np.isfinite(shift)
-        for j in range(n):
-            column = work[j, j:]
-            if j:
-                column -= np.einsum("krb,kb->rb", work[:j, j:], work[:j, j])
-            complete &= column[0] > 0
-            column /= np.sqrt(column[0])
-        # R'R = fl(B - c I) + E with |E|_2 <= g / (1 - g) trace (theorem 10.3, rows of R bounded
-        # by the diagonal), and the diagonal of B - c I itself was rounded once.
-        loss = gamma_bound(n + 4) * trace * (1.0 + 1e-6) + 2 * UNIT_ROUNDOFF * largest
-        lower = (shift - loss - spread) - 8 * UNIT_ROUNDOFF * (np.abs(shift) + loss + spread)
-        return np.where(complete & np.isfinite(lower), lower - _UNDERFLOW, -np.inf)
+    diagonal -= shift
+    trace = np.abs(diagonal).sum(axis=0)
+    largest = np.abs(diagonal).max(axis=0)
+    complete = np.isfinite(shift)
+    for j in range(n):
+        column = work[j, j:]
+        if j:
+            column -= np.einsum("krb,kb->rb", work[:j, j:], work[:j, j])
+        complete &= column[0] > 0
+        column /= np.sqrt(column[0])
+    # R'R = fl(B - c I) + E with |E|_2 <= g / (1 - g) trace (theorem 10.3, rows of R bounded
+    # by the diagonal), and the diagonal of B - c I itself was rounded once.
+    loss = gamma_bound(n + 4) * trace * (1.0 + 1e-6) + 2 * UNIT_ROUNDOFF * largest
+    lower = (shift - loss - spread) - 8 * UNIT_ROUNDOFF * (np.abs(shift) + loss + spread)
+    return np.where(complete & np.isfinite(lower), lower - _UNDERFLOW, -np.inf)
