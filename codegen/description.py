@@ -1,0 +1,266 @@
+"""What a project is made from: an observer, checked and with C names."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from obsynth.codegen.errors import CodegenError
+from obsynth.codegen.interface import FloatArray, ObserverLike, PlantLike
+from obsynth.codegen.kernel import STEP_INPUTS
+from obsynth.codegen.machine import Machine
+from obsynth.codegen.names import project_name, unique
+from obsynth.designs.observer import STEP_OUTPUTS
+
+__all__ = ["Description", "Field", "Port", "describe", "midpoints", "nominal_values"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A member of the state: a named slice of the memory."""
+
+    name: str
+    start: int
+    size: int
+
+
+@dataclass(frozen=True)
+class Port:
+    """A signal as the header shows it: C name, the user's name, unit and declared range."""
+
+    c_name: str
+    name: str
+    unit: str = ""
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    def __str__(self) -> str:
+        unit = f" [{self.unit}]" if self.unit else ""
+        if math.isinf(self.lower) and math.isinf(self.upper):
+            return f"{self.name}{unit}"
+        return f"{self.name}{unit}, declared range {self.lower:.6g} to {self.upper:.6g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """An observer as the templates see it.
+
+    Attributes
+    ----------
+    name : str
+        C name of the project.
+    observer : ObserverLike
+    sample_time : float
+        Seconds.
+    fields : tuple of Field
+        The memory in order.
+    x, u, y, f : tuple of Port
+    start : ndarray of shape (n_memory,)
+        The initialised memory that ``NAME_init_default`` sets.
+    model_hash : str
+        SHA-256 of the plant's stored form.
+    """
+
+    name: str
+    observer: ObserverLike
+    sample_time: float
+    fields: tuple[Field, ...]
+    x: tuple[Port, ...]
+    u: tuple[Port, ...]
+    y: tuple[Port, ...]
+    f: tuple[Port, ...]
+    start: FloatArray
+    model_hash: str
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of the vectors."""
+        return {
+            "memory": int(self.start.size),
+            "u": len(self.u),
+            "y": len(self.y),
+            "x": len(self.x),
+            "f": len(self.f),
+        }
+
+
+def describe(
+    observer: ObserverLike, name: str | None = None, memory: FloatArray | None = None
+) -> Description:
+    """Check that an observer can ship and collect what its C project says of it.
+
+    Parameters
+    ----------
+    observer : ObserverLike
+    name : str, optional
+        C name of the project; made from the plant's name by default.
+    memory : array_like of shape (n_memory,), optional
+        What ``NAME_init_default`` sets. By default ``observer.memory0`` for the nominal state (the
+        middle of its range where none is declared) and the declared ranges.
+
+    Raises
+    ------
+    CodegenError
+        If step, memory layout and plant do not fit together, if a memory of zeros does not
+        count as not initialised, or if the plant has no sample time.
+    """
+    model = observer.model
+    if model.Ts is None:
+        raise CodegenError(
+            f"{model.name!r} has no sample time, so its observer has no step to ship; design the"
+            " observer for plant.discretise(...) or give dynamics(..., Ts=...)",
+            symbol=model.name,
+        )
+    sample_time = float(model.Ts)
+    if not 0 < sample_time < math.inf:
+        raise CodegenError(f"the sample time of {model.name!r} is {sample_time}", symbol=model.name)
+    if observer.fault_delay not in (0, 1):
+        raise CodegenError(
+            f"fault_delay is {observer.fault_delay!r}; 0 and 1 are the delays a step can have"
+        )
+    chosen = project_name(name, model.name)
+    fields = _fields(observer.memory_layout)
+    n_memory = fields[-1].start + fields[-1].size
+    _check_step(observer.step, model, n_memory)
+    start = _start(observer, memory, n_memory)
+    _check_not_initialised(observer, n_memory)
+    return Description(
+        name=chosen,
+        observer=observer,
+        sample_time=sample_time,
+        fields=fields,
+        x=_ports(model, "x"),
+        u=_ports(model, "u"),
+        y=_measurements(model),
+        f=_ports(model, "f"),
+        start=start,
+        model_hash=_hash(model.to_dict()),
+    )
+
+
+def _fields(layout: Mapping[str, slice]) -> tuple[Field, ...]:
+    ordered = sorted(layout.items(), key=lambda item: item[1].start or 0)
+    names = unique(key for key, _ in ordered)
+    fields, end = [], 0
+    for (key, part), name in zip(ordered, names, strict=True):
+        start, stop = part.start or 0, part.stop
+        if start != end or stop is None or stop < start or part.step not in (None, 1):
+            raise CodegenError(
+                f"memory_layout[{key!r}] is {part}, but the entries before it end at {end}: the"
+                " layout has to cover the memory without gaps and overlaps",
+                symbol=key,
+            )
+        end = stop
+        if stop > start:
+            fields.append(Field(name, start, stop - start))
+    if not fields:
+        raise CodegenError("memory_layout is empty: the observer has no memory to carry along")
+    return tuple(fields)
+
+
+def _check_step(step: ca.Function, model: PlantLike, n_memory: int) -> None:
+    n, n_f = len(model.x), len(model.f)
+    inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
+    if "theta" in inputs:
+        raise CodegenError(
+            "the step has a scheduling input theta; projects for scheduled observers are not"
+            f" available yet, the inputs available are {', '.join(STEP_INPUTS)}",
+            symbol="theta",
+        )
+    expected_in = (n_memory, len(model.u), len(model.output_names))
+    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1)
+    found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
+    found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
+    if len(inputs) != len(STEP_INPUTS) or len(outputs) != len(STEP_OUTPUTS):
+        raise CodegenError(
+            f"the step maps {inputs} to {outputs}; it has to map {STEP_INPUTS} to {STEP_OUTPUTS}"
+        )
+    for name, found, expected in zip(
+        (*STEP_INPUTS, *(f"the returned {name}" for name in STEP_OUTPUTS)),
+        (*found_in, *found_out),
+        (*expected_in, *expected_out),
+        strict=True,
+    ):
+        if found != expected:
+            raise CodegenError(
+                f"{name} of the step has {found} entries; the plant {model.name!r} and the"
+                f" memory layout ask for {expected}",
+                symbol=name,
+                found=found,
+                expected=expected,
+            )
+
+
+def midpoints(box: FloatArray) -> FloatArray:
+    """Return the middle of every range; the number closest to zero in one that is open."""
+    lower, upper = np.asarray(box, dtype=float).reshape(-1, 2).T
+    open_end = np.isinf(lower) | np.isinf(upper)
+    inside = np.clip(0.0, lower, upper)
+    result: FloatArray = inside.copy()
+    result[~open_end] = 0.5 * (lower[~open_end] + upper[~open_end])
+    return result
+
+
+def nominal_values(model: PlantLike, kind: Literal["x", "u"]) -> FloatArray:
+    """Return the nominal values; the middle of the range where none is declared."""
+    signals = model.x if kind == "x" else model.u
+    values = midpoints(model.box(kind))
+    for i, signal in enumerate(signals):
+        if signal.nominal is not None:
+            values[i] = float(signal.nominal)
+    return values
+
+
+def _start(observer: ObserverLike, memory: FloatArray | None, n_memory: int) -> FloatArray:
+    given = "memory=" if memory is not None else "what memory0 returned"
+    value = observer.memory0(nominal_values(observer.model, "x")) if memory is None else memory
+    start = np.array(value, dtype=float)
+    if start.shape != (n_memory,):
+        raise CodegenError(
+            f"{given} has shape {start.shape}; the layout of the memory asks for ({n_memory},)",
+            symbol="memory",
+        )
+    return start
+
+
+def _check_not_initialised(observer: ObserverLike, n_memory: int) -> None:
+    """Make sure that a state nobody has initialised is told apart by the step itself."""
+    model = observer.model
+    zeros = [np.zeros(size) for size in (n_memory, len(model.u), len(model.output_names))]
+    status = float(Machine(observer.step)(*zeros)[-1][0])
+    if not (status.is_integer() and int(status) & 1):
+        raise CodegenError(
+            f"the step returns status {status:g} for a memory of zeros; bit 1 (not initialised)"
+            " has to be set there, since zeros are what a C program holds before it calls init",
+            status=status,
+        )
+
+
+def _ports(model: PlantLike, kind: str) -> tuple[Port, ...]:
+    signals = getattr(model, kind)
+    box = np.asarray(model.box(kind), dtype=float).reshape(-1, 2)
+    names = unique(signal.name for signal in signals)
+    return tuple(
+        Port(c_name, signal.name, signal.unit, float(lower), float(upper))
+        for c_name, signal, (lower, upper) in zip(names, signals, box, strict=True)
+    )
+
+
+def _measurements(model: PlantLike) -> tuple[Port, ...]:
+    names = tuple(model.output_names)
+    return tuple(
+        Port(c_name, name, unit)
+        for c_name, name, unit in zip(unique(names), names, model.output_units, strict=True)
+    )
+
+
+def _hash(data: Mapping[str, Any]) -> str:
+    text = json.dumps(data, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,263 @@
+"""`generate_c`: a C project of one observer step, built and compared on the spot."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import operator
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any, Literal
+
+import casadi as ca
+
+from obsynth.codegen.build import Build, Comparison, build_and_compare, find_compiler
+from obsynth.codegen.description import Description, Port, describe
+from obsynth.codegen.errors import BuildError, CodegenError
+from obsynth.codegen.folder import KIND, MANIFEST, place
+from obsynth.codegen.interface import FloatArray, ObserverLike
+from obsynth.codegen.kernel import Kernel, generate_kernel
+from obsynth.codegen.render import generator_name, render
+from obsynth.codegen.vectors import Vectors, make_vectors
+
+__all__ = ["BACKENDS", "PRECISIONS", "CProject", "generate_c"]
+
+PRECISIONS = ("double",)
+"""Precisions that a project can be generated for."""
+
+BACKENDS = ("casadi",)
+"""Writers of the kernel."""
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class CProject:
+    """A C project on the disk.
+
+    Attributes
+    ----------
+    name : str
+        Prefix of every C name.
+    folder : Path
+    files : tuple of str
+        Paths relative to the folder, sorted.
+    sizes : mapping of str to int
+        Lengths of memory, u, y, x, f.
+    operations : int
+        Instructions of the step.
+    vectors : int
+        Number of recorded steps.
+    statuses : mapping of int to int
+        How often the recorded steps returned which status.
+    build : Build or None
+        How it was compiled; None where there is no compiler.
+    comparison : Comparison or None
+        That all vectors are equal to the last bit; None where there is no compiler.
+    """
+
+    name: str
+    folder: Path
+    files: tuple[str, ...]
+    sizes: Mapping[str, int]
+    operations: int
+    vectors: int
+    statuses: Mapping[int, int]
+    build: Build | None
+    comparison: Comparison | None
+
+    def _rows(self) -> list[tuple[str, str]]:
+        sizes = ", ".join(f"{count} {kind}" for kind, count in self.sizes.items())
+        rows = [
+            ("folder", str(self.folder)),
+            ("step", f"{self.operations} operations; {sizes}"),
+        ]
+        if self.build is None or self.comparison is None:
+            missing = "not compiled: no C compiler found (CC, cc, gcc, clang)"
+            rows.append(("build", missing))
+            rows.append(
+                ("comparison", f"not done; `make test` compares the {self.vectors} recorded steps")
+            )
+        else:
+            rows.append(("build", str(self.build)))
+            rows.append(("comparison", str(self.comparison)))
+        return rows
+
+    def __str__(self) -> str:
+        return "\n".join(
+            [f"C project {self.name}", *(f"  {key}: {text}" for key, text in self._rows())]
+        )
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in self._rows()
+        )
+        return f"<table><caption>C project {escape(self.name)}</caption>{rows}</table>"
+
+
+def generate_c(
+    observer: ObserverLike,
+    folder: str | os.PathLike[str],
+    name: str | None = None,
+    precision: Literal["double"] = "double",
+    backend: Literal["casadi"] = "casadi",
+    vectors: int = 10_000,
+    seed: int = 0,
+    overwrite: bool = False,
+    memory: FloatArray | None = None,
+) -> CProject:
+    """Write a C project of one observer step; build it and compare it where a compiler is there.
+
+    The project holds a header without CasADi's types (state, inputs and outputs as structs with
+    the signals' names and units; init, step, status bits), the sources (no heap, no global data),
+    recorded steps of CasADi's virtual machine with a program that compares them, an example,
+    CMake and make files, a README and a manifest. The same observer and options give the same
+    bytes.
+
+    Parameters
+    ----------
+    observer : Observer
+        A designed observer.
+    folder : path
+        Where the project shall be. It appears there only when it is complete and compared.
+    name : str, optional
+        Prefix of every C name; made from the plant's name by default.
+    precision : {"double"}
+    backend : {"casadi"}
+        Who writes the kernel.
+    vectors : int
+        Number of recorded steps, at least 100.
+    seed : int
+        Seed of the vectors.
+    overwrite : bool
+        Replace an older project in the same place. A folder that holds anything else is
+        refused all the same.
+    memory : ndarray of shape (n_memory,), optional
+        What ``NAME_init_default`` sets, from ``observer.memory0``; by default the memory for the
+        nominal state (the middle of its range) and the declared ranges.
+
+    Returns
+    -------
+    CProject
+
+    Raises
+    ------
+    CodegenError
+        If an option is not available, the observer cannot ship or the folder is not free.
+    BuildError
+        If the compiler rejects the code.
+    ComparisonError
+        If the compiled step differs from CasADi's virtual machine in any bit.
+
+    Examples
+    --------
+    >>> generate_c(observer=None, folder="tank", precision="single")
+    Traceback (most recent call last):
+    ...
+    obsynth.codegen.errors.CodegenError: precision='single' is not available; available: 'double'
+    """
+    _available("precision", precision, PRECISIONS)
+    _available("backend", backend, BACKENDS)
+    count, start = _whole("vectors", vectors), _whole("seed", seed)
+    if start < 0:
+        raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
+    description = describe(observer, name, memory)
+    kernel = generate_kernel(observer.step, description.name)
+    recorded = make_vectors(description, count, start)
+    files = render(description, kernel, recorded, start_given=memory is not None)
+    files[MANIFEST] = _manifest(description, kernel, recorded, start, files)
+
+    def check(place: Path) -> tuple[Build, Comparison] | None:
+        compiler = find_compiler()
+        if compiler is None:
+            return None
+        build, comparison = build_and_compare(place, description.name, compiler=compiler)
+        if (comparison.vectors, comparison.values) != (recorded.count, recorded.values):
+            raise BuildError(
+                f"the test compared {comparison.vectors} steps and {comparison.values} values of"
+                f" {recorded.count} and {recorded.values}",
+                command=compiler,
+                output=str(comparison),
+            )
+        return build, comparison
+
+    target, result = place(folder, files, overwrite, check)
+    build, comparison = (None, None) if result is None else result
+    return CProject(
+        name=description.name,
+        folder=target,
+        files=tuple(sorted(files)),
+        sizes=description.sizes,
+        operations=kernel.operations,
+        vectors=recorded.count,
+        statuses=recorded.statuses,
+        build=build,
+        comparison=comparison,
+    )
+
+
+def _available(option: str, value: str, values: tuple[str, ...]) -> None:
+    if value not in values:
+        raise CodegenError(
+            f"{option}={value!r} is not available; available: {', '.join(map(repr, values))}",
+            option=option,
+            available=values,
+        )
+
+
+def _whole(option: str, value: Any) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise CodegenError(f"{option}={value!r} is no whole number", option=option) from None
+
+
+def _manifest(
+    description: Description,
+    kernel: Kernel,
+    vectors: Vectors,
+    seed: int,
+    files: Mapping[str, str],
+) -> str:
+    observer = description.observer
+    data = {
+        "kind": KIND,
+        "format": _FORMAT,
+        "name": description.name,
+        "versions": {"obsynth": generator_name().split()[-1], "casadi": ca.CasadiMeta.version()},
+        "model": {"name": observer.model.name, "sha256": description.model_hash},
+        "method": observer.method,
+        "precision": PRECISIONS[0],
+        "backend": BACKENDS[0],
+        "sample_time": description.sample_time,
+        "fault_delay": observer.fault_delay,
+        "sizes": description.sizes,
+        "memory": {
+            field.name: [field.start, field.start + field.size] for field in description.fields
+        },
+        "signals": {kind: _signals(getattr(description, kind)) for kind in ("u", "y", "x", "f")},
+        "guarantee": {
+            "claims": list(observer.guarantee.claims),
+            "assumptions": list(observer.guarantee.assumptions),
+        },
+        "operations": kernel.operations,
+        "library_functions": list(kernel.library),
+        "not_defined_to_the_last_bit": list(kernel.inexact),
+        "vectors": {
+            "count": vectors.count,
+            "seed": seed,
+            "kinds": dict(vectors.kinds),
+            "statuses": {str(status): times for status, times in vectors.statuses.items()},
+        },
+        "files": {
+            path: hashlib.sha256(text.encode()).hexdigest() for path, text in sorted(files.items())
+        },
+    }
+    return json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _signals(ports: tuple[Port, ...]) -> list[dict[str, str]]:
+    return [{"name": port.name, "unit": port.unit} for port in ports]

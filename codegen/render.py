@@ -1,0 +1,166 @@
+"""The text files of a project, from templates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from obsynth.codegen.description import Description, Port, midpoints, nominal_values
+from obsynth.codegen.interface import FloatArray
+from obsynth.codegen.kernel import Kernel
+from obsynth.codegen.machine import Machine
+from obsynth.codegen.names import c_comment, c_number
+from obsynth.codegen.vectors import Vectors
+from obsynth.designs.observer import STATUS
+
+__all__ = ["generator_name", "render"]
+
+_MEANINGS = {
+    "not_initialised": "the state has not been initialised; nothing else is of use",
+    "non_finite_input": "an input or a measurement is NaN, infinite or absurdly large",
+    "outside_domain": "the returned set is not inside the domain where the guarantee holds",
+    "inconsistent_measurement": "the measurement contradicts the set: an assumption is violated",
+    "fault_not_valid": "the fault estimate and its bounds are not valid",
+}
+
+_ARGUMENTS = {
+    "memory": "memory",
+    "u": "in->u",
+    "y": "in->y",
+    "next": "next",
+    "status": "status",
+}
+
+_EXAMPLE_STEPS = 5
+
+
+def generator_name() -> str:
+    """Return name and version of this package, as generated files show them."""
+    return f"obsynth {version('obsynth')}"
+
+
+def _example(description: Description) -> list[tuple[str, str]]:
+    """Return inputs and measurements of a plant that starts in its nominal state."""
+    model = description.observer.model
+    plant = Machine(model.function())
+    x, u = nominal_values(model, "x"), nominal_values(model, "u")
+    d, w, p, rho = (midpoints(model.box(kind)) for kind in ("d", "w", "p", "rho"))
+    rows = []
+    for _ in range(_EXAMPLE_STEPS):
+        following, y = plant(x, u, d, np.zeros(len(model.f)), w, p, rho)
+        rows.append((_row(u), _row(y)))
+        x = following
+    return rows
+
+
+def _row(values: FloatArray) -> str:
+    # Six digits serve an example; a plant that diverges must not break its C.
+    return ", ".join(c_number(float(f"{v:.6g}") if math.isfinite(v) else 0.0) for v in values)
+
+
+def _listed(ports: tuple[Port, ...]) -> str:
+    return ", ".join(f"{p.name} [{p.unit}]" if p.unit else p.name for p in ports)
+
+
+def render(
+    description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
+) -> dict[str, str]:
+    """Fill in the templates.
+
+    Parameters
+    ----------
+    description : Description
+    kernel : Kernel
+    vectors : Vectors
+    start_given : bool
+        Whether the memory of ``NAME_init_default`` came from the user.
+
+    Returns
+    -------
+    dict of str to str
+        Text by path relative to the project's folder; all but the manifest.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters["number"] = c_number
+    environment.filters["comment"] = c_comment
+    environment.filters["cell"] = lambda text: " ".join(text.replace("|", "\\|").split())
+    values = _values(description, kernel, vectors, start_given)
+    name = description.name
+    templates = {
+        f"include/{name}.h": "header.h.j2",
+        f"src/{name}.c": "source.c.j2",
+        f"src/{name}_kernel.h": "kernel.h.j2",
+        f"tests/test_{name}.c": "runner.c.j2",
+        "examples/main.c": "example.c.j2",
+        "CMakeLists.txt": "CMakeLists.txt.j2",
+        "Makefile": "Makefile.j2",
+        "README.md": "README.md.j2",
+    }
+    files = {
+        path: environment.get_template(template).render(values)
+        for path, template in templates.items()
+    }
+    files["tests/vectors.txt"] = vectors.text
+    return files
+
+
+def _values(
+    description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
+) -> Mapping[str, Any]:
+    observer, sizes = description.observer, description.sizes
+    signals = {"u": description.u, "y": description.y, "x": description.x, "f": description.f}
+    outputs = [("xhat", sizes["x"]), ("fhat", sizes["f"])]
+    outputs += [(f"{kind}_{end}", sizes[kind]) for kind in "xf" for end in ("lower", "upper")]
+    start = nominal_values(observer.model, "x")
+    return {
+        "name": description.name,
+        "macro": description.name.upper(),
+        "generator": generator_name(),
+        "casadi": ca.CasadiMeta.version(),
+        "method": observer.method,
+        "plant": observer.model.name,
+        "model_hash": description.model_hash,
+        "sample_time": description.sample_time,
+        "fault_delay": observer.fault_delay,
+        "n": sizes,
+        "signals": [(kind, ports) for kind, ports in signals.items() if ports],
+        "signals_text": {kind: _listed(ports) for kind, ports in signals.items()},
+        "status": [
+            {"name": bit, "value": value, "meaning": _MEANINGS.get(bit, bit.replace("_", " "))}
+            for bit, value in STATUS.items()
+        ],
+        "all_bits": sum(STATUS.values()),
+        "fields": description.fields,
+        "start": description.start,
+        "start_given": start_given,
+        "start_guess": [] if start_given else list(zip(description.x, start, strict=True)),
+        "kernel": kernel,
+        "call": ",\n        ".join(
+            _ARGUMENTS.get(name, f"result.{name}") for name in kernel.arguments
+        ),
+        "reads_in": bool({"u", "y"} & set(kernel.arguments)),
+        "library": kernel.library,
+        "inexact": kernel.inexact,
+        "outputs": [(name, length) for name, length in outputs if length],
+        "example": _example(description),
+        "count": vectors.count,
+        "kinds": vectors.kinds,
+        "claims": [" ".join(text.split()) for text in observer.guarantee.claims],
+        "assumptions": [" ".join(text.split()) for text in observer.guarantee.assumptions],
+        "inf": math.inf,
+    }

@@ -1,0 +1,131 @@
+"""Signals that drive a step as a plant would: trajectories inside the declared ranges."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.codegen.description import Description, midpoints, nominal_values
+from obsynth.codegen.interface import FloatArray
+from obsynth.codegen.machine import Machine
+
+__all__ = ["Drive", "random_memory"]
+
+_KINDS = ("u", "d", "f", "w", "p", "rho")
+_HOLD = 20
+
+
+def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
+    """Return a box to draw from: open ends close one unit from the nominal value."""
+    lower = np.where(np.isfinite(box[:, 0]), box[:, 0], np.minimum(nominal, box[:, 1]) - 1.0)
+    upper = np.where(np.isfinite(box[:, 1]), box[:, 1], np.maximum(nominal, lower) + 1.0)
+    return np.column_stack([lower, upper])
+
+
+class Drive:
+    """Inputs and measurements along random trajectories of the plant.
+
+    Parameters
+    ----------
+    description : Description
+    rng : numpy.random.Generator
+
+    Notes
+    -----
+    The trajectories serve to reach the memories and branches that a step meets in service.
+    Whether they are admissible does not matter: states that leave their declared range
+    are put back on its border.
+    """
+
+    def __init__(self, description: Description, rng: np.random.Generator) -> None:
+        model = description.observer.model
+        self.rng = rng
+        self._observer = description.observer
+        self._plant = Machine(model.function())
+        self._nominal = nominal_values(model, "x")
+        self._x_box = _finite(self._box("x"), self._nominal)
+        self._boxes = {
+            kind: _finite(self._box(kind), midpoints(self._box(kind))) for kind in _KINDS
+        }
+        self._sequence = 0
+        self._x = self._nominal
+        self._levels = {kind: self._draw(kind) for kind in _KINDS}
+        self._u = np.empty((0, len(model.u)))
+        self._ramp = np.empty((0, len(model.f)))
+        self._measured = self._measure(self._x)
+
+    def _box(self, kind: str) -> FloatArray:
+        return np.asarray(self._observer.model.box(kind), dtype=float).reshape(-1, 2)
+
+    def _draw(self, kind: str) -> FloatArray:
+        box = self._boxes[kind]
+        return self.rng.uniform(box[:, 0], box[:, 1])
+
+    def _measure(self, x: FloatArray) -> FloatArray:
+        self._following, y = self._plant(x, *(self._levels[kind] for kind in _KINDS))
+        return y
+
+    def begin(self, length: int) -> FloatArray | None:
+        """Start a trajectory of `length` samples; return the observer's memory for it.
+
+        None stands for the default memory. Every second trajectory starts from a guess of
+        its own, and two thirds of them carry a fault that grows from a random instant.
+        """
+        rng = self.rng
+        self._sequence += 1
+        holds = -(-length // _HOLD)
+        self._u = np.repeat([self._draw("u") for _ in range(holds)], _HOLD, axis=0)
+        onset = int(rng.integers(length))
+        ramp = np.clip((np.arange(length) - onset) / (0.5 * length), 0.0, 1.0)
+        target = self._draw("f") * (self._sequence % 3 > 0)
+        self._ramp = ramp[:, None] * target
+        self._levels["p"] = self._draw("p")
+        self._x = rng.uniform(self._x_box[:, 0], self._x_box[:, 1])
+        if self._sequence % 2:
+            return None
+        return np.array(self._observer.memory0(self._x), dtype=float)
+
+    def sample(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return (u_k, y_k) of the trajectory and move the plant on."""
+        for kind in ("d", "w", "rho"):
+            self._levels[kind] = self._draw(kind)
+        self._levels["u"] = self._u[k]
+        self._levels["f"] = self._ramp[k]
+        y = self._measure(self._x)
+        following = np.clip(self._following, self._x_box[:, 0], self._x_box[:, 1])
+        self._x = following if np.isfinite(following).all() else self._nominal
+        if np.isfinite(y).all():
+            self._measured = y
+        return self._u[k].copy(), y
+
+    def wide(self) -> tuple[FloatArray, FloatArray]:
+        """Return inputs and measurements spread around those seen last, over many magnitudes."""
+        u, y = self._draw("u"), self._measured
+        return _spread(self.rng, u), _spread(self.rng, y)
+
+
+def _spread(rng: np.random.Generator, values: FloatArray) -> FloatArray:
+    size = values.size
+    wide: FloatArray = rng.standard_normal(size) * 10.0 ** rng.uniform(-6, 6, size)
+    near: FloatArray = values * (1.0 + 0.3 * rng.standard_normal(size))
+    return np.where(rng.random(size) < 0.3, wide, near)
+
+
+def random_memory(rng: np.random.Generator, near: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return a memory around one that was visited; some entries far from it.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    near : ndarray of shape (n_memory,)
+        A memory that occurred.
+    scale : ndarray of shape (n_memory,)
+        Largest magnitudes that occurred.
+    """
+    size = near.size
+    base = np.where(np.isfinite(near), near, scale)
+    close: FloatArray = base * (1.0 + 0.2 * rng.standard_normal(size))
+    far: FloatArray = scale * rng.standard_normal(size) * 10.0 ** rng.uniform(-3, 3, size)
+    choice = rng.random(size)
+    kept: FloatArray = np.where(choice < 0.6, close, far)
+    # Flags and counters hold whole numbers; kept as they are often enough, they select branches.
+    return np.where(rng.random(size) < 0.5, base, kept)

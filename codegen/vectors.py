@@ -1,0 +1,246 @@
+"""Test vectors: what CasADi's virtual machine returns for the step, bit by bit."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.codegen.description import Description
+from obsynth.codegen.errors import CodegenError
+from obsynth.codegen.interface import FloatArray
+from obsynth.codegen.machine import Machine
+from obsynth.codegen.sequences import Drive, random_memory
+from obsynth.designs.observer import STATUS, STEP_OUTPUTS
+
+__all__ = ["MINIMUM", "SHARES", "Vectors", "bits", "make_vectors"]
+
+MINIMUM = 100
+"""Fewest vectors that still hold some of every kind."""
+
+SHARES: Mapping[str, float] = {
+    "closed loop": 0.5,
+    "closed loop with failing signals": 0.2,
+    "random": 0.14,
+    "extreme": 0.14,
+    "not initialised": 0.02,
+}
+"""Share of every kind of vectors."""
+
+_SEQUENCE = 250
+_ALL_BITS = sum(STATUS.values())
+_EXTREMES = np.array(
+    [
+        0.0,
+        -0.0,
+        5e-324,
+        -2.2250738585072014e-308,
+        1e-160,
+        1e160,
+        -1e300,
+        1.0000000000000002e300,
+        sys.float_info.max,
+        -sys.float_info.max,
+        np.inf,
+        -np.inf,
+        np.nan,
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Vectors as the text that the C runner reads.
+
+    Attributes
+    ----------
+    text : str
+        One record a line, see the README of a generated project.
+    count : int
+        Number of steps.
+    values : int
+        How many numbers the runner has to compare: results, statuses and memories.
+    kinds : mapping of str to int
+        How many steps of which kind.
+    statuses : mapping of int to int
+        How often the steps returned which status.
+    """
+
+    text: str
+    count: int
+    values: int
+    kinds: Mapping[str, int]
+    statuses: Mapping[int, int]
+
+
+def bits(values: FloatArray) -> str:
+    """Return doubles as IEEE 754 bit patterns in hexadecimal, without trailing zeros.
+
+    Every NaN is written as the same one: which of the NaNs an operation returns is not
+    defined, neither by IEEE 754 nor by C.
+
+    Examples
+    --------
+    >>> bits(np.array([1.0, -2.0, 0.0, 0.1]))
+    '3ff c 0 3fb999999999999a'
+    """
+    flat = np.array(values, dtype=float).ravel()
+    flat[np.isnan(flat)] = np.nan
+    text = flat.astype(">f8").tobytes().hex()
+    return " ".join(text[i : i + 16].rstrip("0") or "0" for i in range(0, len(text), 16))
+
+
+class _Recorder:
+    """The state of a C program that runs through the vectors, kept by the virtual machine."""
+
+    def __init__(self, description: Description) -> None:
+        self._step = Machine(description.observer.step)
+        self._start = description.start
+        self._zeros = np.zeros_like(description.start)
+        self.memory = self._zeros
+        self.lines: list[str] = []
+        self.statuses: Counter[int] = Counter()
+        self.values = 0
+
+    def forget(self) -> None:
+        """Record a call of NAME_init."""
+        self._set("N", self._zeros)
+
+    def default(self) -> None:
+        """Record a call of NAME_init_default."""
+        self._set("D", self._start)
+
+    def load(self, memory: FloatArray) -> None:
+        """Record a call of NAME_set_memory."""
+        self._set("M", memory)
+
+    def _set(self, letter: str, memory: FloatArray) -> None:
+        self.memory = memory.copy()
+        self.lines.append(f"{letter} {bits(memory)}")
+        self.values += memory.size
+
+    def step(self, u: FloatArray, y: FloatArray) -> None:
+        """Record one step and carry the memory along."""
+        arrays = self._step(self.memory, u, y)
+        status = float(arrays[-1][0])
+        if not (status.is_integer() and 0 <= status <= _ALL_BITS):
+            raise CodegenError(
+                f"the step returns status {status!r}, which is no mask of the bits"
+                f" {', '.join(map(str, STATUS.values()))}",
+                status=status,
+                memory=self.memory,
+                u=u,
+                y=y,
+            )
+        self.memory = arrays[STEP_OUTPUTS.index("memory")]
+        self.statuses[int(status)] += 1
+        self.values += sum(array.size for array in arrays)
+        numbers = np.concatenate([u, y, *arrays[:-1]])
+        self.lines.append(f"S {int(status)} {bits(numbers)}")
+
+
+def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -> Vectors:
+    """Run the step on the virtual machine and record every input and result.
+
+    Half of the steps are sequences of 250 along trajectories of the plant, the memory carried
+    along by the C program itself; another fifth are such sequences with failing signals. The
+    others start from random memories, hold extreme and non-finite numbers anywhere,
+    or follow `NAME_init` without an initialised memory.
+
+    Parameters
+    ----------
+    description : Description
+    count : int
+        Number of steps, at least 100.
+    seed : int
+        Seed of NumPy's default generator.
+
+    Raises
+    ------
+    CodegenError
+        If the count is too small, or if the step returns a status that is no bit mask.
+    """
+    if count < MINIMUM:
+        raise CodegenError(
+            f"vectors={count}; at least {MINIMUM} are needed for some of every kind",
+            vectors=count,
+        )
+    rng = np.random.default_rng(seed)
+    recorder = _Recorder(description)
+    drive = Drive(description, rng)
+    kinds = _quotas(count)
+    visited = [description.start]
+    for kind, failing in (("closed loop", False), ("closed loop with failing signals", True)):
+        for length in _lengths(kinds[kind]):
+            _follow(recorder, drive, length, failing)
+            visited.append(recorder.memory)
+    scale = _scale(visited)
+    for i in range(kinds["random"]):
+        recorder.load(random_memory(rng, visited[i % len(visited)], scale))
+        recorder.step(*drive.wide())
+    for i in range(kinds["extreme"]):
+        memory = visited[i % len(visited)].copy()
+        u, y = drive.wide()
+        if i % 2:
+            memory = random_memory(rng, memory, scale)
+        # Extremes in the memory would hide those in u and y: a step must cope with either.
+        _spoil(rng, [memory] if i % 3 == 0 else [u, y])
+        recorder.load(memory)
+        recorder.step(u, y)
+    for length in _lengths(kinds["not initialised"], 4):
+        recorder.forget()
+        for _ in range(length):
+            recorder.step(*drive.wide())
+    sizes = description.sizes
+    head = [description.name, *(str(sizes[key]) for key in ("memory", "u", "y", "x", "f"))]
+    lines = [" ".join(("obsynth-vectors", "1", *head, str(count))), *recorder.lines]
+    return Vectors(
+        text="\n".join(lines) + "\n",
+        count=count,
+        values=recorder.values,
+        kinds=kinds,
+        statuses=dict(sorted(recorder.statuses.items())),
+    )
+
+
+def _quotas(count: int) -> dict[str, int]:
+    kinds = {kind: int(share * count) for kind, share in SHARES.items()}
+    kinds["closed loop"] += count - sum(kinds.values())
+    return kinds
+
+
+def _lengths(total: int, most: int = _SEQUENCE) -> Iterator[int]:
+    for start in range(0, total, most):
+        yield min(most, total - start)
+
+
+def _follow(recorder: _Recorder, drive: Drive, length: int, failing: bool) -> None:
+    guess = drive.begin(length)
+    if guess is None:
+        recorder.default()
+    else:
+        recorder.load(guess)
+    for k in range(length):
+        u, y = drive.sample(k)
+        # Whole stretches fail, so that what follows a failure is tested too.
+        if failing and k % 25 in (7, 8, 9, 20):
+            _spoil(drive.rng, [u, y])
+        recorder.step(u, y)
+
+
+def _spoil(rng: np.random.Generator, arrays: list[FloatArray]) -> None:
+    """Replace one to three entries by extreme or non-finite numbers, in place."""
+    places = [(array, i) for array in arrays for i in range(array.size)]
+    for _ in range(rng.integers(1, 4)):
+        array, i = places[rng.integers(len(places))]
+        array[i] = rng.choice(_EXTREMES)
+
+
+def _scale(visited: list[FloatArray]) -> FloatArray:
+    stacked = np.abs(np.array(visited))
+    stacked[~np.isfinite(stacked)] = 0.0
+    largest: FloatArray = stacked.max(axis=0)
+    return np.where(largest > 0, largest, 1.0)
