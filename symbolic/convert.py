@@ -65,7 +65,7 @@ def nearest_double(number: sp.Expr) -> float:
 
 
 def to_sx(
-    expressions: Sequence[sp.Expr], symbols: Mapping[sp.Symbol, ca.SX], where: str = "expression"
+    expressions: Sequence[sp.Expr], symbols: Mapping[sp.Symbol, ca.SX], labels: Sequence[str]
 ) -> list[ca.SX]:
     """Convert SymPy expressions to SX.
 
@@ -75,8 +75,8 @@ def to_sx(
         The rows.
     symbols : mapping of sympy.Symbol to casadi.SX
         The SX scalar each symbol becomes.
-    where : str
-        What a row is called in messages.
+    labels : sequence of str
+        What each row is called in messages.
 
     Returns
     -------
@@ -92,13 +92,13 @@ def to_sx(
     Examples
     --------
     >>> x = sp.Symbol("x", real=True)
-    >>> to_sx([sp.sqrt(x) + sp.Abs(x)], {x: ca.SX.sym("x")})
-    [SX((fabs(x)+sqrt(x)))]
+    >>> to_sx([sp.sqrt(x) + sp.Abs(x)], {x: ca.SX.sym("x")}, ["row 1"])
+    [SX((sqrt(x)+fabs(x)))]
     """
     walker = _Walker(symbols)
     rows = []
-    for number, expression in enumerate(expressions, start=1):
-        walker.where = f"{where} row {number}"
+    for label, expression in zip(labels, expressions, strict=True):
+        walker.where = label
         rows.append(walker.visit(expression))
     return rows
 

@@ -1,6 +1,5 @@
 """From the arguments of a declaration to signals: names, broadcasting, checks."""
 
-import keyword
 import math
 import re
 from collections.abc import Sequence
@@ -13,11 +12,12 @@ import sympy as sp
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import ALIASES, BY_NAME
 from obsynth.symbolic.signals import Role, Signal
+from obsynth.symbolic.text import WORDS
 
 __all__ = ["RESERVED", "exact_number", "expand_names", "make_signals", "per_symbol"]
 
-RESERVED = frozenset({*BY_NAME, *ALIASES, "pi", "piecewise", "Piecewise", *keyword.kwlist})
-"""Names that mean something else in the text form of an equation."""
+RESERVED = (WORDS | BY_NAME.keys() | ALIASES.keys()) - {"phi1", "tanhc"}
+"""Names that would read as something else; phi1 is too good a name for an angle."""
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 

@@ -1,16 +1,14 @@
 """From derivatives to next values: Euler's and the classical Runge-Kutta formula."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import sympy as sp
 
 from obsynth.symbolic.declare import exact_number
 from obsynth.symbolic.errors import PlantError
 
-if TYPE_CHECKING:
-    from obsynth.symbolic.plant import Plant
-
-__all__ = ["METHODS", "discrete_rows", "sampling_time"]
+__all__ = ["METHODS", "check_method", "next_values", "runge_kutta", "sampling_time"]
 
 METHODS = ("euler", "rk4")
 """The methods by name."""
@@ -49,53 +47,81 @@ def sampling_time(Ts: Any) -> sp.Expr:
     return number
 
 
-def discrete_rows(plant: "Plant", method: str, Ts: Any) -> tuple[tuple[sp.Expr, ...], sp.Expr]:
-    """Discretise the dynamics of a continuous plant, its inputs held over a step.
+def check_method(method: str) -> str:
+    """Return the name of a method, or refuse it with the names there are.
 
-    Whatever stands in the dynamics (unknown inputs, disturbances, faults) is multiplied
-    by Ts with them.
-
-    Parameters
-    ----------
-    plant : Plant
-        A complete continuous plant.
-    method : str
-        ``"euler"`` or ``"rk4"``.
-    Ts : float or sympy.Rational
-        Sampling time in seconds.
-
-    Returns
-    -------
-    tuple of sympy.Expr
-        The next value of every state, before faults are inserted.
-    sympy.Expr
-        The sampling time as an exact number.
-
-    Raises
-    ------
-    PlantError
-        The plant is discrete, the method unknown, Ts not positive.
+    Examples
+    --------
+    >>> check_method("euler")
+    'euler'
     """
     if method not in METHODS:
         raise PlantError(
             f"discretisation {method!r} is unknown; methods are {', '.join(METHODS)}",
             method=method,
         )
-    if plant.Ts is not None:
-        raise PlantError(f"plant {plant.name!r} is discrete already (Ts = {plant.Ts} s)")
-    step = sampling_time(Ts)
-    rates = sp.Matrix(plant._dynamics)
-    x = sp.Matrix([signal.symbol for signal in plant.x])
-    rows = x + step * rates if method == "euler" else _rk4(x, rates, step)
-    return tuple(rows), step
+    return method
 
 
-def _rk4(x: sp.Matrix, rates: sp.Matrix, step: sp.Expr) -> sp.Matrix:
+def next_values(
+    method: str, x: Sequence[sp.Symbol], rates: Sequence[sp.Expr], step: sp.Expr
+) -> tuple[sp.Expr, ...]:
+    """Return the next value of every state, everything else held over the step.
+
+    Parameters
+    ----------
+    method : {"euler", "rk4"}
+        Euler keeps quasi-LPV and QPV structure. A Runge-Kutta step substitutes the
+        equations into themselves three times, so its expressions are long.
+    x : sequence of sympy.Symbol
+        States.
+    rates : sequence of sympy.Expr
+        Their time derivatives.
+    step : sympy.Expr
+        Sampling time.
+
+    Returns
+    -------
+    tuple of sympy.Expr
+
+    Examples
+    --------
+    >>> z = sp.Symbol("z")
+    >>> next_values("rk4", [z], [-z], sp.Integer(1))
+    (3*z/8,)
+    """
+    state, derivative = sp.Matrix(x), sp.Matrix(rates)
+    if method == "euler":
+        return tuple(state + step * derivative)
+
     def at(point: sp.Matrix) -> sp.Matrix:
-        return rates.xreplace(dict(zip(x, point, strict=True)))
+        return derivative.xreplace(dict(zip(x, point, strict=True)))
 
-    k1 = rates
-    k2 = at(x + step / 2 * k1)
-    k3 = at(x + step / 2 * k2)
-    k4 = at(x + step * k3)
+    return tuple(runge_kutta(at, state, step))
+
+
+def runge_kutta(rates: Callable[[Any], Any], x: Any, step: Any) -> Any:
+    """Return one step of the classical formula of order four.
+
+    Parameters
+    ----------
+    rates : callable
+        Maps a state column to its derivative; SymPy, SX or NumPy.
+    x : column
+    step : number
+
+    Returns
+    -------
+    column
+        Of the kind that ``rates`` returns.
+
+    Examples
+    --------
+    >>> round(runge_kutta(lambda x: x, 1.0, 0.1), 6)
+    1.105171
+    """
+    k1 = rates(x)
+    k2 = rates(x + step / 2 * k1)
+    k3 = rates(x + step / 2 * k2)
+    k4 = rates(x + step * k3)
     return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

@@ -12,21 +12,20 @@ from sympy.core.relational import Relational
 from sympy.functions.elementary.piecewise import ExprCondPair
 from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
 
+from obsynth.symbolic.declare import expand_names, per_symbol
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
+from obsynth.symbolic.text import TextError, read_text
 
-__all__ = ["canonical", "read_rows"]
+__all__ = ["canonical", "read_dynamics", "read_outputs", "read_rows"]
 
-_STRUCTURE = (
+_PLAIN = (
+    sp.Symbol,
     sp.Add,
     sp.Mul,
     sp.Pow,
     sp.Piecewise,
-    ExprCondPair,
     Relational,
-    And,
-    Or,
-    Not,
     BooleanTrue,
     BooleanFalse,
 )
@@ -74,6 +73,98 @@ def read_rows(rows: Any, symbols: Mapping[str, sp.Symbol], what: str) -> tuple[s
     return tuple(_read(row, symbols, f"{what} row {k}") for k, row in enumerate(rows, start=1))
 
 
+def read_dynamics(
+    rows: Any, symbols: Mapping[str, sp.Symbol], states: Sequence[str]
+) -> tuple[sp.Expr, ...]:
+    """Read one row for each state.
+
+    Parameters
+    ----------
+    rows : sequence of expressions, or a column matrix
+    symbols : mapping of str to sympy.Symbol
+    states : sequence of str
+        Names of the states.
+
+    Returns
+    -------
+    tuple of sympy.Expr
+
+    Raises
+    ------
+    PlantError
+        As :func:`read_rows`; another number of rows than states, or no state at all.
+
+    Examples
+    --------
+    >>> x = sp.Symbol("x", real=True)
+    >>> read_dynamics(["-x"], {"x": x}, ["x"])
+    (-x,)
+    """
+    if not states:
+        raise PlantError("a plant needs at least one state; declare states first")
+    found = read_rows(rows, symbols, "dynamics")
+    if len(found) != len(states):
+        raise PlantError(
+            f"dynamics has {len(found)} rows for {len(states)} states ({', '.join(states)})",
+            rows=len(found),
+            states=tuple(states),
+        )
+    return found
+
+
+def read_outputs(
+    rows: Any, symbols: Mapping[str, sp.Symbol], names: Any, unit: Any
+) -> tuple[dict[str, sp.Expr], tuple[str, ...]]:
+    """Read outputs with their names and units.
+
+    Parameters
+    ----------
+    rows : sequence of expressions, or a column matrix
+    symbols : mapping of str to sympy.Symbol
+    names : str, sequence of str or None
+        None: y1, y2, ...
+    unit : str or sequence of str
+
+    Returns
+    -------
+    dict of str to sympy.Expr
+        The outputs by name.
+    tuple of str
+        Their units.
+
+    Raises
+    ------
+    PlantError
+        As :func:`read_rows`; no output, names that are taken or not as many as rows.
+
+    Examples
+    --------
+    >>> x = sp.Symbol("x", real=True)
+    >>> read_outputs([x], {"x": x}, None, "cm")
+    ({'y1': x}, ('cm',))
+    """
+    found = read_rows(rows, symbols, "outputs")
+    if not found:
+        raise PlantError("outputs is empty: an observer needs at least one measurement")
+    default = [f"y{k}" for k in range(1, len(found) + 1)]
+    named = expand_names(default if names is None else names, "output")
+    if len(named) != len(found):
+        raise PlantError(
+            f"outputs has {len(found)} rows and {len(named)} names ({', '.join(named)})",
+            rows=len(found),
+            names=named,
+        )
+    taken = next((name for name in named if name in symbols), None)
+    if taken is not None:
+        raise PlantError(
+            f"output {taken}: the name is taken by a signal; give other names=", symbol=taken
+        )
+    units = per_symbol(unit, named, "unit")
+    if not all(isinstance(item, str) for item in units):
+        raise PlantError(f"outputs: unit= is text such as 'cm', not {unit!r}", unit=unit)
+    return dict(zip(named, found, strict=True)), tuple(units)
+
+
 def canonical(expression: sp.Expr) -> sp.Expr:
     """Rebuild an expression from its parts until it no longer changes.
 
@@ -108,10 +199,19 @@ def _rebuild(node: sp.Basic, done: dict[sp.Basic, sp.Basic]) -> sp.Basic:
             done[node] = sp.Float(float(node))
         elif node.args:
             arguments = [_rebuild(argument, done) for argument in node.args]
-            done[node] = node.func(*arguments)
+            done[node] = _closed(node.func(*arguments))
         else:
             done[node] = node
     return done[node]
+
+
+def _closed(node: sp.Basic) -> sp.Basic:
+    """Let the last case of an exhaustive Piecewise be the one that is left."""
+    if isinstance(node, sp.Piecewise) and node.args[-1][1] != sp.true:
+        *cases, (last, condition) = node.args
+        if Or(*(c for _, c in cases), condition) == sp.true:
+            return sp.Piecewise(*cases, (last, True))
+    return node
 
 
 def _read(row: Any, symbols: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
@@ -119,6 +219,11 @@ def _read(row: Any, symbols: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
         raise PlantError(f"{where}: this is a CasADi expression; use Plant.from_casadi")
     if isinstance(row, np.generic):
         row = row.item()
+    if isinstance(row, str):
+        try:
+            row = read_text(row, symbols)
+        except TextError as error:
+            raise TextError(f"{where}: {error}", **error.facts | {"where": where}) from None
     if isinstance(row, bool) or not isinstance(row, int | float | sp.Basic):
         raise PlantError(f"{where}: {row!r} is not an expression", where=where)
     expression = sp.sympify(row)
@@ -165,18 +270,31 @@ def _match(symbol: sp.Basic, symbols: Mapping[str, sp.Symbol], where: str) -> sp
 def _check_nodes(expression: sp.Expr, where: str) -> None:
     """Refuse whatever has no meaning as a real function of the plant's signals."""
     for node in sp.preorder_traversal(expression):
-        if isinstance(node, sp.Symbol | sp.Integer | sp.Rational) and node.is_finite is not False:
-            continue
-        if isinstance(node, sp.Float) and math.isfinite(float(node)):
-            continue
-        if node in (sp.pi, sp.E) or isinstance(node, _STRUCTURE) or node.func in BY_CLASS:
-            continue
-        if isinstance(node, sp.Number) or node in (sp.I, sp.zoo, sp.nan):
-            raise PlantError(f"{where}: {node} in {expression} is not a finite real number")
-        name = node.func.__name__
-        raise PlantError(
-            f"{where}: the function {name} in {expression} is not supported; supported are "
-            f"{', '.join(sorted(BY_NAME))}, Piecewise",
-            function=name,
-            where=where,
-        )
+        if isinstance(node, sp.Number) or node in (sp.I, sp.zoo):
+            if not (isinstance(node, sp.Rational | sp.Float) and math.isfinite(_float(node))):
+                raise PlantError(
+                    f"{where}: {node} in {expression} is not a finite real number", where=where
+                )
+        elif isinstance(node, And | Or | Not | ExprCondPair):
+            conditions = node.args[1:] if isinstance(node, ExprCondPair) else node.args
+            if any(isinstance(condition, sp.Symbol) for condition in conditions):
+                raise PlantError(f"{where}: a symbol is used as a condition in {node}", where=where)
+        elif isinstance(node, sp.Piecewise) and node.args[-1][1] != sp.true:
+            raise PlantError(
+                f"{where}: {node} leaves cases open; end it with (expression, True)", where=where
+            )
+        elif not (isinstance(node, _PLAIN) or node in (sp.pi, sp.E) or node.func in BY_CLASS):
+            name = node.func.__name__
+            raise PlantError(
+                f"{where}: the function {name} in {expression} is not supported; supported are "
+                f"{', '.join(sorted(BY_NAME))}, Piecewise",
+                function=name,
+                where=where,
+            )
+
+
+def _float(number: sp.Number) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        return math.inf

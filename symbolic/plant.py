@@ -1,6 +1,6 @@
 """The plant: signals, dynamics and outputs as the control engineer writes them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, Self
 
@@ -9,24 +9,22 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.symbolic.declare import exact_number, expand_names, make_signals, per_symbol
-from obsynth.symbolic.discretise import discrete_rows, sampling_time
-from obsynth.symbolic.equations import read_rows
+from obsynth.symbolic.discretise import check_method, next_values, sampling_time
+from obsynth.symbolic.display import plant_html, plant_latex
+from obsynth.symbolic.equations import read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.signals import FAULT_ROLES, Role, Signal
+from obsynth.symbolic.faults import check_targets, insert_faults
+from obsynth.symbolic.from_casadi import fill_plant
+from obsynth.symbolic.serialize import fill_from_dict, plant_to_dict, read_field
+from obsynth.symbolic.signal_table import SignalTable
+from obsynth.symbolic.signals import KINDS, Role, Signal
 from obsynth.symbolic.sxmodel import SxModel, build_sx
+from obsynth.symbolic.text import read_text
 
 __all__ = ["Plant"]
 
-_KINDS: dict[str, frozenset[Role]] = {
-    "x": frozenset({Role.STATE}),
-    "u": frozenset({Role.INPUT}),
-    "d": frozenset({Role.UNKNOWN_INPUT}),
-    "f": FAULT_ROLES,
-    "w": frozenset({Role.DISTURBANCE}),
-    "p": frozenset({Role.PARAM}),
-    "rho": frozenset({Role.SCHEDULING}),
-}
+Names = str | Sequence[str]
+Rows = tuple[sp.Expr, ...]
 
 
 class Plant:
@@ -40,14 +38,28 @@ class Plant:
     Raises
     ------
     PlantError
-        By every method, when what is given cannot be accepted.
+        By every method, for what cannot be accepted; the plant is then as before.
 
     Notes
     -----
-    Continuous time: ``dynamics`` are time derivatives. Discrete time (``Ts`` given):
-    next values. Declarations return tuples of real SymPy symbols. The states are
-    complete once the dynamics stand; other signals may be declared until the plant is
-    first used (converted or discretised).
+    Every declaration takes names as ``sympy.symbols`` does and returns a tuple of real
+    SymPy symbols. Its keywords take one value for all symbols or a list with one each:
+
+    ``range``
+        A pair (lower, upper) in the signal's unit, or a list of pairs.
+    ``bound``
+        b for the range (-b, b).
+    ``nominal``
+        Value at the operating point, inside the range.
+    ``unit``
+        A label; no arithmetic is done with it.
+    ``rate``
+        Faults: the largest change per second, per step in a discrete plant.
+    ``constant``
+        True for what does not change with time.
+
+    The states are complete once the dynamics stand. Everything else may be added until
+    the plant is used (converted to CasADi or discretised).
 
     Examples
     --------
@@ -63,12 +75,11 @@ class Plant:
 
     def __init__(self, name: str) -> None:
         if not isinstance(name, str) or not name.strip():
-            raise PlantError(f"a plant's name is a non-empty text, not {name!r}")
+            raise PlantError(f"a plant's name is a non-empty text, not {name!r}", name=name)
         self._name = name
-        self._signals: dict[str, Signal] = {}
-        self._dynamics: tuple[sp.Expr, ...] | None = None
-        self._outputs: tuple[sp.Expr, ...] | None = None
-        self._output_names: tuple[str, ...] = ()
+        self._table = SignalTable()
+        self._dynamics: Rows | None = None
+        self._outputs: dict[str, sp.Expr] | None = None
         self._output_units: tuple[str, ...] = ()
         self._Ts: sp.Expr | None = None
         self._origin: tuple[Plant, str] | None = None
@@ -78,28 +89,28 @@ class Plant:
     # -- declarations --------------------------------------------------------------
 
     def states(
-        self, names: str | Sequence[str], *, range: Any = None, unit: Any = "", nominal: Any = None
+        self, names: Names, *, range: Any = None, unit: Any = "", nominal: Any = None
     ) -> tuple[sp.Symbol, ...]:
-        """Declare states; ``range`` is the box the analysis may assume."""
+        """Declare states; ``range`` is the box that guarantees are about."""
         if self._dynamics is not None:
-            raise PlantError("the dynamics stand already: declare all states before them")
+            raise PlantError("states are declared before the dynamics, one row for each")
         return self._declare(Role.STATE, names, limits=range, unit=unit, nominal=nominal)
 
     def inputs(
-        self, names: str | Sequence[str], *, range: Any = None, unit: Any = "", nominal: Any = None
+        self, names: Names, *, range: Any = None, unit: Any = "", nominal: Any = None
     ) -> tuple[sp.Symbol, ...]:
-        """Declare known inputs; ``nominal`` is their value at the operating point."""
+        """Declare known inputs; ``nominal`` defines the equilibrium."""
         return self._declare(Role.INPUT, names, limits=range, unit=unit, nominal=nominal)
 
     def unknown_inputs(
-        self, names: str | Sequence[str], *, range: Any = None, unit: Any = ""
+        self, names: Names, *, range: Any = None, unit: Any = ""
     ) -> tuple[sp.Symbol, ...]:
-        """Declare unknown inputs, to be decoupled; their bounds are optional."""
+        """Declare unknown inputs, which observers decouple; a range is optional."""
         return self._declare(Role.UNKNOWN_INPUT, names, limits=range, unit=unit)
 
     def params(
         self,
-        names: str | Sequence[str],
+        names: Names,
         value: Any = None,
         *,
         tolerance: Any = None,
@@ -107,44 +118,40 @@ class Plant:
         unit: Any = "",
         constant: Any = True,
     ) -> tuple[sp.Symbol, ...]:
-        """Declare parameters: a value, a value with a relative tolerance, or an interval.
+        """Declare parameters by value, by value and relative tolerance, or by range.
 
-        ``tolerance=0.05`` means 5 % to either side. A parameter with a plain value is a
-        constant of the plant; ``constant=False`` lets it change inside its interval.
+        ``tolerance=0.05`` is 5 % to either side of the value. A parameter with nothing
+        but a value is one of the plant's ``constants``, kept exact; the others are its
+        ``p``, and ``constant=False`` lets them change inside their range.
         """
-        return self._declare(
-            Role.PARAM,
-            names,
-            value=value,
-            tolerance=tolerance,
-            limits=range,
-            unit=unit,
-            constant=constant,
-        )
+        keywords = {"value": value, "tolerance": tolerance, "unit": unit, "constant": constant}
+        return self._declare(Role.PARAM, names, limits=range, **keywords)
 
     def scheduling(
         self,
-        names: str | Sequence[str],
+        names: Names,
         *,
         range: Any = None,
         unit: Any = "",
         measured: Any = True,
         nominal: Any = None,
     ) -> tuple[sp.Symbol, ...]:
-        """Declare scheduling variables; ``measured=False``: bounded but not known on line."""
-        return self._declare(
-            Role.SCHEDULING, names, limits=range, unit=unit, measured=measured, nominal=nominal
-        )
+        """Declare scheduling variables; ``measured=False``: bounded, not known on line."""
+        keywords = {"unit": unit, "measured": measured, "nominal": nominal}
+        return self._declare(Role.SCHEDULING, names, limits=range, **keywords)
 
     def disturbances(
-        self, names: str | Sequence[str], *, bound: Any = None, range: Any = None, unit: Any = ""
+        self, names: Names, *, bound: Any = None, range: Any = None, unit: Any = ""
     ) -> tuple[sp.Symbol, ...]:
-        """Declare disturbances and noise: ``bound=b`` is [-b, b]; no bound: finite energy."""
+        """Declare disturbances and noise; without bounds they have finite energy only.
+
+        Where the symbols stand in dynamics and outputs makes W1 and W2.
+        """
         return self._declare(Role.DISTURBANCE, names, bound=bound, limits=range, unit=unit)
 
     def actuator_faults(
         self,
-        names: str | Sequence[str],
+        names: Names,
         *,
         of: Any,
         range: Any = None,
@@ -152,12 +159,13 @@ class Plant:
         constant: Any = False,
         unit: Any = None,
     ) -> tuple[sp.Symbol, ...]:
-        """Declare additive actuator faults: each input in ``of`` becomes input + fault."""
-        return self._faults(Role.ACTUATOR_FAULT, names, of, range, rate, constant, unit)
+        """Declare actuator faults: each input v in ``of`` becomes v + fault everywhere."""
+        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
+        return self._declare(Role.ACTUATOR_FAULT, names, of=of, **keywords)
 
     def sensor_faults(
         self,
-        names: str | Sequence[str],
+        names: Names,
         *,
         of: Any,
         range: Any = None,
@@ -165,72 +173,65 @@ class Plant:
         constant: Any = False,
         unit: Any = None,
     ) -> tuple[sp.Symbol, ...]:
-        """Declare additive sensor faults: each output named in ``of`` becomes output + fault."""
-        return self._faults(Role.SENSOR_FAULT, names, of, range, rate, constant, unit)
+        """Declare sensor faults: each output y named in ``of`` becomes y + fault."""
+        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
+        return self._declare(Role.SENSOR_FAULT, names, of=of, **keywords)
 
     def process_faults(
         self,
-        names: str | Sequence[str],
+        names: Names,
         *,
         range: Any = None,
         rate: Any = None,
         constant: Any = False,
         unit: Any = "",
     ) -> tuple[sp.Symbol, ...]:
-        """Declare faults whose symbols stand in the equations themselves."""
-        return self._declare(
-            Role.PROCESS_FAULT, names, limits=range, rate=rate, constant=constant, unit=unit
-        )
+        """Declare faults whose symbols stand in the equations (also called ``faults``)."""
+        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
+        return self._declare(Role.PROCESS_FAULT, names, **keywords)
 
     faults = process_faults
 
     def dynamics(self, rows: Any, Ts: Any = None) -> None:
-        """State the dynamics: time derivatives, or next values when ``Ts`` is given.
+        """State the dynamics: time derivatives, or next values where ``Ts`` is given.
 
         Parameters
         ----------
-        rows : sequence of expressions or column matrix
-            One per state, in the order of the states.
+        rows : sequence of expressions, or a column matrix
+            One per state, in their order: SymPy, numbers, or text.
         Ts : float or sympy.Rational, optional
-            Sampling time in seconds of a discrete plant.
+            Sampling time in s of a discrete plant.
         """
-        self._open("dynamics")
+        self._refuse_in_use("dynamics")
         if self._dynamics is not None:
             raise PlantError("the dynamics are given twice; make a new Plant to change them")
-        found = read_rows(rows, self._symbols, "dynamics")
-        if len(found) != len(self.x):
-            raise PlantError(
-                f"dynamics has {len(found)} rows for {len(self.x)} states "
-                f"({', '.join(self.names('x'))})",
-                rows=len(found),
-                states=self.names("x"),
-            )
-        if not found:
-            raise PlantError("a plant needs at least one state; declare states first")
+        found = read_dynamics(rows, self._table.symbols, self.names("x"))
         self._Ts = None if Ts is None else sampling_time(Ts)
         self._dynamics = found
 
-    def outputs(
-        self, rows: Any, *, names: str | Sequence[str] | None = None, unit: Any = ""
-    ) -> tuple[str, ...]:
-        """State the measured outputs; return their names (``y1``, ``y2``, ... by default)."""
-        self._open("outputs")
+    def outputs(self, rows: Any, *, names: Names | None = None, unit: Any = "") -> tuple[str, ...]:
+        """State the measured outputs.
+
+        Parameters
+        ----------
+        rows : sequence of expressions, or a column matrix
+            Functions of states, inputs, disturbances, parameters.
+        names : str or sequence of str, optional
+            One per row; ``y1``, ``y2``, ... by default.
+        unit : str or sequence of str
+
+        Returns
+        -------
+        tuple of str
+            The names, which ``sensor_faults(of=)`` takes.
+        """
+        self._refuse_in_use("outputs")
         if self._outputs is not None:
             raise PlantError("the outputs are given twice; make a new Plant to change them")
-        found = read_rows(rows, self._symbols, "outputs")
-        if not found:
-            raise PlantError("outputs is empty: an observer needs at least one measurement")
-        given = [f"y{k}" for k in range(1, len(found) + 1)] if names is None else names
-        named = expand_names(given, "output")
-        if len(named) != len(found):
-            raise PlantError(f"outputs has {len(found)} rows and {len(named)} names")
-        units = tuple(per_symbol(unit, named, "unit"))
-        if not all(isinstance(item, str) for item in units):
-            raise PlantError(f"outputs: unit= is text such as 'cm', not {unit!r}")
-        self._check_sensor_faults(named)
-        self._outputs, self._output_names, self._output_units = found, named, units
-        self._cache.clear()
-        return named
+        found, units = read_outputs(rows, self._table.symbols, names, unit)
+        check_targets(self.signals, tuple(found))
+        self._outputs, self._output_units = found, units
+        return tuple(found)
 
     # -- reading -------------------------------------------------------------------
 
@@ -241,73 +242,97 @@ class Plant:
 
     @property
     def Ts(self) -> float | None:
-        """Sampling time in seconds; None for a continuous plant."""
+        """Sampling time in s; None for a continuous plant."""
         return None if self._Ts is None else float(self._Ts)
+
+    @property
+    def exact_Ts(self) -> sp.Expr | None:
+        """Sampling time in s as it stands in the equations."""
+        return self._Ts
 
     @property
     def signals(self) -> tuple[Signal, ...]:
         """All signals in order of declaration."""
-        return tuple(self._signals.values())
+        return self._table.all
 
     @property
     def x(self) -> tuple[Signal, ...]:
         """States."""
-        return self._kind("x")
+        return self._table.kind("x")
 
     @property
     def u(self) -> tuple[Signal, ...]:
         """Known inputs."""
-        return self._kind("u")
+        return self._table.kind("u")
 
     @property
     def d(self) -> tuple[Signal, ...]:
         """Unknown inputs."""
-        return self._kind("d")
+        return self._table.kind("d")
 
     @property
     def f(self) -> tuple[Signal, ...]:
         """Faults of every role, in order of declaration."""
-        return self._kind("f")
+        return self._table.kind("f")
 
     @property
     def w(self) -> tuple[Signal, ...]:
         """Disturbances."""
-        return self._kind("w")
+        return self._table.kind("w")
 
     @property
     def p(self) -> tuple[Signal, ...]:
-        """Parameters that are known up to an interval."""
-        return self._kind("p")
+        """Parameters known up to a range of positive width."""
+        return self._table.kind("p")
 
     @property
     def rho(self) -> tuple[Signal, ...]:
         """Scheduling variables."""
-        return self._kind("rho")
+        return self._table.kind("rho")
 
     @property
     def constants(self) -> tuple[Signal, ...]:
         """Parameters with a plain value."""
-        return tuple(s for s in self.signals if s.role is Role.PARAM and s.lower == s.upper)
+        return self._table.constants
 
     @property
     def constant_values(self) -> dict[sp.Symbol, sp.Expr]:
         """Exact value of every constant."""
-        return {s.symbol: _value(s) for s in self.constants}
+        return self._table.constant_values
+
+    @property
+    def has_dynamics(self) -> bool:
+        """True once the dynamics are given."""
+        return self._dynamics is not None or self._origin is not None
+
+    @property
+    def has_outputs(self) -> bool:
+        """True once the outputs are given."""
+        return self._outputs is not None
+
+    @property
+    def equations(self) -> tuple[Rows, Rows]:
+        """Dynamics and outputs as they were given, before faults are inserted."""
+        if self._dynamics is None and self._origin is not None:
+            origin, method = self._origin
+            symbols = [signal.symbol for signal in self.x]
+            self._dynamics = next_values(method, symbols, origin.equations[0], self._Ts)
+        return self._dynamics or (), tuple((self._outputs or {}).values())
 
     @property
     def rhs(self) -> sp.Matrix:
-        """Right-hand side (n, 1) with the faults inserted, constants as symbols."""
+        """Right-hand side (n, 1), faults inserted, constants as symbols."""
         return self._rows()[0]
 
     @property
     def output(self) -> sp.Matrix:
-        """Output map (m, 1) with the faults inserted, constants as symbols."""
+        """Output map (m, 1), faults inserted, constants as symbols."""
         return self._rows()[1]
 
     @property
     def output_names(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return self._output_names
+        return tuple(self._outputs or ())
 
     @property
     def output_units(self) -> tuple[str, ...]:
@@ -316,182 +341,211 @@ class Plant:
 
     @property
     def continuous(self) -> "Plant | None":
-        """The plant this one was discretised from."""
+        """The continuous plant this one was made from."""
         return None if self._origin is None else self._origin[0]
 
     @property
     def discretisation(self) -> str | None:
-        """The method this plant was discretised with."""
+        """Name of the method this plant was discretised with."""
         return None if self._origin is None else self._origin[1]
 
     def names(self, kind: str) -> tuple[str, ...]:
-        """Return the names of one kind: x, u, d, f, w, p or rho."""
-        return tuple(signal.name for signal in self._kind(kind))
+        """Return the names of a kind of signals: x, u, d, f, w, p or rho."""
+        return self._table.names(kind)
 
     def box(self, kind: str) -> NDArray[np.float64]:
-        """Return lower and upper bounds of one kind, shape (number, 2)."""
-        rows = [(signal.lower, signal.upper) for signal in self._kind(kind)]
-        return np.array(rows, dtype=np.float64).reshape(len(rows), 2)
+        """Return lower and upper bounds of a kind of signals, shape (number, 2)."""
+        return self._table.box(kind)
+
+    # -- using ---------------------------------------------------------------------
 
     def check(self) -> Self:
-        """Return the plant itself when it is complete and consistent, else refuse it."""
-        if self._dynamics is None:
+        """Return the plant itself when it is complete and consistent; refuse it otherwise."""
+        if not self.has_dynamics:
             raise PlantError(f"plant {self.name!r} has no dynamics yet: call plant.dynamics([...])")
-        if self._outputs is None:
+        if not self.has_outputs:
             raise PlantError(f"plant {self.name!r} has no outputs yet: call plant.outputs([...])")
-        self._check_sensor_faults(self._output_names)
+        check_targets(self.signals, self.output_names)
         return self
 
     def sx(self, constants: Literal["value", "symbol"] = "value") -> SxModel:
-        """Return the plant as CasADi SX expressions (cached, checked against SymPy)."""
-        if constants not in ("value", "symbol"):
-            raise PlantError(f"constants= is 'value' or 'symbol', not {constants!r}")
+        """Return the plant in CasADi's SX, compared with SymPy at random points of the box.
+
+        Parameters
+        ----------
+        constants : {"value", "symbol"}
+            Whether constants are numbers in the expressions or symbols in ``SxModel.c``.
+
+        Returns
+        -------
+        SxModel
+            The same object at every call.
+
+        Raises
+        ------
+        PlantError
+            The plant is not complete.
+        ParityError
+            The two forms differ (a defect of the conversion; the row and point are named).
+        """
         key = f"sx {constants}"
         if key not in self._cache:
             self._cache[key] = build_sx(self.check(), constants)
             self._in_use = True
-        result: SxModel = self._cache[key]
-        return result
+        model: SxModel = self._cache[key]
+        return model
 
     def function(self) -> ca.Function:
-        """Return (x, u, d, f, w, p, rho) -> (rhs, y) as a CasADi function (cached)."""
+        """Return (x, u, d, f, w, p, rho) -> (rhs, y) as a CasADi function."""
         if "function" not in self._cache:
             self._cache["function"] = self.sx().function()
         function: ca.Function = self._cache["function"]
         return function
 
     def discretise(self, method: str, Ts: Any) -> "Plant":
-        """Return the discrete plant for ``"euler"`` or ``"rk4"`` and a sampling time in s."""
-        rows, step = discrete_rows(self.check(), method, Ts)
-        self._in_use = True
+        """Return the discrete plant of a continuous one, signals held over a step.
+
+        Parameters
+        ----------
+        method : {"euler", "rk4"}
+        Ts : float or sympy.Rational
+            Sampling time in s.
+
+        Returns
+        -------
+        Plant
+            Dynamics, D, W1 and rates are multiplied by Ts; the outputs are the same.
+        """
+        if self.check().Ts is not None:
+            raise PlantError(f"plant {self.name!r} is discrete already (Ts = {self.Ts:g} s)")
         result = Plant(self.name)
-        for signal in self.signals:
-            rate = None if signal.rate is None else signal.rate * float(step)
-            result._signals[signal.name] = replace(signal, rate=rate)
-        result._dynamics, result._outputs = rows, self._outputs
-        result._output_names, result._output_units = self.output_names, self.output_units
-        result._Ts, result._origin = step, (self, method)
+        result._origin, result._Ts = (self, check_method(method)), sampling_time(Ts)
+        h = float(result._Ts)
+        result._table = SignalTable(
+            [replace(s, rate=None if s.rate is None else s.rate * h) for s in self.signals]
+        )
+        result._outputs, result._output_units = self._outputs, self._output_units
+        self._in_use = result._in_use = True
         return result
+
+    @classmethod
+    def from_casadi(
+        cls,
+        name: str,
+        *,
+        x: Any,
+        y: Any,
+        u: Any = None,
+        d: Any = None,
+        f: Any = None,
+        w: Any = None,
+        p: Any = None,
+        rho: Any = None,
+        xdot: Any = None,
+        xnext: Any = None,
+        Ts: Any = None,
+        range: Any = None,
+        names: Mapping[str, Any] | None = None,
+        output_names: Names | None = None,
+        **options: Any,
+    ) -> "Plant":
+        """Make a plant from CasADi expressions, SX or MX.
+
+        The equations are kept in SymPy from then on, compared with the CasADi function
+        at random points of the box. Faults stand in the expressions themselves.
+
+        Parameters
+        ----------
+        x, u, d, f, w, p, rho : SX, MX or a list of them
+            Columns of symbols.
+        xdot, xnext : SX, MX or a list of them
+            Time derivatives, or next values with the sampling time ``Ts`` (1 s if left out).
+        y : SX, MX or a list of them
+            Outputs.
+        range, bound, nominal, unit, rate, constant, measured, value, tolerance : mapping
+            Keywords of the declarations, by kind (``{"x": ..., "u": ...}``) or by signal;
+            a plain value is for the states.
+        names : mapping of str to names, optional
+            By kind, where CasADi's own names will not do.
+        output_names : names, optional
+
+        Examples
+        --------
+        >>> h, v = ca.SX.sym("h"), ca.SX.sym("v")
+        >>> Plant.from_casadi("tank", x=h, u=v, xdot=v - ca.sqrt(h), y=h, range=(1, 9)).rhs
+        Matrix([[-sqrt(h) + v]])
+        """
+        if (xdot is None) == (xnext is None):
+            raise PlantError("from_casadi: give xdot= (continuous) or xnext= (discrete)")
+        if xnext is None and Ts is not None:
+            raise PlantError("from_casadi: Ts= goes with xnext=; discretise a continuous plant")
+        step = None if xnext is None else 1 if Ts is None else Ts
+        columns = {"x": x, "u": u, "d": d, "f": f, "w": w, "p": p, "rho": rho}
+        rhs = xdot if xnext is None else xnext
+        plant = cls(name)
+        options["range"] = range
+        fill_plant(plant, columns, rhs, y, step, options, names or {}, output_names)
+        return plant
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the complete plant as JSON-able data, expressions as text."""
+        return plant_to_dict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Plant":
+        """Read a plant from what :meth:`to_dict` returned; nothing is evaluated."""
+        if isinstance(data, Mapping) and "continuous" in data:
+            discretise = read_field(data, "discretise", dict)
+            step = read_text(read_field(discretise, "Ts", str), {})
+            original = cls.from_dict(read_field(data, "continuous", dict))
+            return original.discretise(read_field(discretise, "method", str), step)
+        plant = cls(read_field(data, "name", str))
+        fill_from_dict(plant, data)
+        return plant
 
     def __repr__(self) -> str:
         time = "continuous" if self.Ts is None else f"Ts = {self.Ts:g} s"
-        counts = ", ".join(f"{len(self._kind(k))} {k}" for k in _KINDS if self._kind(k))
-        return f"Plant({self.name!r}, {time}: {counts}, {len(self._output_names)} y)"
+        counts = [f"{len(self.names(kind))} {kind}" for kind in KINDS if self.names(kind)]
+        counts.append(f"{len(self.output_names)} y")
+        return f"Plant({self.name!r}, {time}: {', '.join(counts)})"
+
+    def _repr_latex_(self) -> str:
+        return f"$${plant_latex(self)}$$"
+
+    def _repr_html_(self) -> str:
+        return plant_html(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_cache": {}}
 
     # -- inside --------------------------------------------------------------------
 
-    @property
-    def _symbols(self) -> dict[str, sp.Symbol]:
-        return {name: signal.symbol for name, signal in self._signals.items()}
+    def add_signals(self, signals: Sequence[Signal]) -> None:
+        """Add signals made elsewhere; the declarations above are the usual way."""
+        self._refuse_in_use("signals")
+        self._table.add(signals, self.output_names)
+        self._cache.clear()
 
-    def _kind(self, kind: str) -> tuple[Signal, ...]:
-        if kind not in _KINDS:
-            raise PlantError(f"{kind!r} is no kind of signal; kinds are {', '.join(_KINDS)}")
-        roles = _KINDS[kind]
-        found = tuple(signal for signal in self.signals if signal.role in roles)
-        return tuple(s for s in found if s.lower < s.upper) if kind == "p" else found
+    def _declare(self, role: Role, names: Names, **keywords: Any) -> tuple[sp.Symbol, ...]:
+        self._refuse_in_use("signals")
+        self._cache.clear()
+        if "of" in keywords:
+            outputs = dict(zip(self.output_names, self.output_units, strict=True))
+            return self._table.declare_faults(role, names, outputs=outputs, **keywords)
+        return self._table.declare(role, names, self.output_names, **keywords)
 
-    def _open(self, what: str) -> None:
+    def _refuse_in_use(self, what: str) -> None:
         if self._in_use:
             raise PlantError(
-                f"plant {self.name!r} is in use already: {what} cannot be added; make a new Plant"
+                f"plant {self.name!r} is in use already: {what} cannot be added any more; "
+                "make a new Plant"
             )
-
-    def _declare(self, role: Role, names: Any, **options: Any) -> tuple[sp.Symbol, ...]:
-        self._open("signals")
-        signals = make_signals(role, names, **options)
-        for signal in signals:
-            known = self._signals.get(signal.name)
-            if known is not None:
-                raise PlantError(
-                    f"{role} {signal.name}: the name is taken by the {known.role} {known.name}",
-                    symbol=signal.name,
-                )
-        self._signals.update({signal.name: signal for signal in signals})
-        self._cache.clear()
-        return tuple(signal.symbol for signal in signals)
-
-    def _faults(
-        self, role: Role, names: Any, of: Any, limits: Any, rate: Any, constant: Any, unit: Any
-    ) -> tuple[sp.Symbol, ...]:
-        found = expand_names(names, str(role))
-        targets = self._targets(role, found, of)
-        if unit is None:
-            unit = [self._signals[t].unit if t in self._signals else "" for t in targets]
-        return self._declare(
-            role, names, limits=limits, rate=rate, constant=constant, unit=unit, of=targets
-        )
-
-    def _targets(self, role: Role, names: tuple[str, ...], of: Any) -> list[str]:
-        """Return what each fault adds to, one input or output name per fault."""
-        items = [of] if isinstance(of, str | sp.Symbol) else of
-        if not isinstance(items, Sequence):
-            raise PlantError(f"{role} {names[0]}: of= names inputs or outputs, not {of!r}")
-        targets = [t for item in items for t in expand_names(str(item), f"{role}: of=")]
-        if len(targets) != len(names):
-            raise PlantError(
-                f"{role}: {len(names)} faults ({', '.join(names)}) for {len(targets)} signals "
-                f"in of= ({', '.join(targets)})"
-            )
-        taken = {s.of: s.name for s in self.signals if s.role is role}
-        for name, target in zip(names, targets, strict=True):
-            if role is Role.ACTUATOR_FAULT and target not in self.names("u"):
-                raise PlantError(
-                    f"{role} {name}: of={target} is no input; inputs are "
-                    f"{', '.join(self.names('u')) or 'none yet'}",
-                    symbol=name,
-                    of=target,
-                )
-            if target in taken:
-                raise PlantError(
-                    f"{role} {name}: {target} has the fault {taken[target]} already", symbol=name
-                )
-            taken[target] = name
-        if role is Role.SENSOR_FAULT and self._outputs is not None:
-            self._check_of(names, targets, self._output_names)
-        return targets
-
-    def _check_sensor_faults(self, outputs: tuple[str, ...]) -> None:
-        found = [s for s in self.signals if s.role is Role.SENSOR_FAULT]
-        self._check_of([s.name for s in found], [str(s.of) for s in found], outputs)
-
-    def _check_of(
-        self, names: Sequence[str], targets: Sequence[str], outputs: tuple[str, ...]
-    ) -> None:
-        for name, target in zip(names, targets, strict=True):
-            if target not in outputs:
-                raise PlantError(
-                    f"sensor fault {name}: of={target} is no output; outputs are "
-                    f"{', '.join(outputs)}",
-                    symbol=name,
-                    of=target,
-                )
 
     def _rows(self) -> tuple[sp.Matrix, sp.Matrix]:
-        if "rows" not in self._cache:
-            self.check()
-            self._cache["rows"] = insert_faults(self)
-        rows: tuple[sp.Matrix, sp.Matrix] = self._cache["rows"]
+        dynamics, outputs = self.equations
+        key = f"rows {len(dynamics)} {len(outputs)}"
+        if key not in self._cache:
+            named = dict(zip(self.output_names, outputs, strict=True))
+            self._cache[key] = insert_faults(dynamics, named, self.signals)
+        rows: tuple[sp.Matrix, sp.Matrix] = self._cache[key]
         return rows
-
-
-def insert_faults(plant: Plant) -> tuple[sp.Matrix, sp.Matrix]:
-    """Return dynamics and outputs with v -> v + f and y -> y + f applied."""
-    inputs = {s.name: s.symbol for s in plant.u}
-    shift = {
-        inputs[str(s.of)]: inputs[str(s.of)] + s.symbol
-        for s in plant.f
-        if s.role is Role.ACTUATOR_FAULT
-    }
-    sensor = {s.of: s.symbol for s in plant.f if s.role is Role.SENSOR_FAULT}
-    rhs = [row.xreplace(shift) for row in plant._dynamics or ()]
-    y = [
-        row.xreplace(shift) + sensor.get(name, 0)
-        for name, row in zip(plant.output_names, plant._outputs or (), strict=True)
-    ]
-    return sp.ImmutableMatrix(len(rhs), 1, rhs), sp.ImmutableMatrix(len(y), 1, y)
-
-
-def _value(signal: Signal) -> sp.Expr:
-    """Return the exact value of a constant, given as a value or as an interval of one point."""
-    return exact_number(signal.lower, signal.name) if signal.value is None else signal.value

@@ -8,7 +8,7 @@ import sympy as sp
 
 from obsynth.symbolic.errors import PlantError
 
-__all__ = ["FAULT_ROLES", "Role", "Signal"]
+__all__ = ["FAULT_ROLES", "KINDS", "Role", "Signal"]
 
 
 class Role(StrEnum):
@@ -33,6 +33,17 @@ class Role(StrEnum):
 
 FAULT_ROLES = frozenset({Role.ACTUATOR_FAULT, Role.SENSOR_FAULT, Role.PROCESS_FAULT})
 """The roles whose signals are faults."""
+
+KINDS: dict[str, frozenset[Role]] = {
+    "x": frozenset({Role.STATE}),
+    "u": frozenset({Role.INPUT}),
+    "d": frozenset({Role.UNKNOWN_INPUT}),
+    "f": FAULT_ROLES,
+    "w": frozenset({Role.DISTURBANCE}),
+    "p": frozenset({Role.PARAM}),
+    "rho": frozenset({Role.SCHEDULING}),
+}
+"""The letters of the field and the roles they gather."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +105,25 @@ class Signal:
         who = f"{self.role} {self.name}"
         if math.isnan(self.lower) or math.isnan(self.upper):
             raise PlantError(f"{who}: a bound of its range is not a number", symbol=self.name)
-        if self.lower > self.upper or self.lower == math.inf or self.upper == -math.inf:
+        unbounded = self.lower == -math.inf and self.upper == math.inf
+        if not (self.bounded or unbounded):
             raise PlantError(
-                f"{who}: the range ({self.lower}, {self.upper}) is empty; "
-                "give the lower bound first",
+                f"{who}: the range ({self.lower}, {self.upper}) is not finite; give two finite "
+                "bounds, or none for an unbounded signal",
                 symbol=self.name,
                 lower=self.lower,
                 upper=self.upper,
             )
+        if self.lower > self.upper:
+            raise PlantError(
+                f"{who}: the range ({self.lower}, {self.upper}) is empty; give the lower bound "
+                "first",
+                symbol=self.name,
+                lower=self.lower,
+                upper=self.upper,
+            )
+        if self.role is Role.PARAM and unbounded:
+            raise PlantError(f"{who}: a parameter has a value or a finite range", symbol=self.name)
         if self.nominal is not None and not self.lower <= self.nominal <= self.upper:
             raise PlantError(
                 f"{who}: the nominal value {self.nominal} is not a number inside the range "
@@ -116,9 +138,10 @@ class Signal:
                     symbol=self.name,
                     rate=self.rate,
                 )
-            if not 0.0 <= self.rate < math.inf:
+            if not 0.0 < self.rate < math.inf:
                 raise PlantError(
-                    f"{who}: the rate {self.rate} is not a finite, non-negative number",
+                    f"{who}: the rate {self.rate} is not a finite, positive number; a fault that "
+                    "does not change has constant=True",
                     symbol=self.name,
                     rate=self.rate,
                 )

@@ -1,0 +1,106 @@
+"""Plants in notebooks: equations in LaTeX, signals in a table."""
+
+import html
+from typing import TYPE_CHECKING
+
+import sympy as sp
+
+from obsynth.symbolic.signals import Signal
+
+if TYPE_CHECKING:
+    from obsynth.symbolic.plant import Plant
+
+__all__ = ["plant_html", "plant_latex"]
+
+
+def plant_latex(plant: "Plant") -> str:
+    r"""Return the equations of a plant, faults inserted, as one LaTeX environment.
+
+    Parameters
+    ----------
+    plant : Plant
+        What it still lacks is left out.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> plant_latex(quadruple_tank()).splitlines()[-2]
+    'y_{3} &= h_{3} + w_{3}'
+    """
+    # A Runge-Kutta step written out fills pages; its derivatives say the same.
+    original = plant.continuous
+    if original is not None and plant.discretisation != "euler":
+        step = sp.latex(plant.exact_Ts)
+        note = rf"\text{{{plant.discretisation}, }} T_s &= {step}\,\mathrm{{s}}"
+        inner = plant_latex(original).removeprefix("\\begin{aligned}\n")
+        return f"\\begin{{aligned}}\n{note} \\\\\n{inner}"
+    rows = []
+    if plant.has_dynamics:
+        for signal, row in zip(plant.x, plant.rhs, strict=True):
+            name = sp.latex(signal.symbol)
+            left = rf"\dot{{{_base(name)}}}{_index(name)}" if plant.Ts is None else rf"{name}^{{+}}"
+            rows.append(f"{left} &= {sp.latex(row)}")
+    if plant.has_outputs:
+        for name, row in zip(plant.output_names, plant.output, strict=True):
+            rows.append(f"{sp.latex(sp.Symbol(name))} &= {sp.latex(row)}")
+    body = " \\\\\n".join(rows)
+    return f"\\begin{{aligned}}\n{body}\n\\end{{aligned}}"
+
+
+def plant_html(plant: "Plant") -> str:
+    """Return equations and a table of signals for a notebook.
+
+    Parameters
+    ----------
+    plant : Plant
+
+    Returns
+    -------
+    str
+        HTML; the equations are LaTeX between dollar signs, which notebooks set.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> "<td>h3</td>" in plant_html(quadruple_tank())
+    True
+    """
+    time = "continuous time" if plant.Ts is None else f"sampled every {plant.Ts:g} s"
+    method = f", {plant.discretisation}" if plant.discretisation else ""
+    heads = ("signal", "role", "range", "nominal", "rate", "unit")
+    cells = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in _cells(signal)) + "</tr>"
+        for signal in plant.signals
+    )
+    return (
+        f"<p><b>{html.escape(plant.name)}</b>, {time}{method}</p>"
+        f"<div>$${html.escape(plant_latex(plant), quote=False)}$$</div>"
+        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
+        f"<tbody>{cells}</tbody></table>"
+    )
+
+
+def _cells(signal: Signal) -> tuple[str, ...]:
+    role = f"{signal.role} of {signal.of}" if signal.of else str(signal.role)
+    role += "" if signal.measured else ", not measured"
+    if signal.value is not None and signal.lower == signal.upper:
+        span = sp.sstr(signal.value, full_prec=False)
+    elif signal.bounded:
+        span = f"[{signal.lower:g}, {signal.upper:g}]"
+    else:
+        span = "unbounded"
+    nominal = "" if signal.nominal is None else f"{signal.nominal:g}"
+    rate = "" if signal.rate is None else f"{signal.rate:g}"
+    return signal.name, role, span, nominal, rate, signal.unit
+
+
+def _base(name: str) -> str:
+    return name.split("_{", 1)[0]
+
+
+def _index(name: str) -> str:
+    return name.removeprefix(_base(name))

@@ -1,0 +1,211 @@
+"""Plants as plain data for JSON, and back without evaluating anything."""
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import sympy as sp
+
+from obsynth.symbolic.declare import expand_names
+from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.signals import Role, Signal
+from obsynth.symbolic.text import read_text, write_text
+
+if TYPE_CHECKING:
+    from obsynth.symbolic.plant import Plant
+
+__all__ = [
+    "FORMAT",
+    "fill_from_dict",
+    "plant_to_dict",
+    "read_field",
+    "signal_from_dict",
+    "signal_to_dict",
+]
+
+FORMAT = "obsynth plant 1"
+"""Value of ``format``; the number grows when an older reader would misunderstand."""
+
+_REQUIRED = object()
+
+
+def plant_to_dict(plant: "Plant") -> dict[str, Any]:
+    """Return a complete plant as JSON-able data.
+
+    Expressions are text, infinite bounds null, and a discretised plant is its continuous
+    original with method and sampling time, so that nothing is rounded on the way.
+
+    Parameters
+    ----------
+    plant : Plant
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    PlantError
+        The plant is not complete.
+    """
+    original = plant.check().continuous
+    step = None if plant.exact_Ts is None else write_text(plant.exact_Ts)
+    if original is not None:
+        return {
+            "format": FORMAT,
+            "discretise": {"method": plant.discretisation, "Ts": step},
+            "continuous": plant_to_dict(original),
+        }
+    dynamics, outputs = plant.equations
+    return {
+        "format": FORMAT,
+        "name": plant.name,
+        "Ts": step,
+        "signals": [signal_to_dict(signal) for signal in plant.signals],
+        "dynamics": [write_text(row) for row in dynamics],
+        "outputs": [
+            {"name": name, "unit": unit, "expression": write_text(row)}
+            for name, unit, row in zip(plant.output_names, plant.output_units, outputs, strict=True)
+        ],
+    }
+
+
+def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
+    """Declare in a new plant what stored data say.
+
+    Parameters
+    ----------
+    plant : Plant
+        Without signals.
+    data : dict
+        As :func:`plant_to_dict` writes it, of a plant that was not discretised.
+
+    Raises
+    ------
+    PlantError
+        Another format, a field that is missing or not of its type, and whatever the
+        declarations refuse.
+    """
+    stored = read_field(data, "format", str)
+    if stored != FORMAT:
+        raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
+    plant.add_signals([signal_from_dict(item) for item in read_field(data, "signals", list)])
+    step = read_field(data, "Ts", str, None)
+    rows = [str(row) for row in read_field(data, "dynamics", list)]
+    plant.dynamics(rows, Ts=None if step is None else read_text(step, {}))
+    outputs = read_field(data, "outputs", list)
+    names, units, texts = (
+        [read_field(item, key, str) for item in outputs] for key in ("name", "unit", "expression")
+    )
+    plant.outputs(texts, names=names, unit=units)
+
+
+def signal_to_dict(signal: Signal) -> dict[str, Any]:
+    """Return a signal as JSON-able data.
+
+    Examples
+    --------
+    >>> signal_to_dict(Signal("h", sp.Symbol("h", real=True), Role.STATE))["lower"] is None
+    True
+    """
+    return {
+        "name": signal.name,
+        "role": str(signal.role),
+        "lower": signal.lower if math.isfinite(signal.lower) else None,
+        "upper": signal.upper if math.isfinite(signal.upper) else None,
+        "unit": signal.unit,
+        "nominal": signal.nominal,
+        "rate": signal.rate,
+        "constant": signal.constant,
+        "measured": signal.measured,
+        "of": signal.of,
+        "value": None if signal.value is None else write_text(signal.value),
+    }
+
+
+def signal_from_dict(data: Any) -> Signal:
+    """Read a signal back.
+
+    Parameters
+    ----------
+    data : dict
+        As :func:`signal_to_dict` writes it.
+
+    Returns
+    -------
+    Signal
+
+    Raises
+    ------
+    PlantError
+        A field is missing or not of its type.
+
+    Examples
+    --------
+    >>> signal = Signal("h", sp.Symbol("h", real=True), Role.STATE, 0.5, 2.0, "m")
+    >>> signal_from_dict(signal_to_dict(signal)) == signal
+    True
+    """
+    name = read_field(data, "name", str)
+    if expand_names(name) != (name,):
+        raise PlantError(f"stored signal {name!r}: this is not the name of one signal", symbol=name)
+    role = read_field(data, "role", str)
+    if role not in list(Role):
+        raise PlantError(f"stored signal {name!r}: the role {role!r} is unknown", symbol=name)
+    lower, upper = (read_field(data, key, float, None) for key in ("lower", "upper"))
+    value = read_field(data, "value", str, None)
+    return Signal(
+        name=name,
+        symbol=sp.Symbol(name, real=True),
+        role=Role(role),
+        lower=-math.inf if lower is None else lower,
+        upper=math.inf if upper is None else upper,
+        unit=read_field(data, "unit", str),
+        nominal=read_field(data, "nominal", float, None),
+        rate=read_field(data, "rate", float, None),
+        constant=read_field(data, "constant", bool),
+        measured=read_field(data, "measured", bool),
+        of=read_field(data, "of", str, None),
+        value=None if value is None else read_text(value, {}),
+    )
+
+
+def read_field(data: Any, key: str, kind: type, default: Any = _REQUIRED) -> Any:
+    """Read one field of stored data and check its type.
+
+    Parameters
+    ----------
+    data : mapping
+    key : str
+    kind : type
+        ``float`` takes integers too.
+    default : object, optional
+        What null or a missing field means; without it the field has to be there.
+
+    Returns
+    -------
+    object
+        Of type ``kind``, or the default.
+
+    Raises
+    ------
+    PlantError
+        Names the field and what was found.
+
+    Examples
+    --------
+    >>> read_field({"rate": 1}, "rate", float)
+    1.0
+    """
+    if not isinstance(data, Mapping):
+        raise PlantError(f"stored plant: a table with {key!r} is needed, not {data!r}", key=key)
+    value = data.get(key)
+    if value is None and default is not _REQUIRED:
+        return default
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind):
+        raise PlantError(
+            f"stored plant: {key!r} is {value!r}, not of type {kind.__name__}", key=key
+        )
+    return value

@@ -1,0 +1,148 @@
+"""The signals of a plant, by name and by kind."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.symbolic.declare import exact_number, expand_names, make_signals
+from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.faults import check_targets, fault_units, read_targets
+from obsynth.symbolic.signals import KINDS, Role, Signal
+
+__all__ = ["SignalTable"]
+
+
+class SignalTable:
+    """Signals in order of declaration, each name once.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        The first ones.
+
+    Examples
+    --------
+    >>> table = SignalTable()
+    >>> table.declare(Role.STATE, "h1:3", limits=(0, 1))
+    (h1, h2)
+    >>> table.names("x")
+    ('h1', 'h2')
+    """
+
+    def __init__(self, signals: Sequence[Signal] = ()) -> None:
+        self._signals: dict[str, Signal] = {}
+        self.add(signals)
+
+    @property
+    def all(self) -> tuple[Signal, ...]:
+        """All signals in order of declaration."""
+        return tuple(self._signals.values())
+
+    @property
+    def symbols(self) -> dict[str, sp.Symbol]:
+        """The symbols by name."""
+        return {name: signal.symbol for name, signal in self._signals.items()}
+
+    @property
+    def constants(self) -> tuple[Signal, ...]:
+        """Parameters with a plain value."""
+        return tuple(s for s in self.all if s.role is Role.PARAM and s.lower == s.upper)
+
+    @property
+    def constant_values(self) -> dict[sp.Symbol, sp.Expr]:
+        """Exact value of every constant."""
+        return {
+            signal.symbol: exact_number(signal.lower, signal.name)
+            if signal.value is None
+            else signal.value
+            for signal in self.constants
+        }
+
+    def kind(self, kind: str) -> tuple[Signal, ...]:
+        """Return the signals of a kind; ``"p"`` leaves out the constants."""
+        if kind not in KINDS:
+            raise PlantError(f"{kind!r} is no kind of signal; kinds are {', '.join(KINDS)}")
+        found = tuple(signal for signal in self.all if signal.role in KINDS[kind])
+        return tuple(s for s in found if s.lower < s.upper) if kind == "p" else found
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """Return the names of a kind."""
+        return tuple(signal.name for signal in self.kind(kind))
+
+    def box(self, kind: str) -> NDArray[np.float64]:
+        """Return the bounds of a kind, shape (number, 2)."""
+        rows = [(signal.lower, signal.upper) for signal in self.kind(kind)]
+        return np.array(rows, dtype=np.float64).reshape(len(rows), 2)
+
+    def declare(
+        self, role: Role, names: Any, taken: Sequence[str] = (), **keywords: Any
+    ) -> tuple[sp.Symbol, ...]:
+        """Make signals from the arguments of a declaration and add them.
+
+        Parameters
+        ----------
+        role : Role
+        names : str or sequence of str
+        taken : sequence of str
+            Names of outputs, which signals cannot have.
+        **keywords
+            As ``declare.make_signals`` takes them.
+
+        Returns
+        -------
+        tuple of sympy.Symbol
+        """
+        signals = make_signals(role, names, **keywords)
+        self.add(signals, taken)
+        return tuple(signal.symbol for signal in signals)
+
+    def declare_faults(
+        self, role: Role, names: Any, of: Any, outputs: Mapping[str, str], **keywords: Any
+    ) -> tuple[sp.Symbol, ...]:
+        """Declare faults that add to inputs or outputs, with the units of these.
+
+        Parameters
+        ----------
+        role : Role
+            Actuator or sensor fault.
+        names : str or sequence of str
+        of : str, Symbol or a sequence of them
+        outputs : mapping of str to str
+            Units of the outputs declared so far, by name.
+        **keywords
+            As ``declare.make_signals`` takes them; ``unit=None`` is the unit of the target.
+
+        Returns
+        -------
+        tuple of sympy.Symbol
+        """
+        targets = read_targets(role, expand_names(names, str(role)), of)
+        if keywords.get("unit") is None:
+            inputs = {signal.name: signal.unit for signal in self.kind("u")}
+            units = inputs if role is Role.ACTUATOR_FAULT else outputs
+            keywords["unit"] = fault_units(targets, units)
+        return self.declare(role, names, tuple(outputs), of=targets, **keywords)
+
+    def add(self, signals: Sequence[Signal], outputs: Sequence[str] = ()) -> None:
+        """Add signals, all of them or none.
+
+        Raises
+        ------
+        PlantError
+            A name that is taken, a fault of something that does not exist.
+        """
+        added: dict[str, Signal] = {}
+        for signal in signals:
+            taken = self._signals.get(signal.name) or added.get(signal.name)
+            if taken is not None or signal.name in outputs:
+                role = "output" if taken is None else str(taken.role)
+                raise PlantError(
+                    f"{signal.role} {signal.name}: the name is taken by the {role} {signal.name}",
+                    symbol=signal.name,
+                )
+            added[signal.name] = signal
+        check_targets([*self.all, *signals], outputs or None)
+        self._signals.update(added)

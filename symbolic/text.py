@@ -1,0 +1,328 @@
+"""Expressions as text and back: a small language of our own, read without evaluation.
+
+::
+
+    condition  = conjunction {"or" conjunction}
+    conjunction = negation {"and" negation}
+    negation   = "not" negation | comparison
+    comparison = sum [("<" | "<=" | ">" | ">=" | "==" | "!=") sum]
+    sum        = ["-" | "+"] product {("+" | "-") product}
+    product    = factor {("*" | "/") factor}
+    factor     = ("-" | "+") factor | atom ["**" factor]
+    atom       = number | name | name "(" condition {"," condition} ")" | "(" condition ")"
+    piecewise  = "piecewise(" "(" sum "," condition ")" {"," "(" sum "," condition ")"} ")"
+
+Integers are exact, a quotient of integers is an exact rational, a number with a point or
+an exponent is a double in its shortest form. ``pi`` is the constant.
+"""
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import sympy as sp
+from sympy.core.relational import Relational
+from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
+
+from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.functions import ALIASES, BY_NAME
+from obsynth.symbolic.text_writer import write_text
+
+__all__ = ["WORDS", "TextError", "read_text", "write_text"]
+
+WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
+"""Words of the language that cannot name a symbol."""
+
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?)"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
+    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>]))"
+)
+_COMPARE = {"<": sp.Lt, "<=": sp.Le, ">": sp.Gt, ">=": sp.Ge, "==": sp.Eq, "!=": sp.Ne}
+_CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
+_DEEPEST = 100
+_LARGEST_BITS = 8192
+
+
+class TextError(PlantError):
+    """Text that is no expression; ``position`` is the offset of the first wrong character."""
+
+
+def read_text(text: str, symbols: Mapping[str, sp.Symbol]) -> sp.Expr:
+    """Read an expression.
+
+    Parameters
+    ----------
+    text : str
+        An expression of the language above.
+    symbols : mapping of str to sympy.Symbol
+        The names that may stand in it.
+
+    Returns
+    -------
+    sympy.Expr
+
+    Raises
+    ------
+    TextError
+        Not an expression; ``position`` says where.
+
+    Examples
+    --------
+    >>> h = sp.Symbol("h", real=True)
+    >>> read_text("-1/2*sqrt(h) + 0.1", {"h": h})
+    0.1 - sqrt(h)/2
+    """
+    return _Reader(text, symbols).read()
+
+
+# -- reading ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Token:
+    kind: str
+    text: str
+    position: int
+
+
+class _Reader:
+    """Recursive descent; every method reads one rule of the grammar."""
+
+    def __init__(self, text: str, symbols: Mapping[str, sp.Symbol]) -> None:
+        if not isinstance(text, str):
+            raise TextError(f"an expression is text, not {text!r}", position=0)
+        self.text = text
+        self.symbols = symbols
+        self.depth = 0
+        self.index = 0
+        self.tokens = self._split()
+
+    def read(self) -> sp.Expr:
+        result = self._number(self._condition)
+        if self._now.kind != "end":
+            self._fail(f"unexpected {self._now.text!r}")
+        return result
+
+    def _split(self) -> list[_Token]:
+        tokens, position = [], 0
+        end = len(self.text.rstrip())
+        while position < end:
+            match = _TOKEN.match(self.text, position)
+            if match is None:
+                position += len(self.text[position:]) - len(self.text[position:].lstrip())
+                hint = "; a power is written **" if self.text[position] == "^" else ""
+                self._fail(f"the character {self.text[position]!r} has no meaning{hint}", position)
+            kind = str(match.lastgroup)
+            tokens.append(_Token(kind, match[kind], match.start(kind)))
+            position = match.end()
+        return [*tokens, _Token("end", "the end of the text", end)]
+
+    @property
+    def _now(self) -> _Token:
+        return self.tokens[self.index]
+
+    def _take(self, *texts: str) -> _Token | None:
+        """Consume the present token when it is one of these."""
+        token = self._now
+        if token.kind != "end" and token.text in texts:
+            self.index += 1
+            return token
+        return None
+
+    def _expect(self, text: str) -> None:
+        if self._take(text) is None:
+            self._fail(f"expected {text!r} in place of {self._now.text}")
+
+    def _fail(self, message: str, position: int | None = None) -> NoReturn:
+        where = self._now.position if position is None else position
+        shown = self.text if len(self.text) <= 200 else self.text[max(0, where - 100) : where + 100]
+        raise TextError(
+            f"{message}, at position {where} of {shown!r}", position=where, text=self.text
+        )
+
+    def _number(self, rule: Any) -> sp.Expr:
+        position = self._now.position
+        result = rule()
+        if isinstance(result, _CONDITIONS):
+            self._fail(f"the condition {result} stands where a number is needed", position)
+        return result
+
+    def _truth(self, rule: Any) -> sp.Basic:
+        position = self._now.position
+        result = rule()
+        if not isinstance(result, _CONDITIONS):
+            self._fail(f"{result} stands where a condition is needed", position)
+        return result
+
+    def _condition(self) -> sp.Basic:
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self._fail(f"more than {_DEEPEST} levels of parentheses")
+        result = self._joined("or", Or, lambda: self._joined("and", And, self._negation))
+        self.depth -= 1
+        return result
+
+    def _joined(self, word: str, join: Any, rule: Any) -> sp.Basic:
+        position = self._now.position
+        first = rule()
+        if self._now.text != word:
+            return first
+        if not isinstance(first, _CONDITIONS):
+            self._fail(f"{first} stands where a condition is needed", position)
+        parts = [first]
+        while self._take(word):
+            parts.append(self._truth(rule))
+        return join(*parts)
+
+    def _negation(self) -> sp.Basic:
+        if self._take("not"):
+            return Not(self._truth(self._negation))
+        position = self._now.position
+        left = self._sum()
+        operator = self._take(*_COMPARE)
+        if operator is None:
+            return left
+        if isinstance(left, _CONDITIONS):
+            self._fail(f"the condition {left} cannot be compared", position)
+        return _COMPARE[operator.text](left, self._number(self._sum))
+
+    def _sum(self) -> sp.Basic:
+        position = self._now.position
+        first = self._product(self._sign())
+        if self._now.text not in ("+", "-"):
+            return first
+        if isinstance(first, _CONDITIONS):
+            self._fail(f"the condition {first} stands where a number is needed", position)
+        terms = [first]
+        while self._now.text in ("+", "-"):
+            sign = self._sign()
+            terms.append(self._number(lambda sign=sign: self._product(sign)))
+        return self._finite(sp.Add(*terms), position)
+
+    def _sign(self) -> list[sp.Expr]:
+        """Read a sign; return the factor it stands for."""
+        token = self._take("+", "-")
+        return [sp.Integer(-1)] if token is not None and token.text == "-" else []
+
+    def _product(self, factors: list[sp.Expr]) -> sp.Basic:
+        # A product is built from all of its factors at once: SymPy distributes a number
+        # over a sum when it meets the two alone.
+        position = self._now.position
+        first = self._factor()
+        if self._now.text not in ("*", "/") and not factors:
+            return first
+        if isinstance(first, _CONDITIONS):
+            self._fail(f"the condition {first} stands where a number is needed", position)
+        factors = [*factors, first]
+        while operator := self._take("*", "/"):
+            factor = self._number(self._factor)
+            if operator.text == "/" and factor == 0:
+                self._fail("division by zero")
+            factors.append(1 / factor if operator.text == "/" else factor)
+        return self._finite(sp.Mul(*factors), position)
+
+    def _factor(self) -> sp.Basic:
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self._fail(f"more than {_DEEPEST} levels of signs, powers and parentheses")
+        if sign := self._take("-", "+"):
+            inner = self._number(self._factor)
+            result = -inner if sign.text == "-" else inner
+        else:
+            position = self._now.position
+            result = self._atom()
+            if self._take("**"):
+                if isinstance(result, _CONDITIONS):
+                    self._fail(f"the condition {result} has no power", position)
+                result = self._power(result, self._number(self._factor), position)
+        self.depth -= 1
+        return result
+
+    def _power(self, base: sp.Expr, exponent: sp.Expr, position: int) -> sp.Expr:
+        # Exact powers are computed while reading: 9**9**9 would never end.
+        if isinstance(base, sp.Rational) and isinstance(exponent, sp.Rational):
+            if base == 0 and exponent < 0:
+                self._fail("division by zero", position)
+            bits = max(int(base.p).bit_length(), int(base.q).bit_length())
+            if base not in (0, 1, -1) and bits * abs(exponent) > _LARGEST_BITS:
+                self._fail(f"the power {base}**{exponent} is too large", position)
+        return self._finite(base**exponent, position)
+
+    def _finite(self, value: sp.Basic, position: int) -> sp.Basic:
+        wild = isinstance(value, sp.Float) and not abs(value) < sp.Float("1.8e308")
+        if wild or value in (sp.oo, -sp.oo, sp.zoo, sp.nan):
+            self._fail("the value is not a finite number", position)
+        return value
+
+    def _atom(self) -> sp.Basic:
+        token = self._now
+        if token.kind == "end":
+            self._fail("the text ends where a number, a name or a parenthesis is needed")
+        self.index += 1
+        if token.kind == "number":
+            return self._literal(token)
+        if token.text == "(":
+            inner = self._condition()
+            self._expect(")")
+            return inner
+        if token.kind != "name" or token.text in ("and", "or", "not"):
+            self._fail(f"unexpected {token.text!r}", token.position)
+        if self._now.text == "(":
+            return self._call(token)
+        if token.text in ("True", "False"):
+            return sp.true if token.text == "True" else sp.false
+        if token.text == "pi":
+            return sp.pi
+        if token.text in self.symbols:
+            return self.symbols[token.text]
+        close = difflib.get_close_matches(token.text, self.symbols, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        known = ", ".join(self.symbols) or "none"
+        message = f"the symbol {token.text} is not declared (declared: {known}){hint}"
+        return self._fail(message, token.position)
+
+    def _literal(self, token: _Token) -> sp.Expr:
+        if token.text.isdigit():
+            if len(token.text) > 4000:
+                self._fail("the number has more than 4000 digits", token.position)
+            return sp.Integer(int(token.text))
+        return self._finite(sp.Float(float(token.text)), token.position)
+
+    def _call(self, token: _Token) -> sp.Basic:
+        if token.text in ("piecewise", "Piecewise"):
+            return self._piecewise(token)
+        function = BY_NAME.get(ALIASES.get(token.text, token.text))
+        if function is None:
+            self._fail(
+                f"the function {token.text} is not supported; supported are "
+                f"{', '.join(sorted(BY_NAME))}, piecewise",
+                token.position,
+            )
+        self._expect("(")
+        arguments = [self._number(self._condition)]
+        while self._take(","):
+            arguments.append(self._number(self._condition))
+        self._expect(")")
+        most = len(arguments) if function.most is None else function.most
+        if not function.least <= len(arguments) <= most:
+            self._fail(f"{token.text} does not take {len(arguments)} arguments", token.position)
+        return self._finite(function.sympy(*arguments), token.position)
+
+    def _piecewise(self, token: _Token) -> sp.Expr:
+        pairs = []
+        self._expect("(")
+        while True:
+            self._expect("(")
+            value = self._number(self._condition)
+            self._expect(",")
+            pairs.append((value, self._truth(self._condition)))
+            self._expect(")")
+            if not self._take(","):
+                break
+        self._expect(")")
+        if pairs[-1][1] != sp.true:
+            self._fail("the last case of piecewise needs the condition True", token.position)
+        return sp.Piecewise(*pairs)
