@@ -1,1 +1,43 @@
 """What follows from a plant, with proof."""
+
+from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.dependence import AffineDependence
+from obsynth.derive.equilibrium import Equilibrium, equilibrium
+from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
+from obsynth.derive.intervals import Ranges, Status, bound_ranges
+from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.report import Check, StructureReport, analyse
+from obsynth.derive.split import IdentityProof, Split, split
+from obsynth.derive.structure import (
+    Decoupling,
+    Detectability,
+    augmented_pair,
+    detectability,
+    unknown_input_condition,
+)
+
+__all__ = [
+    "AffineDependence",
+    "AffineFamily",
+    "Check",
+    "Decoupling",
+    "DerivationError",
+    "Detectability",
+    "Equilibrium",
+    "IdentityProof",
+    "JacobianBounds",
+    "Ranges",
+    "Split",
+    "Status",
+    "StructureError",
+    "StructureReport",
+    "UnboundedError",
+    "analyse",
+    "augmented_pair",
+    "bound_ranges",
+    "detectability",
+    "equilibrium",
+    "jacobian_bounds",
+    "split",
+    "unknown_input_condition",
+]

@@ -1,0 +1,198 @@
+"""Equilibria: where a plant stays for given inputs."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.derive.errors import DerivationError
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["Equilibrium", "equilibrium", "operating_values"]
+
+Array = NDArray[np.float64]
+_STARTS = 32
+_ITERATIONS = 60
+_NO_VALUES: Array = np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """A point of operation.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+        State, in the units of the plant.
+    u : ndarray, shape (n_u,)
+        Input that holds it.
+    residual : float
+        Largest |f(x, u)| (continuous time) or |f(x, u) - x| (discrete time), with unknown inputs,
+        faults and disturbances at zero.
+    p, rho : ndarray
+        Values of uncertain parameters and scheduling variables that belong to it.
+    """
+
+    x: Array
+    u: Array
+    residual: float
+    p: Array = field(default_factory=lambda: _NO_VALUES)
+    rho: Array = field(default_factory=lambda: _NO_VALUES)
+
+
+def operating_values(model: Plant, kind: str) -> Array:
+    """Nominal values of one kind of signal: declared, else the middle of the range, else zero.
+
+    Parameters
+    ----------
+    model : Plant
+        The plant.
+    kind : str
+        ``"x"``, ``"u"``, ``"p"`` or ``"rho"``.
+
+    Returns
+    -------
+    ndarray
+        One value per signal.
+    """
+    values = []
+    for signal in getattr(model, kind):
+        if signal.nominal is not None:
+            values.append(float(signal.nominal))
+        elif signal.value is not None:
+            values.append(float(signal.value))
+        elif np.isfinite(signal.lower) and np.isfinite(signal.upper):
+            values.append(0.5 * (signal.lower + signal.upper))
+        else:
+            values.append(0.0)
+    return np.array(values, dtype=float)
+
+
+def _inputs(model: Plant, u: ArrayLike | None) -> Array:
+    names = model.names("u")
+    if u is None:
+        for signal in model.u:
+            if signal.nominal is None and not (
+                np.isfinite(signal.lower) and np.isfinite(signal.upper)
+            ):
+                raise DerivationError(
+                    f"the input {signal.name} has neither a nominal value nor a range; give "
+                    f"u= or declare it with nominal=",
+                    symbol=signal.name,
+                )
+        return operating_values(model, "u")
+    values = np.atleast_1d(np.asarray(u, dtype=float))
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise DerivationError(
+            f"u needs one finite number for each of {', '.join(names) or 'no inputs'}; "
+            f"given was {values.tolist()}",
+            symbols=names,
+            given=values,
+        )
+    return values
+
+
+def _residual_function(model: Plant) -> ca.Function:
+    sx = model.sx()
+    residual = sx.rhs - sx.x if model.Ts is not None else sx.rhs
+    quiet = ca.vertcat(sx.d, sx.f, sx.w)
+    residual = ca.substitute(residual, quiet, ca.SX.zeros(quiet.numel()))
+    arguments = [sx.x, sx.u, sx.p, sx.rho]
+    return ca.Function("residual", arguments, [residual, ca.jacobian(residual, sx.x)])
+
+
+def _newton(function: ca.Function, start: Array, given: list[Any]) -> tuple[Array, float]:
+    def at(x: Array) -> tuple[Array, Array]:
+        value, slope = function(x, *given)
+        return np.array(value).ravel(), np.array(slope)
+
+    x = start
+    value, slope = at(x)
+    for _ in range(_ITERATIONS):
+        if not (np.isfinite(value).all() and np.isfinite(slope).all()):
+            return x, np.inf
+        size = float(np.abs(value).max(initial=0.0))
+        if size == 0.0:
+            break
+        # least squares: an integrator makes the Jacobian singular without making it useless
+        step = np.linalg.lstsq(slope, -value, rcond=None)[0]
+        for halving in range(30):
+            trial = x + step * 0.5**halving
+            trial_value, trial_slope = at(trial)
+            if np.abs(trial_value).max(initial=0.0) < size:
+                break
+        else:
+            break
+        x, value, slope = trial, trial_value, trial_slope
+    return x, float(np.abs(value).max(initial=0.0))
+
+
+def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
+    """Find the state that given inputs hold.
+
+    Newton's method with step halving, from the nominal state or the middle of the state's range
+    and then from a fixed set of further points of that range.
+
+    Parameters
+    ----------
+    model : Plant
+        Continuous or discrete plant. Unknown inputs, faults and disturbances are zero.
+    u : array_like, shape (n_u,), optional
+        Inputs; by default their nominal values, else the middle of their range.
+
+    Returns
+    -------
+    Equilibrium
+        State, input and what is left of the equations.
+
+    Raises
+    ------
+    DerivationError
+        No equilibrium was found inside the range of the states; an input without a value.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> point = equilibrium(quadruple_tank(), u=[10, 10])
+    >>> [round(float(level), 6) for level in point.x]
+    [130.118142, 172.57532, 31.304892, 38.805004]
+    """
+    inputs = _inputs(model, u)
+    p, rho = operating_values(model, "p"), operating_values(model, "rho")
+    box = model.box("x")
+    function = _residual_function(model)
+    first = operating_values(model, "x")
+    finite = np.isfinite(box).all(axis=1)
+    width = np.where(
+        finite, np.where(finite, box[:, 1], 0.0) - np.where(finite, box[:, 0], 0.0), 2.0
+    )
+    rng = np.random.default_rng(0)
+    outside: Array | None = None
+    for attempt in range(_STARTS):
+        start = first if attempt == 0 else first + width * (rng.random(len(first)) - 0.5)
+        start = np.clip(start, box[:, 0], box[:, 1])
+        x, residual = _newton(function, start, [inputs, p, rho])
+        scale = 1.0 + float(np.abs(x).max(initial=0.0))
+        if residual > 1e-9 * scale:
+            continue
+        if (x >= box[:, 0]).all() and (x <= box[:, 1]).all():
+            return Equilibrium(x, inputs, residual, p, rho)
+        outside = x
+    if outside is None:
+        raise DerivationError(
+            f"no equilibrium of {model.name!r} was found for u = {inputs.tolist()}; give the point "
+            "of operation with at=(x, u), or other inputs",
+            u=inputs,
+        )
+    names = model.names("x")
+    wrong = [k for k in range(len(names)) if not box[k, 0] <= outside[k] <= box[k, 1]]
+    listed = ", ".join(f"{names[k]} = {outside[k]:.6g} (range {box[k].tolist()})" for k in wrong)
+    raise DerivationError(
+        f"for u = {inputs.tolist()} the plant {model.name!r} rests outside the range of its "
+        f"states: {listed}; change the inputs or widen the range",
+        x=outside,
+        u=inputs,
+        symbols=tuple(names[k] for k in wrong),
+    )

@@ -1,0 +1,245 @@
+"""Interval arithmetic on batches, rounded outwards.
+
+An interval is a pair ``(lo, hi)`` of arrays of equal or broadcastable shape, one element per box of
+a batch. The four operations and the square root are correctly rounded by IEEE 754, so that one
+step of ``nextafter`` encloses the exact result. Zeros that are exact stay exact, since a lower end
+of ``-5e-324`` in place of 0 would leave the domain of a square root.
+
+``nan`` in either end stands for "nothing is known": it propagates through every operation here and
+is turned into the whole line by whoever reads the result. It arises from ``0 * inf``, from
+operands outside a domain and from a division by an interval with zero inside.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "ONE",
+    "ZERO",
+    "Array",
+    "Interval",
+    "Mask",
+    "absolute",
+    "add",
+    "divide",
+    "down",
+    "hull",
+    "maximum",
+    "minimum",
+    "multiply",
+    "negate",
+    "nonnegative",
+    "point",
+    "power_int",
+    "sqrt",
+    "subtract",
+    "twice",
+    "up",
+    "widen",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Interval = tuple[Array, Array]
+Operation = Callable[..., Interval]
+
+_INF = np.inf
+_EPS = float(np.finfo(float).eps)
+ZERO: Interval = (np.zeros(1), np.zeros(1))
+ONE: Interval = (np.ones(1), np.ones(1))
+
+
+def down(value: Array) -> Array:
+    """Step to the next double towards minus infinity.
+
+    Parameters
+    ----------
+    value : ndarray
+        Any shape.
+
+    Returns
+    -------
+    ndarray
+        A lower bound of every real number that rounds to ``value``.
+    """
+    return np.nextafter(value, -_INF)
+
+
+def up(value: Array) -> Array:
+    """Step to the next double towards plus infinity; the counterpart of `down`.
+
+    Parameters
+    ----------
+    value : ndarray
+        Any shape.
+
+    Returns
+    -------
+    ndarray
+        An upper bound of every real number that rounds to ``value``.
+    """
+    return np.nextafter(value, _INF)
+
+
+def point(value: float) -> Interval:
+    """Make the degenerate interval of a number that is meant as the double it is.
+
+    Parameters
+    ----------
+    value : float
+        The number.
+
+    Returns
+    -------
+    Interval
+        Both ends equal, shape (1,).
+    """
+    array = np.array([value], dtype=float)
+    return array, array
+
+
+def widen(a: Interval, ulps: int) -> Interval:
+    """Push both ends outwards by a number of units in the last place.
+
+    Parameters
+    ----------
+    a : Interval
+        Ends computed with a known error.
+    ulps : int
+        Error bound of the computation, in units in the last place.
+
+    Returns
+    -------
+    Interval
+        Encloses the exact ends.
+    """
+    lo, hi = a
+    return down(lo - ulps * _EPS * np.abs(lo)), up(hi + ulps * _EPS * np.abs(hi))
+
+
+def hull(a: Interval, b: Interval) -> Interval:
+    """Return the smallest interval that holds both."""
+    return np.minimum(a[0], b[0]), np.maximum(a[1], b[1])
+
+
+def _keep_zero(raw: Array, rounded: Array, possible: Callable[[], Mask]) -> Array:
+    """Undo the rounding of an exact zero, unless the zero may come from underflow."""
+    zero = raw == 0.0
+    if not zero.any():
+        return rounded
+    return np.where(zero & ~possible(), 0.0, rounded)
+
+
+def negate(a: Interval) -> Interval:
+    """Return -a, exact."""
+    return -a[1], -a[0]
+
+
+def add(a: Interval, b: Interval) -> Interval:
+    """Return a + b; a sum of doubles that rounds to zero is zero, so it is left alone."""
+    lo, hi = a[0] + b[0], a[1] + b[1]
+    return np.where(lo == 0.0, 0.0, down(lo)), np.where(hi == 0.0, 0.0, up(hi))
+
+
+def subtract(a: Interval, b: Interval) -> Interval:
+    """Return a - b for independent operands."""
+    lo, hi = a[0] - b[1], a[1] - b[0]
+    return np.where(lo == 0.0, 0.0, down(lo)), np.where(hi == 0.0, 0.0, up(hi))
+
+
+def twice(a: Interval) -> Interval:
+    """Return 2 a, exact apart from overflow."""
+    return 2.0 * a[0], 2.0 * a[1]
+
+
+def multiply(a: Interval, b: Interval) -> Interval:
+    """Return a * b for independent operands."""
+    (al, ah), (bl, bh) = a, b
+    p, q, r, s = al * bl, al * bh, ah * bl, ah * bh
+    lo = np.minimum(np.minimum(p, q), np.minimum(r, s))
+    hi = np.maximum(np.maximum(p, q), np.maximum(r, s))
+    return (
+        _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
+        _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),
+    )
+
+
+def divide(a: Interval, b: Interval) -> Interval:
+    """Return a / b; a divisor with zero at one end gives a half line, with zero inside nothing."""
+    (al, ah), (bl, bh) = np.broadcast_arrays(*a), np.broadcast_arrays(*b)
+    p, q, r, s = al / bl, al / bh, ah / bl, ah / bh
+    lo = np.minimum(np.minimum(p, q), np.minimum(r, s))
+    hi = np.maximum(np.maximum(p, q), np.maximum(r, s))
+    lo, hi = (
+        _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
+        _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),
+    )
+    singular = (bl <= 0.0) & (bh >= 0.0)
+    if not singular.any():
+        return lo, hi
+    positive, negative = singular & (bl == 0) & (bh > 0), singular & (bh == 0) & (bl < 0)
+    lo, hi = np.where(singular, np.nan, lo), np.where(singular, np.nan, hi)
+    for divisor, end, sign in ((positive, bh, 1.0), (negative, bl, -1.0)):
+        # sign * a over sign * b, a divisor in [0, end]
+        top_lo, top_hi = (al, ah) if sign > 0 else (-ah, -al)
+        width = sign * end
+        above, below = divisor & (top_lo >= 0), divisor & (top_hi <= 0)
+        lo = np.where(above, np.maximum(down(top_lo / width), 0.0), np.where(below, -_INF, lo))
+        hi = np.where(above, _INF, np.where(below, np.minimum(up(top_hi / width), 0.0), hi))
+    return lo, hi
+
+
+def power_int(a: Interval, n: int) -> Interval:
+    """Return a**n for an integer n >= 2; a square is no product of two unknowns."""
+    lo, hi = a
+    if n == 2:
+        big = np.maximum(np.abs(lo), np.abs(hi))
+        small = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
+        return np.maximum(down(small * small), 0.0), np.where(big == 0.0, 0.0, up(big * big))
+    if n % 2 == 0:
+        base_lo, base_hi = absolute(a)
+        ends = _powers(base_lo, base_hi, n)
+        return np.maximum(ends[0], 0.0), np.where(base_hi == 0.0, 0.0, ends[1])
+    ends = _powers(lo, hi, n)
+    return np.where(lo == 0.0, 0.0, ends[0]), np.where(hi == 0.0, 0.0, ends[1])
+
+
+def _powers(lo: Array, hi: Array, n: int) -> Interval:
+    # pow of the C library is good to an ulp; eight leave room for vectorised versions of it
+    return widen((np.power(lo, n), np.power(hi, n)), 8)
+
+
+def sqrt(a: Interval) -> Interval:
+    """Take the square root; an operand that reaches below zero gives nothing."""
+    lo, hi = np.sqrt(a[0]), np.sqrt(a[1])
+    lower, upper = np.where(lo == 0.0, 0.0, down(lo)), np.where(hi == 0.0, 0.0, up(hi))
+    undefined = a[0] < 0.0
+    if undefined.any():
+        lower, upper = np.where(undefined, np.nan, lower), np.where(undefined, np.nan, upper)
+    return lower, upper
+
+
+def nonnegative(a: Interval) -> Interval:
+    """Return a where it is >= 0, nothing where it reaches below: the domain of sqrt(a)**2."""
+    undefined = a[0] < 0.0
+    return np.where(undefined, np.nan, a[0]), np.where(undefined, np.nan, a[1])
+
+
+def absolute(a: Interval) -> Interval:
+    """Return |a|, exact."""
+    lo, hi = a
+    big = np.maximum(np.abs(lo), np.abs(hi))
+    small = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
+    return np.where(np.isnan(big), np.nan, small), big
+
+
+def minimum(a: Interval, b: Interval) -> Interval:
+    """Return min(a, b), exact."""
+    return np.minimum(a[0], b[0]), np.minimum(a[1], b[1])
+
+
+def maximum(a: Interval, b: Interval) -> Interval:
+    """Return max(a, b), exact."""
+    return np.maximum(a[0], b[0]), np.maximum(a[1], b[1])

@@ -1,0 +1,225 @@
+"""Straight-line interval programs from CasADi SX functions.
+
+The instruction list of a CasADi function is turned into a graph in which equal sub-expressions are
+one node (hash-consing). On the way some forms are replaced by others with the same value and a
+narrower range: ``x*x`` becomes a square, ``sqrt(x**2)`` becomes ``|x|``, ``sqrt(x)**2`` becomes
+``x`` on ``x >= 0``, the two halves into which CasADi cuts an ``if_else`` become one choice with the
+hull of both branches, and the quotient of truth values that CasADi writes for the derivative of
+``min`` and ``max`` becomes a weight in [0, 1].
+
+Constants: numbers with at most 24 significant bits (integers, halves, quarters) are taken as
+meant; all others are widened by `CONSTANT_ULPS`, which covers the rounding of the constants that
+CasADi folds while an expression is built. Inputs named in ``constants`` become intervals once and
+for all, which is how exact rational parameters enter as intervals of one unit in the last place.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals.graph import Graph, Node
+from obsynth.derive.intervals.rewrites import REWRITES
+from obsynth.derive.intervals.rules import JUMPS, NAMES, PARTIAL
+
+__all__ = ["CONSTANT_ULPS", "Program", "constant_interval"]
+
+CONSTANT_ULPS = 4
+_SIGNIFICANT_BITS = 24
+
+
+def constant_interval(value: float) -> tuple[float, float]:
+    """Enclose what a constant of a CasADi expression stands for.
+
+    Parameters
+    ----------
+    value : float
+        The double found in the expression.
+
+    Returns
+    -------
+    (float, float)
+        The number itself when it has at most 24 significant bits, else widened.
+
+    Examples
+    --------
+    >>> constant_interval(0.5)
+    (0.5, 0.5)
+    >>> lo, hi = constant_interval(0.1)
+    >>> lo < 0.1 < hi
+    True
+    """
+    if not math.isfinite(value):
+        return (math.nan, math.nan) if math.isnan(value) else (value, value)
+    mantissa, _ = math.frexp(value)
+    if (mantissa * 2.0**_SIGNIFICANT_BITS).is_integer():
+        return value, value
+    lo = hi = value
+    for _ in range(CONSTANT_ULPS):
+        lo, hi = math.nextafter(lo, -math.inf), math.nextafter(hi, math.inf)
+    return lo, hi
+
+
+@dataclass
+class Program(Graph):
+    """A function of a box as a list of interval operations.
+
+    Attributes
+    ----------
+    n_variables : int
+        Number of box variables.
+    outputs : list of int
+        Node of every scalar output, in the order of the function's nonzeros.
+
+    Notes
+    -----
+    Build one with `Program.from_casadi`; evaluate it with
+    `obsynth.derive.intervals.evaluate`.
+    """
+
+    n_variables: int = 0
+    outputs: list[int] = field(default_factory=list)
+    _live: dict[tuple[int, ...], list[int]] = field(default_factory=dict, repr=False)
+    _breaks: dict[int, list[int]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_casadi(
+        cls,
+        function: ca.Function,
+        constants: Mapping[int, Sequence[tuple[float, float]]] | None = None,
+    ) -> "Program":
+        """Build the program of an SX function.
+
+        Parameters
+        ----------
+        function : casadi.Function
+            SX function with dense inputs; MX functions have to be expanded before.
+        constants : mapping, optional
+            For inputs that are not part of the box: the enclosure of every element.
+            All other inputs, one after the other, are the box variables.
+
+        Returns
+        -------
+        Program
+            With one output per nonzero of the function's outputs.
+
+        Raises
+        ------
+        DerivationError
+            An operation without a range rule, by name.
+
+        Examples
+        --------
+        >>> import casadi as ca
+        >>> x = ca.SX.sym("x")
+        >>> program = Program.from_casadi(ca.Function("f", [x], [x * x + x * x]))
+        >>> [node.op for node in program.nodes]
+        ['input', 'power_int', 'twice']
+        """
+        given = dict(constants or {})
+        first: dict[int, int] = {}
+        count = 0
+        for index in range(function.n_in()):
+            if index not in given:
+                first[index] = count
+                count += function.numel_in(index)
+        program = cls(n_variables=count)
+        work: dict[int, int] = {}
+        results: dict[tuple[int, int], int] = {}
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            out, args = function.instruction_output(k), function.instruction_input(k)
+            if code == ca.OP_CONST:
+                work[out[0]] = program.number(*constant_interval(function.instruction_constant(k)))
+            elif code == ca.OP_INPUT:
+                which, element = args
+                if which in given:
+                    work[out[0]] = program.number(*given[which][element])
+                else:
+                    node = Node("input", (), first[which] + element)
+                    work[out[0]] = program.append(node)
+            elif code == ca.OP_OUTPUT:
+                results[(out[0], out[1])] = work[args[0]]
+            else:
+                name = NAMES.get(code)
+                if name is None:
+                    raise DerivationError(
+                        f"the operation number {code} of CasADi has no range rule; write the "
+                        "equation with elementary functions",
+                        operation=code,
+                    )
+                operands = [work[a] for a in args]
+                work[out[0]] = (
+                    REWRITES[name](program, operands)
+                    if name in REWRITES
+                    else program.plain(name, operands)
+                )
+        for index in range(function.n_out()):
+            for element in range(function.nnz_out(index)):
+                program.outputs.append(results[(index, element)])
+        return program
+
+    def live(self, outputs: Sequence[int]) -> list[int]:
+        """List the nodes needed for some outputs, in order; remembered between calls.
+
+        Parameters
+        ----------
+        outputs : sequence of int
+            Positions in ``self.outputs``.
+
+        Returns
+        -------
+        list of int
+            Node numbers in an order in which they can be evaluated.
+        """
+        key = tuple(outputs)
+        if key not in self._live:
+            needed: set[int] = set()
+            stack = [self.outputs[k] for k in outputs]
+            while stack:
+                index = stack.pop()
+                if index not in needed:
+                    needed.add(index)
+                    if index not in self.constants:
+                        stack.extend(self.nodes[index].args)
+            self._live[key] = sorted(needed)
+        return self._live[key]
+
+    def breaks(self, output: int) -> list[int]:
+        """List the operations under an output that may jump or be undefined.
+
+        Parameters
+        ----------
+        output : int
+            Position in ``self.outputs``.
+
+        Returns
+        -------
+        list of int
+            Node numbers, without those that are constant.
+        """
+        if output not in self._breaks:
+            self._breaks[output] = [
+                k
+                for k in self.live([output])
+                if k not in self.constants and self.nodes[k].op in PARTIAL | JUMPS
+            ]
+        return self._breaks[output]
+
+    def support(self, output: int) -> tuple[int, ...]:
+        """List the variables on which an output depends.
+
+        Parameters
+        ----------
+        output : int
+            Position in ``self.outputs``.
+
+        Returns
+        -------
+        tuple of int
+            Indices of box variables, ascending.
+        """
+        found = {self.nodes[k].number for k in self.live([output]) if self.nodes[k].op == "input"}
+        return tuple(sorted(found))

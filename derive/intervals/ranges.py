@@ -1,0 +1,275 @@
+"""Guaranteed ranges of expressions over a box: the way into the interval engine."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals.arithmetic import Array
+from obsynth.derive.intervals.branch import Budget, Outcome, Problem, maximise
+from obsynth.derive.intervals.evaluate import first_failure
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.rules import JUMPS
+
+__all__ = ["EFFORTS", "Failure", "Ranges", "Status", "bound_ranges", "make_problem"]
+
+
+class Status(StrEnum):
+    """How good a bound is; the value is a sentence for the reader.
+
+    Examples
+    --------
+    >>> print(Status.CONVERGED)
+    converged: the bound is within the tolerance of an attained value
+    """
+
+    EXACT = "exact: the bound is attained, up to rounding"
+    CONVERGED = "converged: the bound is within the tolerance of an attained value"
+    BUDGET = "budget: the bound is valid but looser than asked; raise the effort"
+    UNBOUNDED = "unbounded: no finite bound over the box"
+
+
+EFFORTS = {
+    "fast": Budget(boxes=4_000, sweeps=60),
+    "normal": Budget(boxes=400_000, sweeps=1_500),
+    "tight": Budget(boxes=8_000_000, sweeps=10_000),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Failure:
+    """An expression without a finite bound.
+
+    Attributes
+    ----------
+    index : int
+        Which expression.
+    operation : str
+        The first operation without a finite result.
+    lower, upper : ndarray, shape (v,)
+        The sub-box where that happens.
+    """
+
+    index: int
+    operation: str
+    lower: Array
+    upper: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Guaranteed and attained ranges of m expressions of v variables.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (m,)
+        Guaranteed bounds, rounded outwards.
+    attained_lower, attained_upper : ndarray, shape (m,)
+        Values the expressions are guaranteed to reach or pass at ``points_lower`` and
+        ``points_upper``, so that the true range lies between the two pairs.
+    points_lower, points_upper : ndarray, shape (m, v)
+        Where.
+    gap : ndarray, shape (m,)
+        Guaranteed width minus attained width.
+    status_lower, status_upper, status : list of Status
+        How good the bounds are; ``status`` is the worse of the two.
+    failures : tuple of Failure
+        Expressions without a finite bound.
+    boxes, sweeps : int
+        Work done.
+    """
+
+    lower: Array
+    upper: Array
+    attained_lower: Array
+    attained_upper: Array
+    points_lower: Array
+    points_upper: Array
+    gap: Array
+    status_lower: list[Status]
+    status_upper: list[Status]
+    failures: tuple[Failure, ...]
+    boxes: int
+    sweeps: int
+
+    @property
+    def status(self) -> list[Status]:
+        """The worse status of the two bounds of every expression."""
+        order = list(Status)
+        return [
+            max(pair, key=order.index)
+            for pair in zip(self.status_lower, self.status_upper, strict=True)
+        ]
+
+
+def make_problem(
+    expressions: Any,
+    variables: Any,
+    box: ArrayLike,
+    constants: Any = None,
+    constant_box: Sequence[tuple[float, float]] = (),
+) -> Problem:
+    """Program of expressions and their gradients, ready for `maximise`.
+
+    Parameters
+    ----------
+    expressions : casadi.SX
+        m expressions, as a dense column.
+    variables : casadi.SX
+        v symbols, as a column.
+    box : array_like, shape (v, 2)
+        Their ranges.
+    constants : casadi.SX, optional
+        Further symbols, whose enclosures stand in ``constant_box``.
+    constant_box : sequence of (float, float)
+        One enclosure per constant.
+
+    Returns
+    -------
+    Problem
+        With the structural sparsity of the gradient.
+
+    Raises
+    ------
+    DerivationError
+        Free symbols, shapes that do not match, bounds out of order.
+    """
+    box = np.asarray(box, dtype=float)
+    column = ca.densify(ca.vec(ca.SX(expressions)))
+    variables = ca.vec(ca.SX(variables))
+    m, v = column.numel(), variables.numel()
+    if box.shape != (v, 2) or np.isnan(box).any() or (box[:, 0] > box[:, 1]).any():
+        raise DerivationError(
+            f"the box needs one (lower, upper) pair in this order for each of the {v} variables, "
+            f"shape ({v}, 2); given was {box.tolist()}",
+            box=box,
+        )
+    extra = ca.SX(0, 1) if constants is None else ca.vec(ca.SX(constants))
+    if extra.numel() != len(constant_box):
+        raise DerivationError(
+            f"{extra.numel()} constants came with {len(constant_box)} enclosures",
+            constants=extra.numel(),
+            enclosures=len(constant_box),
+        )
+    jacobian = ca.jacobian(column, variables)
+    rows, columns = jacobian.sparsity().get_triplet()
+    slopes = ca.SX(jacobian.nz[:]) if rows else ca.SX(0, 1)
+    try:
+        function = ca.Function("ranges", [variables, extra], [column, slopes])
+    except RuntimeError as error:
+        known = {str(s) for s in ca.symvar(ca.vertcat(variables, extra))}
+        free = sorted({str(s) for s in ca.symvar(column)} - known)
+        raise DerivationError(
+            f"the expressions contain the symbols {', '.join(free)}, which have no range here",
+            symbols=tuple(free),
+        ) from error
+    program = Program.from_casadi(function, {1: list(constant_box)})
+    gradient = np.full((m, v), -1, dtype=np.int64)
+    relevant, affine = np.zeros((m, v), dtype=bool), np.zeros((m, v), dtype=bool)
+    for k, (e, j) in enumerate(zip(rows, columns, strict=True)):
+        gradient[e, j] = m + k
+    for e in range(m):
+        relevant[e, list(program.support(e))] = True
+        if any(program.nodes[k].op in JUMPS for k in program.breaks(e)):
+            continue
+        for j in np.flatnonzero(relevant[e]).tolist():
+            position = int(gradient[e, j])
+            affine[e, j] = position >= 0 and j not in program.support(position)
+    return Problem(program, gradient, relevant, affine, box[:, 0].copy(), box[:, 1].copy())
+
+
+def bound_ranges(
+    expressions: Any,
+    variables: Any,
+    box: ArrayLike,
+    constants: Any = None,
+    constant_box: Sequence[tuple[float, float]] = (),
+    rtol: float = 1e-6,
+    effort: str = "normal",
+) -> Ranges:
+    """Enclose the ranges of CasADi SX expressions over a box.
+
+    Parameters
+    ----------
+    expressions : casadi.SX
+        m expressions.
+    variables : casadi.SX
+        v symbols.
+    box : array_like, shape (v, 2)
+        Their ranges.
+    constants : casadi.SX, optional
+        Symbols with a fixed, not exactly representable value.
+    constant_box : sequence of (float, float)
+        Enclosures of these values.
+    rtol : float
+        Wanted gap relative to the width of the attained range.
+    effort : {"fast", "normal", "tight"}
+        How many boxes may be spent.
+
+    Returns
+    -------
+    Ranges
+        Bounds, attained values and points, gaps, status.
+
+    Raises
+    ------
+    DerivationError
+        A box or an effort that is not understood, an operation without a range rule.
+
+    Examples
+    --------
+    >>> import casadi as ca
+    >>> x = ca.SX.sym("x")
+    >>> found = bound_ranges(x * (1 - x), x, [(0, 1)])
+    >>> bool(0.25 <= found.upper[0] < 0.25 + 1e-6), found.points_upper[0].tolist()
+    (True, [0.5])
+    """
+    if effort not in EFFORTS:
+        raise DerivationError(
+            f"effort {effort!r} is not known; choose one of {', '.join(EFFORTS)}", effort=effort
+        )
+    if not 0.0 <= rtol < 1.0:
+        raise DerivationError(f"rtol has to lie in [0, 1); given was {rtol}", rtol=rtol)
+    problem = make_problem(expressions, variables, box, constants, constant_box)
+    return _ranges(problem, maximise(problem, rtol, EFFORTS[effort]))
+
+
+def _ranges(problem: Problem, outcome: Outcome) -> Ranges:
+    m = len(problem.gradient)
+    gap = (outcome.bound - outcome.attained).reshape(m, 2)
+    rounding = np.maximum(4.0 * outcome.noise, 1e-15 * np.abs(outcome.bound)).reshape(m, 2)
+    finished = outcome.finished.reshape(m, 2)
+    status: list[list[Status]] = []
+    for e in range(m):
+        pair = []
+        for side in (0, 1):
+            if 2 * e + side in outcome.singular:
+                pair.append(Status.UNBOUNDED)
+            elif gap[e, side] <= rounding[e, side]:
+                pair.append(Status.EXACT)
+            else:
+                pair.append(Status.CONVERGED if finished[e, side] else Status.BUDGET)
+        status.append(pair)
+    failures: dict[int, Failure] = {}
+    for goal, (lower, upper) in outcome.singular.items():
+        operation = first_failure(problem.program, lower, upper, goal // 2)
+        failures.setdefault(goal // 2, Failure(goal // 2, operation, lower, upper))
+    return Ranges(
+        -outcome.bound[0::2],
+        outcome.bound[1::2],
+        -outcome.attained[0::2],
+        outcome.attained[1::2],
+        outcome.points[0::2],
+        outcome.points[1::2],
+        gap.sum(axis=1),
+        [pair[0] for pair in status],
+        [pair[1] for pair in status],
+        tuple(failures[k] for k in sorted(failures)),
+        outcome.boxes,
+        outcome.sweeps,
+    )

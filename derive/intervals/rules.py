@@ -1,0 +1,200 @@
+"""Which range rule belongs to which operation of CasADi."""
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.intervals import arithmetic as ar
+from obsynth.derive.intervals import functions as fn
+from obsynth.derive.intervals.arithmetic import Array, Interval
+
+__all__ = ["COMMUTATIVE", "JUMPS", "NAMES", "PARTIAL", "RULES", "uncertain"]
+
+
+def _erf(value: Array) -> Array:
+    from scipy.special import erf
+
+    return np.asarray(erf(value), dtype=float)
+
+
+NAMES: dict[int, str] = {
+    ca.OP_ASSIGN: "assign",
+    ca.OP_ADD: "add",
+    ca.OP_SUB: "subtract",
+    ca.OP_MUL: "multiply",
+    ca.OP_DIV: "divide",
+    ca.OP_NEG: "negate",
+    ca.OP_EXP: "exp",
+    ca.OP_LOG: "log",
+    ca.OP_POW: "power",
+    ca.OP_CONSTPOW: "power_const",
+    ca.OP_SQRT: "sqrt",
+    ca.OP_SQ: "square",
+    ca.OP_TWICE: "twice",
+    ca.OP_SIN: "sine",
+    ca.OP_COS: "cosine",
+    ca.OP_TAN: "tangent",
+    ca.OP_ASIN: "asin",
+    ca.OP_ACOS: "acos",
+    ca.OP_ATAN: "atan",
+    ca.OP_LT: "less",
+    ca.OP_LE: "less_equal",
+    ca.OP_EQ: "equal",
+    ca.OP_NE: "not_equal",
+    ca.OP_NOT: "logical_not",
+    ca.OP_AND: "conjunction",
+    ca.OP_OR: "disjunction",
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceiling",
+    ca.OP_FMOD: "remainder",
+    ca.OP_FABS: "absolute",
+    ca.OP_SIGN: "sign",
+    ca.OP_COPYSIGN: "copysign",
+    ca.OP_IF_ELSE_ZERO: "if_else_zero",
+    ca.OP_ERF: "erf",
+    ca.OP_FMIN: "minimum",
+    ca.OP_FMAX: "maximum",
+    ca.OP_INV: "inverse",
+    ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh",
+    ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh",
+    ca.OP_ATAN2: "arctangent2",
+    ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1",
+    ca.OP_HYPOT: "hypotenuse",
+}
+
+_HALF = float(np.nextafter(0.5 * np.pi, np.inf))
+
+
+def _acos(a: Interval) -> Interval:
+    return ar.negate(_MINUS_ACOS(a))
+
+
+_MINUS_ACOS = fn.increasing(
+    lambda v: -np.arccos(v), -float(np.nextafter(np.pi, np.inf)), 0.0, (-1.0, 1.0)
+)
+
+RULES: dict[str, Callable[..., Interval]] = {
+    "add": ar.add,
+    "subtract": ar.subtract,
+    "multiply": ar.multiply,
+    "divide": ar.divide,
+    "negate": ar.negate,
+    "twice": ar.twice,
+    "power_int": ar.power_int,
+    "sqrt": ar.sqrt,
+    "nonnegative": ar.nonnegative,
+    "absolute": ar.absolute,
+    "minimum": ar.minimum,
+    "maximum": ar.maximum,
+    "exp": fn.increasing(np.exp, 0.0),
+    "expm1": fn.increasing(np.expm1, -1.0),
+    "log": fn.increasing(np.log, domain=(0.0, np.inf)),
+    "log1p": fn.increasing(np.log1p, domain=(-1.0, np.inf)),
+    "sinh": fn.increasing(np.sinh),
+    "tanh": fn.increasing(np.tanh, -1.0, 1.0),
+    "asinh": fn.increasing(np.arcsinh),
+    "acosh": fn.increasing(np.arccosh, 0.0, domain=(1.0, np.inf)),
+    "atanh": fn.increasing(np.arctanh, domain=(-1.0, 1.0)),
+    "asin": fn.increasing(np.arcsin, -_HALF, _HALF, (-1.0, 1.0)),
+    "acos": _acos,
+    "atan": fn.increasing(np.arctan, -_HALF, _HALF),
+    "erf": fn.increasing(_erf, -1.0, 1.0),
+    "sine": fn.sine,
+    "cosine": fn.cosine,
+    "tangent": fn.tangent,
+    "cosh": fn.cosh,
+    "power": fn.power,
+    "power_const": fn.power_const,
+    "arctangent2": fn.arctangent2,
+    "hypotenuse": fn.hypotenuse,
+    "remainder": fn.remainder,
+    "sign": fn.sign,
+    "copysign": fn.copysign,
+    "floor": fn.floor,
+    "ceiling": fn.ceiling,
+    "less": fn.less,
+    "less_equal": fn.less_equal,
+    "equal": fn.equal,
+    "boundary_weight": fn.boundary_weight,
+    "logical_not": fn.logical_not,
+    "conjunction": fn.conjunction,
+    "disjunction": fn.disjunction,
+    "if_else_zero": fn.if_else_zero,
+    "select": fn.select,
+}
+
+COMMUTATIVE = frozenset(
+    {"add", "multiply", "minimum", "maximum", "equal", "conjunction", "disjunction", "hypotenuse"}
+)
+
+PARTIAL = frozenset(
+    {
+        "divide",
+        "sqrt",
+        "nonnegative",
+        "log",
+        "log1p",
+        "power",
+        "power_const",
+        "tangent",
+        "asin",
+        "acos",
+        "acosh",
+        "atanh",
+    }
+)
+"""Operations that are not defined everywhere."""
+
+JUMPS = frozenset(
+    {
+        "sign",
+        "copysign",
+        "floor",
+        "ceiling",
+        "remainder",
+        "less",
+        "less_equal",
+        "equal",
+        "boundary_weight",
+        "arctangent2",
+    }
+)
+"""Operations with a jump, of which CasADi's derivative knows nothing."""
+
+
+def uncertain(op: str, result: Interval, operands: list[Interval]) -> NDArray[np.bool_]:
+    """Where an operation may jump or be undefined inside the box.
+
+    Parameters
+    ----------
+    op : str
+        A member of `PARTIAL` or `JUMPS`.
+    result : Interval
+        Its range.
+    operands : list of Interval
+        The ranges it came from.
+
+    Returns
+    -------
+    ndarray of bool
+        True where the derivative says nothing about the change of the value over the box.
+    """
+    lo, hi = result
+    if op in PARTIAL:
+        return np.asarray(~(np.isfinite(lo) & np.isfinite(hi)))
+    if op == "copysign":
+        return np.asarray(~((operands[1][0] > 0.0) | (operands[1][1] < 0.0)))
+    if op == "remainder":
+        inside = ar.absolute(operands[0])[1] < ar.absolute(operands[1])[0]
+        return np.asarray(~inside)
+    if op == "arctangent2":
+        (y_lo, y_hi), (x_lo, _) = operands
+        return np.asarray(~((x_lo > 0.0) | (y_lo > 0.0) | (y_hi < 0.0)))
+    return np.asarray(lo != hi)

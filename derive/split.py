@@ -1,0 +1,352 @@
+"""A plant as constant matrices plus a nonlinearity, with the proof that they add up."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive.equilibrium import Equilibrium, equilibrium, operating_values
+from obsynth.derive.errors import DerivationError, StructureError
+from obsynth.derive.exact import is_zero, rational, round_number, substitute
+from obsynth.derive.factorise import expand_terms, factorise
+from obsynth.derive.linear_parts import LinearPart, constant_columns
+from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["IdentityProof", "Split", "split"]
+
+Array = NDArray[np.float64]
+_FORMS = ("frozen", "terms", "jacobian")
+
+
+@dataclass(frozen=True, eq=False)
+class IdentityProof:
+    """Proof that the parts of a split add up to the plant, row by row.
+
+    The matrices of the identity are exact: A and B are the rational numbers that their doubles
+    are, and g takes up the difference to the plant's own coefficients. D, B_f, W1, C and W2 belong
+    to signals that g must not contain, so they stay as the plant has them, and ``rounding``
+    bounds how far the doubles handed to a design are away.
+
+    Attributes
+    ----------
+    methods : tuple of str
+        How every row of the dynamics, then every row of the outputs, was proved: ``"syntactic"``,
+        ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was found.
+    rounding : dict of str to ndarray
+        Bounds of |exact - double| for D, B_f, W1, C, W2, D_f.
+    """
+
+    methods: tuple[str, ...]
+    rounding: dict[str, Array]
+
+    @property
+    def holds(self) -> bool:
+        """True when every row is proved."""
+        return all(self.methods)
+
+    def __str__(self) -> str:
+        worst = max((float(e.max(initial=0.0)) for e in self.rounding.values()), default=0.0)
+        rows = ", ".join(f"row {k + 1}: {m or 'not proved'}" for k, m in enumerate(self.methods))
+        return (
+            f"parts add up to the plant exactly ({rows}); largest rounding of a matrix {worst:.2g}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """x+ = A x + B u + D d + B_f f + W1 w + g(x, u), y = C x + W2 w + D_f f.
+
+    For a continuous plant x+ stands for the time derivative.
+
+    Attributes
+    ----------
+    model : Plant
+        The plant.
+    A, B, D, B_f, W1 : ndarray, shapes (n, n), (n, n_u), (n, n_d), (n, n_f), (n, n_w)
+        Constant parts of the dynamics, in the units of the plant.
+    C, W2, D_f : ndarray, shapes (m, n), (m, n_w), (m, n_f)
+        Constant parts of the outputs; D_f is not zero for sensor faults only.
+    g : sympy.Matrix, shape (n, 1)
+        What remains, exactly: a function of x and u (and of uncertain parameters and scheduling
+        variables where there are any).
+    linear : str
+        How A and B were chosen.
+    at : Equilibrium
+        Point of operation.
+    proof : IdentityProof
+        That all of this adds up.
+    """
+
+    model: Plant
+    A: Array
+    B: Array
+    D: Array
+    B_f: Array
+    C: Array
+    W1: Array
+    W2: Array
+    D_f: Array
+    g: sp.Matrix
+    linear: str
+    at: Equilibrium
+    proof: IdentityProof
+
+    def g_function(self) -> ca.Function:
+        """Return the nonlinearity as a CasADi function.
+
+        Returns
+        -------
+        casadi.Function
+            (x, u) -> (g,), with p and rho as further inputs where the plant has them.
+
+        Examples
+        --------
+        >>> from obsynth.symbolic.plants import quadruple_tank
+        >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
+        >>> g = parts.g_function()(parts.at.x, parts.at.u)
+        >>> bool(abs(np.array(g)).max() < 1e-12)
+        True
+        """
+        return self._g_function
+
+    @cached_property
+    def _g_function(self) -> ca.Function:
+        kinds = ["x", "u"] + [k for k in ("p", "rho") if self.model.names(k)]
+        columns: list[ca.SX] = []
+        symbols: dict[sp.Symbol, ca.SX] = {}
+        for kind in kinds:
+            elements = [ca.SX.sym(name) for name in self.model.names(kind)]
+            columns.append(ca.vertcat(*elements) if elements else ca.SX(0, 1))
+            signals = getattr(self.model, kind)
+            symbols.update({s.symbol: e for s, e in zip(signals, elements, strict=True)})
+        labels = [f"g of {name}" for name in self.model.names("x")]
+        value = ca.vertcat(*to_sx(list(self.g), symbols, labels))
+        return ca.Function("g", columns, [value], kinds, ["g"])
+
+    def _repr_latex_(self) -> str:
+        short = self.g.applyfunc(lambda e: e.evalf(6))
+        return f"$\\displaystyle g = {sp.latex(short)}$"
+
+
+def _symbols(model: Plant, kind: str) -> list[sp.Symbol]:
+    return [s.symbol for s in getattr(model, kind)]
+
+
+def _point(model: Plant, at: Any) -> Equilibrium:
+    if at is None:
+        return equilibrium(model)
+    if isinstance(at, Equilibrium):
+        point = at
+    else:
+        try:
+            x, u = (np.atleast_1d(np.asarray(part, dtype=float)) for part in at)
+        except (TypeError, ValueError) as error:
+            raise DerivationError(
+                f"at= is an Equilibrium or a pair (x, u); given was {at!r}", given=at
+            ) from error
+        residual = float("nan")
+        point = Equilibrium(
+            x, u, residual, operating_values(model, "p"), operating_values(model, "rho")
+        )
+    for kind, values in (("x", point.x), ("u", point.u)):
+        names = model.names(kind)
+        if values.shape != (len(names),) or not np.isfinite(values).all():
+            raise DerivationError(
+                f"the point of operation needs one finite number for each of {', '.join(names)}; "
+                f"given was {values.tolist()}",
+                symbols=names,
+            )
+    if np.isnan(point.residual):
+        function = model.function()
+        sx = model.sx()
+        zero = {k: np.zeros(getattr(sx, k).numel()) for k in ("d", "f", "w")}
+        value = np.array(
+            function(point.x, point.u, zero["d"], zero["f"], zero["w"], point.p, point.rho)[0]
+        ).ravel()
+        rest = value - point.x if model.Ts is not None else value
+        point = Equilibrium(
+            point.x, point.u, float(np.abs(rest).max(initial=0.0)), point.p, point.rho
+        )
+    return point
+
+
+def _check_outputs(model: Plant) -> None:
+    allowed = {s.symbol for kind in ("x", "w", "f") for s in getattr(model, kind)}
+    allowed |= set(model.constant_values)
+    for name, row in zip(model.output_names, model.output, strict=True):
+        for symbol in sorted(row.free_symbols - allowed, key=str):
+            raise StructureError(
+                f"the output {name} depends on {symbol}; this form needs outputs that are linear "
+                "in states and disturbances with constant coefficients",
+                symbol=str(symbol),
+                row=name,
+            )
+
+
+def split(
+    model: Plant,
+    at: Any = None,
+    linear: Literal["frozen", "terms", "jacobian"] = "frozen",
+) -> Split:
+    """Split a plant into constant matrices and a nonlinearity g.
+
+    Equations (1)-(2) of Buciakowski et al.; ``linear="frozen"`` is their (57)-(59).
+
+    Parameters
+    ----------
+    model : Plant
+        Continuous or discrete.
+    at : Equilibrium or (x, u), optional
+        Point of operation; by default the equilibrium of the nominal inputs.
+    linear : {"frozen", "terms", "jacobian"}
+        ``"frozen"``: the quasi-linear matrices A(x, u), B(x, u) of `factorise` at the point;
+        ``"terms"``: the terms that are linear with a constant coefficient;
+        ``"jacobian"``: the derivatives at the point. The sum is the same plant in every case.
+
+    Returns
+    -------
+    Split
+        Matrices, g and the proof of the identity.
+
+    Raises
+    ------
+    StructureError
+        An unknown input, a fault or a disturbance enters nonlinearly, or an output is not linear
+        in states and disturbances; symbol and row are named.
+    DerivationError
+        No equilibrium, or a matrix that is not finite at the point.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
+    >>> np.round(np.diag(parts.A), 6).tolist()
+    [0.990154, 0.994626, 0.979926, 0.988667]
+    >>> parts.proof.holds
+    True
+    """
+    if linear not in _FORMS:
+        raise DerivationError(
+            f"linear={linear!r} is not known; choose one of {', '.join(_FORMS)}", linear=linear
+        )
+    model.check()
+    x, u = _symbols(model, "x"), _symbols(model, "u")
+    d, f, w = _symbols(model, "d"), _symbols(model, "f"), _symbols(model, "w")
+    names, output_names = model.names("x"), model.output_names
+    D = constant_columns(model, model.rhs, d, "unknown input", names)
+    B_f = constant_columns(model, model.rhs, f, "fault", names)
+    W1 = constant_columns(model, model.rhs, w, "disturbance", names)
+    _check_outputs(model)
+    C = constant_columns(model, model.output, x, "state", output_names)
+    W2 = constant_columns(model, model.output, w, "disturbance", output_names)
+    D_f = constant_columns(model, model.output, f, "sensor fault", output_names)
+    point = _point(model, at)
+    values = model.constant_values
+    quiet = model.rhs.subs(dict.fromkeys([*d, *f, *w], 0))
+    quiet = quiet.applyfunc(lambda e: substitute(e, values))
+    A, B = _matrices(model, quiet, point, linear)
+    exact_A, exact_B = A.applyfunc(rational), B.applyfunc(rational)
+    columns_x, columns_u = sp.Matrix(len(x), 1, x), sp.Matrix(len(u), 1, u)
+    remainder = quiet - exact_A * columns_x - exact_B * columns_u
+    g = sp.ImmutableMatrix(remainder.applyfunc(lambda e: sp.Add(*expand_terms(e))))
+    parts = {"D": D, "B_f": B_f, "W1": W1, "C": C, "W2": W2, "D_f": D_f}
+    proof = _prove(model, exact_A, exact_B, g, parts)
+    if not proof.holds:
+        row = proof.methods.index("")
+        raise DerivationError(
+            f"row {row + 1} of the split could not be proved equal to the plant's", row=row
+        )
+    return Split(
+        model=model,
+        A=np.array(A, dtype=float).reshape(A.shape),
+        B=np.array(B, dtype=float).reshape(B.shape),
+        D=D.value,
+        B_f=B_f.value,
+        C=C.value,
+        W1=W1.value,
+        W2=W2.value,
+        D_f=D_f.value,
+        g=g,
+        linear=linear,
+        at=point,
+        proof=proof,
+    )
+
+
+def _matrices(
+    model: Plant, rows: sp.Matrix, point: Equilibrium, linear: str
+) -> tuple[sp.Matrix, sp.Matrix]:
+    """Evaluate A and B at the point of operation."""
+    x, u = _symbols(model, "x"), _symbols(model, "u")
+    numbers = {
+        symbol: rational(value)
+        for kind, values in (("x", point.x), ("u", point.u), ("p", point.p), ("rho", point.rho))
+        for symbol, value in zip(_symbols(model, kind), values, strict=True)
+    }
+    if linear == "jacobian":
+        symbolic = (
+            sp.Matrix(rows).jacobian(x),
+            sp.Matrix(rows).jacobian(u) if u else sp.zeros(len(x), 0),
+        )
+    else:
+        form = factorise(rows, x, u)
+        symbolic = (form.A, form.B) if linear == "frozen" else (form.linear_A, form.linear_B)
+
+    def at_point(entry: sp.Expr, i: int, j: int, signals: list[sp.Symbol]) -> sp.Float:
+        value = entry.subs(numbers)
+        if not value.is_finite:
+            # the quotient t/x of a frozen form at x = 0 is the derivative of the term there
+            value = sp.limit(
+                entry.subs({s: n for s, n in numbers.items() if s != signals[j]}),
+                signals[j],
+                numbers[signals[j]],
+            )
+        try:
+            return sp.Float(round_number(value)[0], 17)
+        except DerivationError as error:
+            raise DerivationError(
+                f"the coefficient {entry} of {signals[j]} in the row of {x[i]} has no finite value "
+                f"at the point of operation; choose another point with at=, or linear='terms'",
+                row=str(x[i]),
+                symbol=str(signals[j]),
+            ) from error
+
+    result = []
+    for matrix, signals in zip(symbolic, (x, u), strict=True):
+        filled = sp.zeros(len(x), len(signals))
+        for i in range(filled.rows):
+            for j in range(filled.cols):
+                if matrix[i, j] != 0:
+                    filled[i, j] = at_point(matrix[i, j], i, j, signals)
+        result.append(filled)
+    return result[0], result[1]
+
+
+def _prove(
+    model: Plant, A: sp.Matrix, B: sp.Matrix, g: sp.Matrix, parts: dict[str, LinearPart]
+) -> IdentityProof:
+    """Show that the exact parts add up to the plant's own expressions."""
+    values = model.constant_values
+    column = {k: sp.Matrix(len(_symbols(model, k)), 1, _symbols(model, k)) for k in "xudfw"}
+    dynamics = (
+        A * column["x"]
+        + B * column["u"]
+        + parts["D"].exact * column["d"]
+        + parts["B_f"].exact * column["f"]
+        + parts["W1"].exact * column["w"]
+        + g
+    )
+    outputs = (
+        parts["C"].exact * column["x"]
+        + parts["W2"].exact * column["w"]
+        + parts["D_f"].exact * column["f"]
+    )
+    methods = []
+    for whole, summed in ((model.rhs, dynamics), (model.output, outputs)):
+        methods += [is_zero(substitute(whole[i], values) - summed[i]) for i in range(whole.rows)]
+    return IdentityProof(tuple(methods), {name: part.rounding for name, part in parts.items()})
