@@ -21,27 +21,56 @@ from obsynth.designs.lmi.expression import (
     symmetric,
     trace,
 )
+from obsynth.designs.lmi.family import Family
+from obsynth.designs.lmi.lazy import LazySolution, solve_lazily
 from obsynth.designs.lmi.problem import Block, Problem
+from obsynth.designs.lmi.proof import FamilyProof, prove_family
+from obsynth.designs.lmi.recipe import Margin, MarginSolution, largest_margin, solve_with_margin
+from obsynth.designs.lmi.retry import solve_with_retries
+from obsynth.designs.lmi.search import (
+    Bisection,
+    Knob,
+    Search,
+    bisect_feasible,
+    search_line,
+    smallest_changes,
+)
 from obsynth.designs.lmi.solution import Solution
 
 __all__ = [
     "Affine",
+    "Bisection",
     "Block",
     "Enclosure",
     "ExactMatrix",
     "ExpressionError",
+    "Family",
+    "FamilyProof",
     "Inequality",
+    "Knob",
+    "LazySolution",
+    "Margin",
+    "MarginSolution",
     "Problem",
     "ProofResult",
+    "Search",
     "Solution",
+    "bisect_feasible",
     "block",
     "constant",
     "diagonal",
     "full",
     "he",
     "is_positive_definite",
+    "largest_margin",
+    "prove_family",
     "prove_positive_definite",
     "scalar",
+    "search_line",
+    "smallest_changes",
+    "solve_lazily",
+    "solve_with_margin",
+    "solve_with_retries",
     "symmetric",
     "symmetric_block",
     "trace",

@@ -1,5 +1,6 @@
 """Clarabel, called without a modelling language in between."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from obsynth.designs.lmi.cones import Cone, ConicForm, conic_form, unstack_trian
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution
 
-__all__ = ["solve"]
+__all__ = ["solve", "solve_form"]
 
 
 def solve(problem: Problem, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:
@@ -35,23 +36,11 @@ def solve(problem: Problem, *, accept_inaccurate: bool = False, **settings: Any)
     >>> round(solve(problem).objective, 6)
     2.0
     """
-    form = conic_form(problem)
-    raw = _run(form, settings)
-    status = str(raw.status)
-    values = form.unpack(np.asarray(raw.x), problem)
-    solution = Solution(
-        values=values,
-        status=status,
-        solved=status == "Solved",
-        objective=form.sign * raw.obj_val + form.constant,
-        solver="Clarabel",
-        solve_time=raw.solve_time,
-        iterations=raw.iterations,
-        duals=_duals(form, np.asarray(raw.z), problem),
-    )
+    solution = solve_form(conic_form(problem), problem, settings)
     if solution.solved or accept_inaccurate:
         return solution
-    if status == "PrimalInfeasible":
+    status = solution.status
+    if solution.infeasible:
         raise InfeasibleDesign(
             f"{problem.name}: the solver reports that no values satisfy all constraints",
             [f"constraints: {', '.join(problem.blocks)}"],
@@ -63,14 +52,55 @@ def solve(problem: Problem, *, accept_inaccurate: bool = False, **settings: Any)
         "AlmostPrimalInfeasible": "the constraints hardly leave room, if any: maximise a margin",
     }.get(status, "scale the variables, widen the margins, or try another solver")
     raise SolverTrouble(
-        f"{problem.name}: Clarabel ended with {status} after {raw.iterations} iterations",
+        f"{problem.name}: Clarabel ended with {status} after {solution.iterations} iterations",
         [remedy, f"constraints: {', '.join(problem.blocks)}"],
         solution=solution,
         **solution.facts(),
     )
 
 
-def _run(form: ConicForm, settings: dict[str, Any]) -> Any:
+def solve_form(
+    form: ConicForm,
+    problem: Problem,
+    settings: Mapping[str, Any],
+    columns: NDArray[np.float64] | None = None,
+    rows: NDArray[np.float64] | None = None,
+) -> Solution:
+    """Run Clarabel on a conic form and name the results.
+
+    Parameters
+    ----------
+    form : ConicForm
+        Stacked from the problem, scaled or not.
+    problem : Problem
+        Gives names and shapes.
+    settings : mapping
+        Fields of Clarabel's settings.
+    columns, rows : ndarray, optional
+        Factors by which unknowns and rows of the form were scaled.
+
+    Returns
+    -------
+    Solution
+        Whatever the outcome.
+    """
+    raw = _run(form, settings)
+    x, z = np.asarray(raw.x), np.asarray(raw.z)
+    status = str(raw.status)
+    return Solution(
+        values=form.unpack(x if columns is None else x * columns, problem),
+        status=status,
+        solved=status == "Solved",
+        infeasible=status == "PrimalInfeasible",
+        objective=form.sign * raw.obj_val + form.constant,
+        solver="Clarabel",
+        solve_time=raw.solve_time,
+        iterations=raw.iterations,
+        duals=_duals(form, z if rows is None else z * rows, problem),
+    )
+
+
+def _run(form: ConicForm, settings: Mapping[str, Any]) -> Any:
     import clarabel
     from scipy import sparse
 

@@ -95,6 +95,7 @@ def solve_with_cvxpy(
         values=values,
         status=status,
         solved=status == "optimal",
+        infeasible=status == "infeasible",
         objective=float(translated.value) if translated.value is not None else np.nan,
         solver=solver,
         solve_time=float(statistics.solve_time or 0.0),
@@ -102,7 +103,7 @@ def solve_with_cvxpy(
     )
     if solution.solved or accept_inaccurate:
         return solution
-    kind = InfeasibleDesign if status == "infeasible" else SolverTrouble
+    kind = InfeasibleDesign if solution.infeasible else SolverTrouble
     raise kind(f"{problem.name}: {solver} ended with {status}", **solution.facts())
 
 

@@ -8,6 +8,7 @@ but not for whatever a tuned library may do.
 """
 
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,6 +20,9 @@ __all__ = ["ProofResult", "prove_positive_definite"]
 # Generous bound on all underflow errors of one factorisation of a matrix scaled to a unit
 # diagonal: n (n + 2) 2^-1074 and the same again for the scaling.
 _UNDERFLOW = 1e-290
+
+# Above the underflow of one squared radius.
+_SMALLEST = 2.0**-1022
 
 # Entries treated at a time, so that the work arrays stay in the cache.
 _CHUNK_ENTRIES = 2**17
@@ -163,7 +167,10 @@ def _norm_bound(rad: Matrix, factor: Matrix) -> NDArray[np.float64]:
     if rad.strides[0] == 0 and not rad[:1].any():
         return np.zeros(len(rad))
     scaled = rad * factor
-    sums = np.minimum(scaled.sum(axis=2).max(axis=1), np.sqrt((scaled * scaled).sum(axis=(1, 2))))
+    sums = np.minimum(
+        scaled.sum(axis=2).max(axis=1),
+        np.sqrt((scaled * scaled).sum(axis=(1, 2)) + n * n * _SMALLEST),
+    )
     bound: Matrix = sums * (1.0 + 2 * gamma_bound(n * n + 8)) + _UNDERFLOW
     return bound
 

@@ -78,6 +78,11 @@ class Affine:
         return self._take(np.swapaxes(self._numbers(), -1, -2))
 
     @classmethod
+    def of_variable(cls, variable: Variable) -> Affine:
+        """Make the expression that is just the variable."""
+        return cls(np.zeros(variable.shape), {variable: variable.operator()})
+
+    @classmethod
     def stacked(cls, parts: Sequence[Affine]) -> Affine:
         """All entries of several expressions in one column, each stacked by columns."""
         sizes = [part.constant.size for part in parts]
@@ -319,7 +324,7 @@ def _variable(variable: Variable) -> Affine:
             name=variable.name,
             shape=variable.shape,
         )
-    return Affine(np.zeros(variable.shape), {variable: variable.operator()})
+    return Affine.of_variable(variable)
 
 
 def _as_matrix(value: Any) -> Matrix:

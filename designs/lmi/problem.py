@@ -92,7 +92,15 @@ class Problem:
         """Number of free entries of all variables."""
         return sum(variable.size for variable in self._variables.values())
 
-    def add_lmi(self, name: str, expression: Affine, sense: str, margin: float = 0.0) -> None:
+    def add_lmi(
+        self,
+        name: str,
+        expression: Affine,
+        sense: str,
+        margin: float = 0.0,
+        *,
+        strict: bool = True,
+    ) -> None:
         """Matrix inequality ``expression >> margin I`` or ``expression << -margin I``.
 
         Parameters
@@ -105,13 +113,15 @@ class Problem:
             ``">>"`` or ``"<<"``.
         margin : float
             Smallest eigenvalue asked for.
+        strict : bool
+            Whether :func:`solve_with_margin` asks for a margin in this block.
         """
         if sense not in (">>", "<<"):
             raise ExpressionError(f"{name}: sense {sense!r}; write '>>' or '<<'", block=name)
         positive = expression if sense == ">>" else -expression
         if margin:
             positive = positive - margin * np.eye(expression.shape[0])
-        self._add(Block(name, "psd", positive))
+        self._add(Block(name, "psd", positive, strict))
 
     def add(self, name: str, inequality: Inequality) -> None:
         """Constraint written with an operator: ``P >> 0``, ``X << Y``, ``t <= 3`` (elementwise)."""
@@ -181,11 +191,26 @@ class Problem:
         copy = Problem(self.name)
         copy.objective, copy.maximising = self.objective, self.maximising
         copy._variables = dict(self._variables)
+        copy._blocks = dict(self._blocks)
+        for name, vertices in chosen.items():
+            picked = self._blocks[name].expression.member(np.fromiter(vertices, dtype=np.intp))
+            copy._blocks[name] = replace(self._blocks[name], expression=picked)
+        return copy
+
+    def tightened(self, margin: Affine | float) -> Problem:
+        """Copy the problem with ``margin`` times the identity taken from every strict block.
+
+        Parameters
+        ----------
+        margin : number or 1 x 1 expression
+            An expression becomes a further unknown.
+        """
+        copy = self.members({})
         for name, item in self._blocks.items():
-            expression = item.expression
-            if name in chosen:
-                expression = expression.member(np.fromiter(chosen[name], dtype=np.intp))
-            copy._blocks[name] = replace(item, expression=expression)
+            if item.cone == "psd" and item.strict:
+                lowered = item.expression - margin * np.eye(item.expression.shape[0])
+                copy._learn(lowered, name)
+                copy._blocks[name] = replace(item, expression=lowered)
         return copy
 
     def solve(self, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:

@@ -24,6 +24,8 @@ class Solution:
         In the words of the solver.
     solved : bool
         True only for the status that means solved to full accuracy.
+    infeasible : bool
+        True only where the solver reports infeasibility to full accuracy.
     objective : float
         In the sense of the problem (what was minimised or maximised).
     solver : str
@@ -32,16 +34,20 @@ class Solution:
         Seconds inside the solver.
     duals : mapping of str to ndarray
         Dual matrix of every block, (r, c) or (N, r, c); empty when the solver gives none.
+    attempts : tuple of str
+        How earlier attempts and this one ended, when there was more than one way to try.
     """
 
     values: Mapping[str, NDArray[np.float64]]
     status: str
     solved: bool
+    infeasible: bool
     objective: float
     solver: str
     solve_time: float
     iterations: int = 0
     duals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    attempts: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         return self.values[name]

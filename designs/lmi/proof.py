@@ -1,0 +1,156 @@
+"""Proof of a matrix inequality at every vertex, for the numbers as they are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.errors import CertificateError
+from obsynth.designs.lmi.definite import ProofResult, prove_positive_definite
+from obsynth.designs.lmi.enclosure import Enclosure
+from obsynth.designs.lmi.exact import ExactMatrix, is_positive_definite
+
+__all__ = ["FamilyProof", "prove_family"]
+
+IntArray = NDArray[np.intp]
+
+# Entries of the blocks formed at a time.
+_CHUNK_ENTRIES = 2**19
+
+# The margin of this many vertices tells what to expect of all.
+_SAMPLE = 256
+
+
+@dataclass(frozen=True)
+class FamilyProof:
+    """What was proved of a matrix inequality at its vertices.
+
+    Parameters
+    ----------
+    name : str
+        Name of the inequality.
+    count : int
+        Number of vertices.
+    failed : tuple of int
+        Vertices without proof (at most ten are listed).
+    margin : float
+        Guaranteed lower bound of the smallest eigenvalue over all vertices; -inf if one failed.
+    worst : tuple of int
+        Vertices with the smallest margins, worst first.
+    exact : tuple of int
+        Those of them confirmed in exact rational arithmetic.
+    """
+
+    name: str
+    count: int
+    failed: tuple[int, ...]
+    margin: float
+    worst: tuple[int, ...]
+    exact: tuple[int, ...] = ()
+
+    @property
+    def all_proved(self) -> bool:
+        """Whether the inequality is proved at every vertex."""
+        return not self.failed
+
+    def __str__(self) -> str:
+        if not self.all_proved:
+            listed = ", ".join(map(str, self.failed))
+            return f"{self.name}: NOT proved at vertices {listed} of {self.count}"
+        text = f"{self.name}: proved at {self.count} vertices, margin {self.margin:.3g}"
+        return text + (f", {len(self.exact)} of them exactly" if self.exact else "")
+
+    def require(self) -> FamilyProof:
+        """Return the proof, or raise ``CertificateError`` if a vertex has none."""
+        if not self.all_proved:
+            raise CertificateError(
+                str(self),
+                ["the stored numbers do not satisfy it with a margin that rounding leaves"],
+                failed=self.failed,
+                proof=self,
+            )
+        return self
+
+
+def prove_family(
+    name: str,
+    count: int,
+    enclosed: Callable[[IntArray], Enclosure],
+    exact: Callable[[int], ExactMatrix] | None = None,
+    exact_count: int = 3,
+) -> FamilyProof:
+    """Prove that the matrices at all vertices are positive definite.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    count : int
+        Number of vertices.
+    enclosed : callable
+        Takes an array of vertex numbers, returns the enclosed matrices there, (k, n, n).
+    exact : callable, optional
+        Takes one vertex number, returns the exact matrix: the worst vertices are decided a
+        second time in rational arithmetic.
+    exact_count : int
+        How many of the worst.
+
+    Examples
+    --------
+    >>> A = np.linspace(-0.9, 0.9, 5).reshape(-1, 1, 1)
+    >>> def decay(k, P, A):
+    ...     return P - A @ P @ A
+    >>> proof = prove_family(
+    ...     "decay", 5,
+    ...     lambda k: decay(k, Enclosure.of([[2.0]]), Enclosure.of(A[k])),
+    ...     lambda k: decay(k, ExactMatrix.of(2), ExactMatrix.of(A[k])),
+    ... )
+    >>> print(proof)
+    decay: proved at 5 vertices, margin 0.38, 3 of them exactly
+    """
+    size = enclosed(np.zeros(1, dtype=np.intp)).shape[-1]
+    step = max(1, _CHUNK_ENTRIES // (size * size))
+    sample = np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(np.intp))
+    expected = prove_positive_definite(enclosed(sample))
+    failed = sample[~expected.proved]
+    # All others are asked for the margin of the sample; the few below it are looked at singly.
+    floor = float(expected.margin.min()) if len(failed) == 0 else 0.0
+    low, margins = [sample], [expected.margin]
+    if len(sample) < count:
+        for start in range(0, count, step):
+            part = np.arange(start, min(start + step, count))
+            below = part[~_above(enclosed(part), floor).proved]
+            if len(below):
+                low.append(below)
+                margins.append(prove_positive_definite(enclosed(below)).margin)
+    vertices, margin = np.concatenate(low), np.concatenate(margins)
+    vertices, first = np.unique(vertices, return_index=True)
+    margin = margin[first]
+    failed = vertices[~(margin > 0)]
+    order = np.argsort(margin, kind="stable")
+    worst = [int(k) for k in vertices[order[: max(exact_count, 1)]]]
+    confirmed = []
+    if exact is not None and not len(failed):
+        for vertex in worst:
+            if not is_positive_definite(exact(vertex)):
+                failed = np.append(failed, vertex)
+            else:
+                confirmed.append(vertex)
+    return FamilyProof(
+        name=name,
+        count=count,
+        failed=tuple(int(k) for k in failed[:10]),
+        margin=float(min(margin.min(), np.inf)) if not len(failed) else -np.inf,
+        worst=tuple(worst),
+        exact=tuple(confirmed),
+    )
+
+
+def _above(matrices: Enclosure, floor: float) -> ProofResult:
+    if floor <= 0:
+        return prove_positive_definite(matrices, sharp=False)
+    lowered = matrices - Enclosure.of(floor) * np.eye(matrices.shape[-1])
+    return prove_positive_definite(lowered, sharp=False)

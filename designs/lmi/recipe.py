@@ -1,0 +1,300 @@
+"""The way from inequalities to values that can be proved.
+
+Phase 1 maximises the margin t of the strict blocks and refuses where there is none; phase 2
+minimises the objective with a small part of t kept as margin; the result is moved towards the
+phase 1 point until the proof goes through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi.dual import Binding, MarginBound, binding_blocks, bound_margin
+from obsynth.designs.lmi.expression import Inequality, scalar
+from obsynth.designs.lmi.family import Family
+from obsynth.designs.lmi.lazy import LazySolution, solve_lazily
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.retry import solve_with_retries
+from obsynth.designs.lmi.solution import Solution
+
+__all__ = ["Margin", "MarginSolution", "largest_margin", "solve_with_margin"]
+
+Values = Mapping[str, NDArray[np.float64]]
+Caps = Mapping[str, Inequality]
+
+_MARGIN = "margin.t"
+
+# Below this the margin is no more than the accuracy of a solver.
+_LEAST_MARGIN = 1e-9
+
+# Shares of the phase 1 point that are mixed in, one after the other, until the proof holds.
+_BACK_OFF = (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """The largest margin of a set of inequalities.
+
+    Parameters
+    ----------
+    value : float
+        Largest t with every strict block >= t I, within the caps (at most 1).
+    binding : tuple of Binding
+        Blocks and vertices that limit it.
+    bound : MarginBound or None
+        What exact arithmetic says about it.
+    found : LazySolution
+        Where it was found.
+    """
+
+    value: float
+    binding: tuple[Binding, ...]
+    bound: MarginBound | None
+    found: LazySolution
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the margin is more than a solver's accuracy."""
+        return self.value > _LEAST_MARGIN
+
+    def lines(self) -> list[str]:
+        """Sentences for a report."""
+        text = [f"largest margin: {self.value:.3g} (smallest eigenvalue over all blocks)"]
+        if self.binding:
+            text.append("binding: " + "; ".join(str(binding) for binding in self.binding))
+        if self.bound is not None:
+            sizes = [np.abs(value).max() for value in self.found.solution.values.values()]
+            size = 1e3 * max(1.0, *sizes)
+            excluded = self.bound.size_excluded
+            if excluded > size:
+                text.append(f"exact arithmetic: no solution with entries below {excluded:.3g}")
+            else:
+                text.append(
+                    f"exact arithmetic: with entries below {size:.3g} no margin above "
+                    f"{self.bound.at(size):.3g}"
+                )
+        return text
+
+
+@dataclass(frozen=True, eq=False)
+class MarginSolution:
+    """Values that passed the proof, and how they came about.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray
+        By variable name.
+    objective : float
+        Of these values.
+    margin : Margin
+        Of phase 1.
+    kept : float
+        Margin asked for in phase 2.
+    back_off : float
+        Share of the phase 1 point mixed in.
+    solution : Solution
+        Of phase 2 as the solver returned it.
+    chosen : mapping of str to ndarray of int
+        Vertices stated, to start from when solving a similar problem.
+    proof : object
+        What ``prove`` returned for the values.
+    """
+
+    values: Values
+    objective: float
+    margin: Margin
+    kept: float
+    back_off: float
+    solution: Solution
+    chosen: Mapping[str, NDArray[np.intp]]
+    proof: Any
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        return self.values[name]
+
+
+def largest_margin(
+    problem: Problem,
+    families: Sequence[Family] = (),
+    *,
+    caps: Caps | None = None,
+    start: Mapping[str, NDArray[np.intp]] | None = None,
+    explain: bool = True,
+    solve: Callable[[Problem], Solution] = solve_with_retries,
+) -> Margin:
+    """Phase 1: the largest t with every strict block >= t I.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its objective does not matter.
+    families : sequence of Family
+        Further families, treated lazily.
+    caps : mapping of str to Inequality, optional
+        Constraints of phase 1 only, such as ``{"size": trace(P) <= n}``: without one a
+        homogeneous problem grows until t reaches its limit of 1.
+    start : mapping of str to ndarray of int, optional
+        Vertices to begin with.
+    explain : bool
+        Also find the binding blocks and the exact bound where there is no margin.
+    solve : callable
+        How a problem is solved.
+
+    Examples
+    --------
+    >>> from obsynth.designs.lmi import Problem, symmetric, trace
+    >>> A = np.diag([1.2, 0.5])
+    >>> P = symmetric("P", 2)
+    >>> problem = Problem("unstable")
+    >>> problem.add_lmi("decay", A.T @ P @ A - P, "<<")
+    >>> problem.add("floor", P >> np.eye(2))
+    >>> margin = largest_margin(problem)
+    >>> margin.feasible, margin.binding[0].block, margin.bound.size_excluded > 1e3
+    (False, 'decay', True)
+    """
+    t = scalar(_MARGIN)
+    first = problem.tightened(t)
+    first.add("margin.limit", t <= 1.0)
+    for name, cap in (caps or {}).items():
+        first.add(name, cap)
+    first.maximise(t)
+    tight = [family.tightened(t) for family in families]
+    found = solve_lazily(first, tight, start=start, floor=-_LEAST_MARGIN, solve=solve)
+    value = float(found.solution.values[_MARGIN].item())
+    binding: tuple[Binding, ...] = ()
+    bound = None
+    if explain and value <= _LEAST_MARGIN:
+        binding = binding_blocks(found.problem, found.solution, found.chosen)
+        bound = bound_margin(found.problem, found.solution, _MARGIN)
+    return Margin(value, binding, bound, found)
+
+
+def solve_with_margin(
+    problem: Problem,
+    families: Sequence[Family] = (),
+    *,
+    prove: Callable[[Values], Any],
+    caps: Caps | None = None,
+    fraction: float = 1e-3,
+    start: Mapping[str, NDArray[np.intp]] | None = None,
+    solve: Callable[[Problem], Solution] = solve_with_retries,
+) -> MarginSolution:
+    """Phase 1, phase 2, back-off and proof.
+
+    Parameters
+    ----------
+    problem : Problem
+        With its objective.
+    families : sequence of Family
+        Families with many vertices, treated lazily.
+    prove : callable
+        Takes the values by variable name and returns an object with ``all_proved``, for the
+        gains as they will be stored: a :class:`ProofResult` or a :class:`FamilyProof`.
+    caps : mapping of str to Inequality, optional
+        See :func:`largest_margin`.
+    fraction : float
+        Part of the largest margin that is kept in phase 2.
+    start : mapping of str to ndarray of int, optional
+        Vertices to begin with.
+    solve : callable
+        How a problem is solved.
+
+    Returns
+    -------
+    MarginSolution
+        Proved.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If there is no margin; with ``margin``, ``binding`` and ``bound``.
+    CertificateError
+        If no back-off makes the proof go through.
+    SolverTrouble
+        From the solvers.
+
+    Examples
+    --------
+    >>> from obsynth.designs.lmi import Enclosure, Problem, prove_positive_definite
+    >>> from obsynth.designs.lmi import symmetric, trace
+    >>> A = np.array([[0.9, 0.5], [0.0, 0.8]])
+    >>> P = symmetric("P", 2)
+    >>> problem = Problem("Lyapunov")
+    >>> problem.add("floor", P >> np.eye(2))
+    >>> problem.add("decay", P - A.T @ P @ A >> 0)
+    >>> problem.minimise(trace(P))
+    >>> def prove(values):
+    ...     P, F = Enclosure.of(values["P"]), Enclosure.of(A)
+    ...     return prove_positive_definite(P - F.T @ P @ F)
+    >>> found = solve_with_margin(problem, prove=prove)
+    >>> bool(found.proof.all_proved), round(found.objective, 2)
+    (True, 4.5)
+    """
+    margin = largest_margin(problem, families, caps=caps, start=start, solve=solve)
+    if not margin.feasible:
+        raise InfeasibleDesign(
+            f"{problem.name}: the inequalities leave no room",
+            margin.lines(),
+            margin=margin.value,
+            binding=margin.binding,
+            bound=margin.bound,
+        )
+    kept = fraction * margin.value
+    inner = margin.found.solution.values
+    second = _phase_two(problem, families, kept, margin, solve)
+    outer = second.solution.values
+    proof: Any = None
+    for share in _BACK_OFF:
+        values = {
+            name: (1.0 - share) * outer[name] + share * inner[name] for name in problem.variables
+        }
+        proof = prove(values)
+        if proof.all_proved:
+            return MarginSolution(
+                values=values,
+                objective=float(problem.objective.value(values).item()),
+                margin=margin,
+                kept=kept,
+                back_off=share,
+                solution=second.solution,
+                chosen=second.chosen,
+                proof=proof,
+            )
+    raise CertificateError(
+        f"{problem.name}: solved with margin {margin.value:.3g}, but not proved",
+        [f"even {100 * _BACK_OFF[-1]:.0f} % of the way back to the point of largest margin"],
+        margin=margin.value,
+        proof=proof,
+    )
+
+
+def _phase_two(
+    problem: Problem,
+    families: Sequence[Family],
+    kept: float,
+    margin: Margin,
+    solve: Callable[[Problem], Solution],
+) -> LazySolution:
+    if not problem.objective.terms:
+        return margin.found
+    tight = [family.tightened(kept) for family in families]
+    try:
+        return solve_lazily(
+            problem.tightened(kept),
+            tight,
+            start=margin.found.chosen,
+            floor=-0.5 * kept,
+            solve=solve,
+        )
+    except InfeasibleDesign as trouble:
+        raise SolverTrouble(
+            f"{problem.name}: infeasible with {kept:.3g} of a margin of {margin.value:.3g}",
+            ["the constraints are badly scaled: scale the unknowns"],
+            margin=margin.value,
+        ) from trouble

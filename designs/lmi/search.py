@@ -1,0 +1,296 @@
+"""The scalars in which a design is not convex: bisection, line search, nearest feasible value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["Bisection", "Knob", "Search", "bisect_feasible", "search_line", "smallest_changes"]
+
+Result = TypeVar("Result")
+
+_GOLDEN = (5.0**0.5 - 1.0) / 2.0
+
+
+@dataclass(frozen=True)
+class Bisection:
+    """The limit of feasibility along a line.
+
+    Parameters
+    ----------
+    feasible : float
+        Last value found feasible.
+    infeasible : float or None
+        Last value found infeasible; None if the whole line is feasible.
+    evaluations : int
+        Number of problems solved.
+    """
+
+    feasible: float
+    infeasible: float | None
+    evaluations: int
+
+
+def bisect_feasible(
+    feasible: Callable[[float], bool],
+    inside: float,
+    outside: float,
+    *,
+    rtol: float = 1e-3,
+    logarithmic: bool = False,
+) -> Bisection | None:
+    """Find the feasible value closest to ``outside``.
+
+    Parameters
+    ----------
+    feasible : callable
+        Whether a value is feasible; true on one connected side.
+    inside, outside : float
+        Where feasibility is expected, and where it is wanted.
+    rtol : float
+        Width of the final bracket, relative to its larger end (to the line where it
+        contains zero).
+    logarithmic : bool
+        Halve the ratio, not the difference; both ends positive.
+
+    Returns
+    -------
+    Bisection or None
+        None if ``inside`` is infeasible too.
+
+    Examples
+    --------
+    >>> found = bisect_feasible(lambda g: g < 0.3, 0.0, 1.0, rtol=1e-6)
+    >>> round(found.feasible, 5)
+    0.3
+    """
+    if logarithmic and min(inside, outside) <= 0:
+        raise ObsynthError(
+            f"a logarithmic search needs positive ends, not {inside:.4g} and {outside:.4g}"
+        )
+    if feasible(outside):
+        return Bisection(outside, None, 1)
+    if not feasible(inside):
+        return None
+    good, bad, count = inside, outside, 2
+    tiny = rtol * abs(outside - inside)
+    while abs(bad - good) > max(rtol * max(abs(good), abs(bad)), 1e-3 * tiny):
+        middle = (good * bad) ** 0.5 if logarithmic else 0.5 * (good + bad)
+        if middle in (good, bad):
+            break
+        good, bad = (middle, bad) if feasible(middle) else (good, middle)
+        count += 1
+    return Bisection(good, bad, count)
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One scalar that could be changed to make a design feasible.
+
+    Parameters
+    ----------
+    name : str
+        In the words of the user, as ``"gamma"`` or ``"half width of the box of h3"``.
+    current : float
+        Value at which the design is infeasible.
+    limit : float
+        As far as it may be changed.
+    feasible : callable
+        Whether the design is feasible at a value, all else being equal.
+    unit : str
+        Printed after values.
+    """
+
+    name: str
+    current: float
+    limit: float
+    feasible: Callable[[float], bool]
+    unit: str = ""
+
+
+def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
+    """Say for each scalar how far it has to move, or that it does not help.
+
+    Parameters
+    ----------
+    knobs : sequence of Knob
+        Tried one at a time.
+    rtol : float
+        Relative accuracy of the values found.
+
+    Returns
+    -------
+    list of str
+        One sentence each, for the details of an ``InfeasibleDesign``.
+
+    Examples
+    --------
+    >>> gamma = Knob("gamma", 0.01, 0.0, lambda g: g < 0.009)
+    >>> noise = Knob("noise", 0.1, 0.0, lambda w: False)
+    >>> for line in smallest_changes([gamma, noise]):
+    ...     print(line)
+    gamma: 0.01 is infeasible, 0.00898 is feasible
+    noise: does not enter feasibility; infeasible from 0.1 down to 0
+    """
+    lines = []
+    for knob in knobs:
+        unit = f" {knob.unit}" if knob.unit else ""
+        found = bisect_feasible(knob.feasible, knob.limit, knob.current, rtol=rtol)
+        if found is None:
+            way = "down to" if knob.limit < knob.current else "up to"
+            lines.append(
+                f"{knob.name}: does not enter feasibility; infeasible from "
+                f"{knob.current:.3g}{unit} {way} {knob.limit:.3g}{unit}"
+            )
+        else:
+            lines.append(
+                f"{knob.name}: {knob.current:.3g}{unit} is infeasible, "
+                f"{found.feasible:.3g}{unit} is feasible"
+            )
+    return lines
+
+
+@dataclass(frozen=True, eq=False)
+class Search(Generic[Result]):
+    """The best design along a line.
+
+    Parameters
+    ----------
+    value : float
+        Where the objective is smallest.
+    result : object
+        What the design returned there.
+    objective : float
+        Its objective.
+    tried : tuple of (float, float)
+        Every value tried, in order, with its objective (inf where infeasible).
+    """
+
+    value: float
+    result: Result
+    objective: float
+    tried: tuple[tuple[float, float], ...]
+
+
+def search_line(
+    design: Callable[[float], Result],
+    objective: Callable[[Result], float],
+    grid: Sequence[float],
+    *,
+    refine: int = 0,
+    name: str = "search",
+    jobs: int = 1,
+) -> Search[Result]:
+    """Design at every value of a grid, then refine around the best by golden sections.
+
+    Parameters
+    ----------
+    design : callable
+        Takes a value; may raise ``InfeasibleDesign`` or ``SolverTrouble``, which count as
+        infinitely bad, as does ``CertificateError``.
+    objective : callable
+        What to minimise, of the result.
+    grid : sequence of float
+        Increasing. The refinement assumes one minimum between the neighbours of the best
+        value, which a grid can only suggest.
+    refine : int
+        Number of further designs (at least two) by golden sections.
+    name : str
+        Shown with the progress bar.
+    jobs : int
+        Processes for the grid.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no value of the grid gives a design; the details say what happened at each.
+
+    Examples
+    --------
+    >>> found = search_line(lambda g: (g - 0.3) ** 2, float, [0.0, 0.25, 0.5, 1.0], refine=20)
+    >>> round(found.value, 3)
+    0.3
+    """
+    record = _Record(objective)
+    for value, outcome in zip(grid, _design_all(design, list(grid), name, jobs), strict=True):
+        record.add(value, outcome)
+    if record.best is None:
+        raise InfeasibleDesign(
+            f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design",
+            record.troubles,
+            tried=tuple(record.tried),
+        )
+    if refine:
+        values = sorted(grid)
+        place = values.index(record.best[0])
+        low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
+        _refine(lambda value: record.add(value, _attempt(design, value)), low, high, refine)
+    value, least, result = record.best
+    return Search(value, result, least, tuple(record.tried))
+
+
+class _Record(Generic[Result]):
+    """Everything tried so far and the best of it."""
+
+    def __init__(self, objective: Callable[[Result], float]) -> None:
+        self.objective = objective
+        self.tried: list[tuple[float, float]] = []
+        self.troubles: list[str] = []
+        self.best: tuple[float, float, Result] | None = None
+
+    def add(self, value: float, outcome: Result | Exception) -> float:
+        if isinstance(outcome, Exception):
+            self.troubles.append(f"{value:.4g}: {str(outcome).splitlines()[0]}")
+            measured = np.inf
+        else:
+            measured = float(self.objective(outcome))
+            if self.best is None or measured < self.best[1]:
+                self.best = (value, measured, outcome)
+        self.tried.append((value, measured))
+        return measured
+
+
+def _refine(measure: Callable[[float], float], low: float, high: float, steps: int) -> None:
+    """Golden sections of [low, high], one evaluation per step."""
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = measure(left), measure(right)
+    for _ in range(steps - 2):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = measure(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = measure(right)
+
+
+def _attempt(design: Callable[[float], Result], value: float) -> Result | Exception:
+    try:
+        return design(value)
+    except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
+        return refusal
+
+
+def _design_all(
+    design: Callable[[float], Result], grid: list[float], name: str, jobs: int
+) -> list[Result | Exception]:
+    from rich.console import Console
+    from rich.progress import track
+
+    terminal = Console().is_terminal
+    if jobs == 1:
+        shown = track(grid, description=name, disable=not terminal, transient=True)
+        return [_attempt(design, value) for value in shown]
+    from joblib import Parallel, delayed
+
+    parallel = Parallel(n_jobs=jobs, return_as="generator")
+    outcomes = parallel(delayed(_attempt)(design, value) for value in grid)
+    bar = track(outcomes, name, total=len(grid), disable=not terminal, transient=True)
+    return list(bar)
