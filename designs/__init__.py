@@ -1,1 +1,21 @@
 """What estimates: LMIs, certificates and observers."""
+
+from obsynth.designs.bounded_error import BoundedErrorUIO
+from obsynth.designs.certificate import Certificate, Claim, Guarantee
+from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.observer import STATUS, Observer
+from obsynth.designs.storage import load, save
+
+__all__ = [
+    "STATUS",
+    "BoundedErrorUIO",
+    "Certificate",
+    "CertificateError",
+    "Claim",
+    "Guarantee",
+    "InfeasibleDesign",
+    "Observer",
+    "SolverTrouble",
+    "load",
+    "save",
+]

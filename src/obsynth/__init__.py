@@ -8,17 +8,91 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from obsynth.codegen import CProject as CProject
+    from obsynth.codegen import generate_c as generate_c
+    from obsynth.derive import Equilibrium as Equilibrium
+    from obsynth.derive import JacobianBounds as JacobianBounds
+    from obsynth.derive import Split as Split
+    from obsynth.derive import StructureError as StructureError
+    from obsynth.derive import UnboundedError as UnboundedError
+    from obsynth.derive import analyse as analyse
+    from obsynth.derive import equilibrium as equilibrium
+    from obsynth.derive import jacobian_bounds as jacobian_bounds
+    from obsynth.derive import split as split
+    from obsynth.designs import BoundedErrorUIO as BoundedErrorUIO
+    from obsynth.designs import Certificate as Certificate
+    from obsynth.designs import CertificateError as CertificateError
+    from obsynth.designs import InfeasibleDesign as InfeasibleDesign
+    from obsynth.designs import Observer as Observer
+    from obsynth.designs import load as load
+    from obsynth.evaluate import Run as Run
+    from obsynth.evaluate import report as report
+    from obsynth.evaluate import simulate as simulate
+    from obsynth.symbolic import ObsynthError as ObsynthError
     from obsynth.symbolic import Plant as Plant
+    from obsynth.symbolic import PlantError as PlantError
+    from obsynth.symbolic import Scenario as Scenario
+    from obsynth.symbolic import plants as plants
+    from obsynth.symbolic import scenarios as scenarios
 
 __version__ = "0.1.0"
 
-_HOME = {
-    "Plant": "obsynth.symbolic",
+__all__ = [
+    "BoundedErrorUIO",
+    "CProject",
+    "Certificate",
+    "CertificateError",
+    "Equilibrium",
+    "InfeasibleDesign",
+    "JacobianBounds",
+    "ObsynthError",
+    "Observer",
+    "Plant",
+    "PlantError",
+    "Run",
+    "Scenario",
+    "Split",
+    "StructureError",
+    "UnboundedError",
+    "__version__",
+    "analyse",
+    "equilibrium",
+    "generate_c",
+    "jacobian_bounds",
+    "load",
+    "plants",
+    "report",
+    "scenarios",
+    "simulate",
+    "split",
+]
+
+_ROOMS = {
+    "symbolic": ("ObsynthError", "Plant", "PlantError", "Scenario"),
+    "derive": (
+        "Equilibrium",
+        "JacobianBounds",
+        "Split",
+        "StructureError",
+        "UnboundedError",
+        "analyse",
+        "equilibrium",
+        "jacobian_bounds",
+        "split",
+    ),
+    "designs": (
+        "BoundedErrorUIO",
+        "Certificate",
+        "CertificateError",
+        "InfeasibleDesign",
+        "Observer",
+        "load",
+    ),
+    "codegen": ("CProject", "generate_c"),
+    "evaluate": ("Run", "report", "simulate"),
 }
-
-_MODULES = {"plants": "obsynth.symbolic.plants", "scenarios": "obsynth.symbolic.scenarios"}
-
-__all__ = ["Plant", "__version__", "plants", "scenarios"]
+_HOME = {name: f"obsynth.{room}" for room, names in _ROOMS.items() for name in names}
+_MODULES = {name: f"obsynth.symbolic.{name}" for name in ("plants", "scenarios")}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,425 @@
+"""`BoundedErrorUIO`: options of the method, and the way from a model to an observer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.bounded_error.design import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.error_system import (
+    ERRORS,
+    ErrorKind,
+    ErrorSystem,
+    build_error_system,
+    kept_coordinates,
+)
+from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.prepare import Prepared, prepare
+from obsynth.designs.bounded_error.proof import inverse_diagonal_bounds, prove_ellipsoid
+from obsynth.designs.bounded_error.synthesis import (
+    OBJECTIVES,
+    EllipsoidSolution,
+    Objective,
+    analyse_gain,
+    design_problem,
+    largest_gamma,
+    search_gamma,
+    synthesise,
+)
+from obsynth.designs.errors import InfeasibleDesign
+from obsynth.symbolic.errors import ObsynthError
+
+if TYPE_CHECKING:
+    from obsynth.derive import JacobianBounds, Split
+    from obsynth.designs.lmi import Problem
+    from obsynth.designs.observer import Observer
+    from obsynth.symbolic import Plant
+
+__all__ = ["BoundedErrorUIO"]
+
+FloatArray = NDArray[np.float64]
+# Keeps sums of rounded weights at or below 1.
+BELOW_ONE = 1.0 - 2.0**-48
+FORMS = ("corrected", "printed", "repaired")
+
+
+@dataclass(frozen=True)
+class BoundedErrorUIO:
+    """Unknown input observer with guaranteed intervals for states and actuator faults.
+
+    For discrete-time plants ``x+ = A x + B u + D d + g(x, u) + B_f f + W1 w``,
+    ``y = C x + W2 w`` with bounded w, bounded fault increments and rank(D) =
+    rank(C D) = q.
+
+    Parameters
+    ----------
+    gamma : float, optional
+        Contraction per step of V = e'Pe, in (0, 1); searched where not given.
+    multipliers : {"equal", "per_component"}
+        Whether the boxes of w_k, eps_k, w_{k+1} share the noise ellipsoid in
+        equal parts (eq. (19)) or with weights that the LMI chooses.
+    error : {"plain", "shifted"}
+        The error e of eq. (16), or zeta = T x - z, which w_{k+1} does not enter.
+    post : {"common", "per_component"}
+        One P for all components, or afterwards a P and gamma for each at the
+        gain found.
+    bounds : {"ellipsoid", "peak"}
+        Intervals from the ellipsoid (eqs. (33)-(36)), or peak (l1) bounds with
+        an elementwise small-gain argument, several times narrower.
+    objective : {"trace_inverse", "log_det", "lambda_min", "trace"}
+        What is optimised: min trace(P^-1), max log det P, max lambda_min(P),
+        max trace(P) (the paper's (49), which does not make the bounds small).
+    weights : sequence of float, optional
+        Of the components (states, then faults), for ``trace_inverse`` and peak
+        bounds; 1 by default.
+    form : {"corrected", "printed", "repaired"}
+        The direct LMI at the vertices of the exact Jacobian set; (51) as
+        printed; (51) with diagonal multipliers, which is valid row by row.
+
+    Raises
+    ------
+    ObsynthError
+        For an option that is not known or out of range.
+
+    Notes
+    -----
+    M. Buciakowski, M. Witczak, V. Puig, D. Rotondo, F. Nejjari, J. Korbicz, "A
+    bounded-error approach to simultaneous state and actuator fault estimation
+    for a class of nonlinear systems". What does not hold as printed:
+
+    ===========  ==============================================================
+    in print     correct
+    ===========  ==============================================================
+    (4)          rows taken at different points lose the dependences between
+                 entries; the integral mean value matrix keeps them
+    (18)         the third block of Wbar is E W2, not E W1
+    (51)         infeasible on the paper's own data for every gamma, with an
+                 exact certificate; `form="corrected"` needs no such relaxation
+    gamma = .01  above the largest feasible value (about .00903)
+    Q_w = 100 I  does not hold the cube [-.1, .1]^3; (100/3) I does
+    M bounds     differences with a 1 cm step, too narrow down to h = 5 cm
+    Remark 2     2^(n^2 - c) = 64 vertices; 16 suffice, the entries depend on
+                 each other
+    (49)         the trace of P is not the sum of the axes
+    Theorem 1    sufficient, not an equivalence; U is redundant
+    ===========  ==============================================================
+
+    Examples
+    --------
+    >>> BoundedErrorUIO(gamma=0.005).objective
+    'trace_inverse'
+    """
+
+    gamma: float | None = None
+    multipliers: Literal["equal", "per_component"] = "equal"
+    error: ErrorKind = "plain"
+    post: Literal["common", "per_component"] = "common"
+    bounds: Literal["ellipsoid", "peak"] = "ellipsoid"
+    objective: Objective = "trace_inverse"
+    weights: tuple[float, ...] | None = None
+    form: Literal["corrected", "printed", "repaired"] = "corrected"
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "multipliers": ("equal", "per_component"),
+            "error": ERRORS,
+            "post": ("common", "per_component"),
+            "bounds": ("ellipsoid", "peak"),
+            "objective": OBJECTIVES,
+            "form": FORMS,
+        }
+        for name, values in allowed.items():
+            given = getattr(self, name)
+            if given not in values:
+                raise ObsynthError(
+                    f"{name} is {given!r}; it has to be one of {', '.join(map(repr, values))}",
+                    option=name,
+                )
+        if self.gamma is not None and not 0.0 < self.gamma < 1.0:
+            raise ObsynthError(
+                f"gamma is {self.gamma!r}; the contraction per step lies between 0 and 1",
+                option="gamma",
+            )
+        if self.weights is not None:
+            object.__setattr__(self, "weights", tuple(float(w) for w in self.weights))
+            if not all(np.isfinite(w) and w >= 0 for w in self.weights) or not any(self.weights):
+                raise ObsynthError(
+                    f"weights are {self.weights}; they have to be finite, not negative and not "
+                    "all zero",
+                    option="weights",
+                )
+        if self.form != "corrected" and (
+            self.error != "plain" or self.multipliers != "equal" or self.bounds != "ellipsoid"
+        ):
+            raise ObsynthError(
+                f'form="{self.form}" stands for (51), which has error="plain", '
+                'multipliers="equal" and bounds="ellipsoid"',
+                option="form",
+            )
+
+    def design(
+        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
+    ) -> Observer:
+        """Design, prove and return the observer.
+
+        Parameters
+        ----------
+        model_or_split : Plant or Split
+            Discrete time, see `Plant.discretise`.
+        bounds : JacobianBounds, optional
+            Of the split's g, where they are at hand.
+
+        Returns
+        -------
+        Observer
+            With a certificate in which every claim is proved.
+
+        Raises
+        ------
+        StructureError
+            If the model is outside the class, or a rank or detectability
+            condition fails; before any LMI.
+        InfeasibleDesign
+            If no observer of this form exists; says which gamma is feasible.
+        UnboundedError
+            If the Jacobian is unbounded over the declared box.
+        """
+        from obsynth.designs.bounded_error.assembly import assemble
+
+        prepared = prepare(model_or_split, bounds)
+        if self.bounds == "peak":
+            from obsynth.designs.bounded_error.peak import design_peak
+
+            design = design_peak(prepared, self)
+        else:
+            design = self._design_ellipsoid(prepared)
+        return assemble(design, derived=(prepared.split, prepared.bounds))
+
+    def analyse(
+        self,
+        model_or_split: Plant | Split,
+        gains: Mapping[str, ArrayLike],
+        bounds: JacobianBounds | None = None,
+    ) -> Observer:
+        """Return what the given gains guarantee, proved.
+
+        Parameters
+        ----------
+        model_or_split : Plant or Split
+        gains : mapping
+            ``K`` of shape (n, m) and ``F`` of shape (n_f, m).
+        bounds : JacobianBounds, optional
+
+        Raises
+        ------
+        InfeasibleDesign
+            If the gains are unstable at a vertex, or guarantee nothing.
+        """
+        from obsynth.designs.bounded_error.assembly import assemble
+
+        prepared = prepare(model_or_split, bounds)
+        K, F = _read_gains(prepared.design, gains)
+        given = replace(prepared.design, K=K, F=F, options=asdict(self))
+        if self.bounds == "peak":
+            from obsynth.designs.bounded_error.peak import bound_peak
+
+            return assemble(bound_peak(given), derived=(prepared.split, prepared.bounds))
+        system, noise, weights = self._setting(prepared)
+        gain = np.vstack([K[self._kept(given)], F])
+        if self.gamma is None:
+            solution = analyse_gain(system, gain, noise, weights)
+        else:
+            solution = synthesise(system, self.gamma, noise, self.objective, weights, gain)
+        design = self._complete(given, system, solution, noise, weights)
+        return assemble(design, derived=(prepared.split, prepared.bounds))
+
+    def problem(
+        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
+    ) -> Problem:
+        """Return the design LMI at the given gamma, see `Problem.to_cvxpy`.
+
+        Raises
+        ------
+        ObsynthError
+            If gamma is not given.
+        """
+        if self.gamma is None:
+            raise ObsynthError("the LMI is linear only for a fixed gamma: give gamma=")
+        prepared = prepare(model_or_split, bounds)
+        if self.form != "corrected":
+            from obsynth.designs.bounded_error.multipliers import box_vertices, multiplier_problem
+
+            data = _with_vertices(prepared, box_vertices(prepared.bounds))
+            noise, weights = self._noise(prepared, 3), self._weights(prepared)
+            return multiplier_problem(
+                data, self.gamma, noise, self.objective, weights, self.form
+            )
+        system, free_or_fixed, weights = self._setting(prepared)
+        return design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
+
+    def _kept(self, design: UioDesign) -> list[int]:
+        if self.error == "plain":
+            return list(range(len(design.A)))
+        return kept_coordinates(design.T)
+
+    def _weights(self, prepared: Prepared) -> FloatArray:
+        design = prepared.design
+        n, n_f = design.A.shape[0], design.rate.size
+        weights = np.ones(n + n_f) if self.weights is None else np.array(self.weights)
+        if weights.shape != (n + n_f,):
+            names = (*design.plant.names("x"), *design.plant.names("f"))
+            raise ObsynthError(
+                f"weights are {weights.size} numbers; {n + n_f} are needed ({', '.join(names)})",
+                option="weights",
+            )
+        return np.concatenate([weights[:n][self._kept(design)], weights[n:]])
+
+    @staticmethod
+    def _noise(prepared: Prepared, blocks: int) -> FloatArray:
+        design = prepared.design
+        boxes = NoiseBox(design.w_centre, design.w_radius, design.rate)
+        return boxes.equal_weights(blocks) * BELOW_ONE
+
+    def _setting(self, prepared: Prepared) -> tuple[ErrorSystem, FloatArray | None, FloatArray]:
+        system = build_error_system(prepared.design.data, self.error)
+        noise = None if self.multipliers == "per_component" else self._noise(prepared, system.blocks)
+        return system, noise, self._weights(prepared)
+
+    def _design_ellipsoid(self, prepared: Prepared) -> UioDesign:
+        system, noise, weights = self._setting(prepared)
+        if self.form == "corrected":
+
+            def solve(gamma: float) -> EllipsoidSolution:
+                return synthesise(system, gamma, noise, self.objective, weights)
+
+            def top() -> float:
+                return largest_gamma(system)
+
+        else:
+            solve, top = self._multiplier_form(prepared, weights)
+        solution = _solve_or_explain(solve, top, weights, self.gamma)
+        gain = solution.gain
+        n, m = prepared.design.K.shape
+        kept = self._kept(prepared.design)
+        K = np.zeros((n, m))
+        K[kept] = gain[: len(kept)]
+        F = gain[len(kept) :]
+        if self.error == "shifted":
+            K, F = K @ prepared.design.Pi, F @ prepared.design.Pi
+        given = replace(prepared.design, K=K, F=F, options=asdict(self))
+        return self._complete(given, system, solution, noise, weights)
+
+    def _multiplier_form(self, prepared: Prepared, weights: FloatArray) -> tuple[Any, Any]:
+        from obsynth.designs.bounded_error.multipliers import (
+            box_vertices,
+            refuse_printed,
+            synthesise_multipliers,
+        )
+
+        vertices = box_vertices(prepared.bounds)
+        data = _with_vertices(prepared, vertices)
+        noise = self._noise(prepared, 3)
+        form: Any = self.form
+        if form == "printed":
+            refuse_printed(data, vertices, self.gamma or 0.0)
+
+        def solve(gamma: float) -> EllipsoidSolution:
+            return synthesise_multipliers(data, gamma, noise, self.objective, weights, form)
+
+        def top() -> float:
+            return largest_gamma(build_error_system(data, "plain"))
+
+        return solve, top
+
+    def _complete(
+        self,
+        given: UioDesign,
+        system: ErrorSystem,
+        solution: EllipsoidSolution,
+        noise: FloatArray | None,
+        weights: FloatArray,
+    ) -> UioDesign:
+        """Attach the ellipsoids to a design with gains, backed off until they are proved."""
+        gain = np.vstack([given.K[self._kept(given)], given.F])
+        solutions = [solution]
+        if self.post == "per_component":
+            solutions = [
+                analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))
+            ]
+        shapes = np.stack([s.P for s in solutions])
+        gammas = np.array([s.gamma for s in solutions])
+        rows = np.stack([s.weights for s in solutions])
+        # A smaller P asks less of the noise block of the LMI, so shrinking it buys the
+        # margin that rounding and the solver's tolerance took.
+        for loss in (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
+            P = shapes * (1.0 - loss)
+            bound = EllipsoidBound(self.error, P, gammas, rows, inverse_diagonal_bounds(P))
+            design = replace(given, bound=bound)
+            if all(claim.holds for claim in prove_ellipsoid(design)):
+                break
+        return design
+
+
+def _with_vertices(prepared: Prepared, vertices: FloatArray) -> Any:
+    return replace(
+        prepared.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices)
+    )
+
+
+def _read_gains(
+    design: UioDesign, gains: Mapping[str, ArrayLike]
+) -> tuple[FloatArray, FloatArray]:
+    missing = {"K", "F"} - set(gains)
+    if missing:
+        raise ObsynthError(
+            f"gains has {sorted(gains)}; K of shape {design.K.shape} and F of shape "
+            f"{design.F.shape} are needed",
+            missing=tuple(sorted(missing)),
+        )
+    arrays = []
+    for name, shape in (("K", design.K.shape), ("F", design.F.shape)):
+        array = np.asarray(gains[name], dtype=float)
+        if array.shape != shape or not np.all(np.isfinite(array)):
+            raise ObsynthError(
+                f"{name} has shape {array.shape}; finite numbers of shape {shape} are needed",
+                gain=name,
+            )
+        arrays.append(array)
+    return arrays[0], arrays[1]
+
+
+def _solve_or_explain(
+    solve: Any, top: Any, weights: FloatArray, gamma: float | None
+) -> EllipsoidSolution:
+    """Solve at gamma, or search it; explain an infeasible one by the largest that is feasible."""
+    if gamma is None:
+        largest = top()
+        if largest <= 0:
+            raise InfeasibleDesign(
+                "no gamma is feasible: no gain makes the error contract at all vertices with one P",
+                [
+                    "the bounds of disturbances and rates do not matter here: they only scale P",
+                    "what helps: a smaller box of the states, or another measurement",
+                ],
+                largest_gamma=0.0,
+            )
+        return search_gamma(solve, weights, largest)
+    try:
+        solution: EllipsoidSolution = solve(gamma)
+    except InfeasibleDesign as error:
+        largest = top()
+        raise InfeasibleDesign(
+            f"gamma = {gamma:.6g} is infeasible",
+            [
+                f"the largest feasible gamma is about {largest:.5g}",
+                "the bounds of disturbances and rates do not enter feasibility: they only scale P",
+                "what helps: a smaller gamma, or a smaller box of the states",
+            ],
+            gamma=gamma,
+            largest_gamma=largest,
+        ) from error
+    return solution

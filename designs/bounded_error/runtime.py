@@ -1,0 +1,252 @@
+"""From a proved bound to what runs: half-width recursions and the first memory."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.bounded_error.design import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.error_system import kept_coordinates
+from obsynth.designs.bounded_error.step import RuntimeBound, memory_layout
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = [
+    "StartBox",
+    "ellipsoid_first",
+    "ellipsoid_runtime",
+    "largest_level",
+    "make_start",
+    "noise_offset",
+    "reset_box",
+]
+
+FloatArray = NDArray[np.float64]
+# Above the relative rounding error of the few dozen operations of each formula below.
+UP = 1.0 + 2.0**-44
+CORNERS = 14
+
+
+def noise_offset(design: UioDesign) -> FloatArray:
+    """Bound of ``E W2 w_k``, which separates e from zeta, shape (n,)."""
+    bound: FloatArray = np.abs(design.E) @ (np.abs(design.W2) @ design.w_radius) * UP
+    return bound
+
+
+def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
+    """Upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
+
+    Exact up to rounding at the corners for up to 14 components, by the sum of
+    ``|P_ij| r_i r_j`` beyond.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> level = largest_level(np.eye(2), np.array([-1.0, 0.0]), np.array([2.0, 3.0]))
+    >>> 13.0 <= level < 13.000001
+    True
+    """
+    reach = np.maximum(np.abs(lower), np.abs(upper))
+    rounding = 2.0**-40 * float(reach @ np.abs(P) @ reach)
+    if len(P) > CORNERS:
+        return float(reach @ np.abs(P) @ reach) * UP + rounding
+    pairs = [(a, b) if a != b else (a,) for a, b in zip(lower, upper, strict=True)]
+    corners = np.array(list(itertools.product(*pairs)))
+    levels = np.einsum("ki,ij,kj->k", corners, P, corners)
+    return float(levels.max()) + rounding
+
+
+class StartBox:
+    """Where the error can be at k = 0, as boxes of zeta, e and e_f.
+
+    Parameters
+    ----------
+    design : UioDesign
+    z0 : ndarray of shape (n,)
+    x_range : ndarray of shape (n, 2)
+    fhat0 : ndarray of shape (n_f,)
+    f_range : ndarray of shape (n_f, 2)
+    """
+
+    def __init__(
+        self,
+        design: UioDesign,
+        z0: FloatArray,
+        x_range: FloatArray,
+        fhat0: FloatArray,
+        f_range: FloatArray,
+    ) -> None:
+        middle, radius = x_range.mean(axis=1), 0.5 * (x_range[:, 1] - x_range[:, 0])
+        reach = np.abs(design.T) @ (np.abs(middle) + radius) + np.abs(z0)
+        slack = 2.0**-44 * reach
+        spread = np.abs(design.T) @ radius + slack
+        centre = design.T @ middle - z0
+        noise = noise_offset(design)
+        self.zeta = (centre - spread, centre + spread)
+        self.e = (self.zeta[0] - noise, self.zeta[1] + noise)
+        self.e_f = (f_range[:, 0] - fhat0, f_range[:, 1] - fhat0)
+
+    def xi(self, design: UioDesign, error: str) -> tuple[FloatArray, FloatArray]:
+        """Box of the error coordinates, (lower, upper)."""
+        if error == "plain":
+            sides = self.e
+        else:
+            kept = kept_coordinates(design.T)
+            sides = (self.zeta[0][kept], self.zeta[1][kept])
+        return (
+            np.concatenate([sides[0], self.e_f[0]]),
+            np.concatenate([sides[1], self.e_f[1]]),
+        )
+
+
+def _component_map(design: UioDesign, bound: EllipsoidBound) -> list[int | None]:
+    """For each of the n + n_f errors the component of xi that bounds it, or None."""
+    n, n_f = design.A.shape[0], design.rate.size
+    if bound.error == "plain":
+        return list(range(n + n_f))
+    kept = kept_coordinates(design.T)
+    states: list[int | None] = [kept.index(i) if i in kept else None for i in range(n)]
+    return states + [len(kept) + j for j in range(n_f)]
+
+
+def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
+    """Recursion of eq. (36) for every component, rounding errors of the step included.
+
+    An error of at most `UioDesign.rounding` per step is at most rho in the norm
+    of P, so ``V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho + rho^2``.
+    """
+    bound = design.bound
+    if not isinstance(bound, EllipsoidBound):
+        raise TypeError("the design has no ellipsoidal bound")
+    n, n_f = design.A.shape[0], design.rate.size
+    size = n + n_f
+    decay, offset, scale = np.zeros(size), np.zeros(size), np.zeros(size)
+    add = design.rounding * UP
+    if bound.error == "shifted":
+        add[:n] += noise_offset(design)
+    reset = np.full(size, np.inf)
+    box = reset_box(design)
+    for i, component in enumerate(_component_map(design, bound)):
+        if component is None:
+            continue
+        shape = bound.shape_of(component)
+        gamma, P = float(bound.gamma[shape]), bound.P[shape]
+        kept = [j for j, c in enumerate(_component_map(design, bound)) if c is not None]
+        tau = design.rounding[kept]
+        rho = float(np.sqrt(tau @ np.abs(P) @ tau)) * UP
+        decay[i] = (1.0 - gamma) * (1.0 + rho) * UP
+        offset[i] = (gamma * (1.0 + rho) + rho + rho**2) * UP
+        scale[i] = bound.inverse_diagonal[component] * UP
+        if box is not None:
+            reset[i] = largest_level(P, *box.xi(design, bound.error))
+    return RuntimeBound(decay, offset, scale, add, True, reset)
+
+
+def reset_box(design: UioDesign) -> StartBox | None:
+    """Errors when state, fault and their estimates lie in their declared boxes."""
+    x_box, f_box = design.plant.box("x"), design.plant.box("f")
+    if not (np.isfinite(x_box).all() and np.isfinite(f_box).all()):
+        return None
+    if isinstance(design.bound, EllipsoidBound) and design.bound.error == "shifted":
+        # zeta has to lie in the range of T, which a missing measurement does not keep.
+        return None
+    width, f_width = np.diff(x_box)[:, 0], np.diff(f_box)[:, 0]
+    n, n_f = design.A.shape[0], design.rate.size
+    box = StartBox(design, np.zeros(n), np.zeros((n, 2)), np.zeros(n_f), np.zeros((n_f, 2)))
+    noise = noise_offset(design)
+    box.e = (-width, width)
+    box.zeta = (-width - noise, width + noise)
+    box.e_f = (-f_width, f_width)
+    return box
+
+
+def make_start(
+    design: UioDesign, first: Callable[[StartBox], FloatArray]
+) -> Callable[..., FloatArray]:
+    """Return the function behind `Observer.memory0`.
+
+    Parameters
+    ----------
+    design : UioDesign
+    first : callable
+        From the box of the first error to the first s of the runtime bound.
+    """
+    n, n_f = design.A.shape[0], design.rate.size
+    names = {"x": design.plant.names("x"), "f": design.plant.names("f")}
+
+    def start(
+        guess: ArrayLike,
+        x_range: ArrayLike | None = None,
+        f_range: ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+        z0: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
+        point = _vector(guess, n, "guess", names["x"])
+        x_box = design.plant.box("x") if x_range is None else _box(x_range, n, "x_range")
+        f_box = np.zeros((n_f, 2)) if f_range is None else _box(f_range, n_f, "f_range")
+        if not np.isfinite(x_box).all():
+            raise ObsynthError(
+                "x_range is needed: the states have no finite declared range, so the first error "
+                "has no bound"
+            )
+        z = design.T @ point if z0 is None else _vector(z0, n, "z0", names["x"])
+        if z0 is not None and isinstance(design.bound, EllipsoidBound):
+            _check_range_of_T(design, design.bound, z)
+        fhat = f_box.mean(axis=1)
+        box = StartBox(design, z, x_box, fhat, f_box)
+        layout = memory_layout(n, n_f)
+        memory = np.zeros(layout["initialised"].stop)
+        memory[layout["z"]] = z
+        memory[layout["fhat"]] = fhat
+        memory[layout["bound"]] = first(box)
+        memory[layout["prediction"]] = point
+        memory[layout["initialised"]] = 1.0
+        return memory
+
+    return start
+
+
+def _check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
+    if bound.error == "shifted" and np.any(design.T @ z != z):
+        raise ObsynthError(
+            "z0 has to lie in the range of T (zero in the coordinates that the unknown input "
+            'takes away) for error="shifted"; give the guess alone',
+            z0=z,
+        )
+
+
+def ellipsoid_first(design: UioDesign) -> Callable[[StartBox], FloatArray]:
+    """Return V_0 of every component's ellipsoid for a box of first errors, delta of (48)."""
+    bound = design.bound
+    if not isinstance(bound, EllipsoidBound):
+        raise TypeError("the design has no ellipsoidal bound")
+    components = _component_map(design, bound)
+
+    def first(box: StartBox) -> FloatArray:
+        lower, upper = box.xi(design, bound.error)
+        levels = [largest_level(P, lower, upper) for P in bound.P]
+        return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])
+
+    return first
+
+
+def _vector(value: Any, size: int, name: str, symbols: tuple[str, ...]) -> FloatArray:
+    array = np.asarray(value, dtype=float)
+    if array.shape != (size,) or not np.all(np.isfinite(array)):
+        raise ObsynthError(
+            f"{name} has to be {size} finite numbers ({', '.join(symbols)}); got {value!r}"
+        )
+    return array
+
+
+def _box(value: Any, size: int, name: str) -> FloatArray:
+    array = np.asarray(value, dtype=float)
+    if array.shape != (size, 2) or not np.all(np.isfinite(array)):
+        raise ObsynthError(f"{name} has to be {size} finite pairs (lower, upper); got {value!r}")
+    if np.any(array[:, 0] > array[:, 1]):
+        raise ObsynthError(f"{name} has a lower end above its upper end: {value!r}")
+    return array
