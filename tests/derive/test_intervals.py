@@ -1,0 +1,307 @@
+"""The interval engine against balls of 300 bits: nothing it encloses may leave its bounds."""
+
+import casadi as ca
+import flint
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals import Program, arithmetic, evaluate, functions, rules
+from obsynth.derive.intervals.program import constant_interval
+
+QUICK = settings(max_examples=120, deadline=None, derandomize=True)
+UNARY = {
+    "sqrt": ca.sqrt,
+    "exp": ca.exp,
+    "log": ca.log,
+    "sin": ca.sin,
+    "cos": ca.cos,
+    "tan": ca.tan,
+    "atan": ca.atan,
+    "tanh": ca.tanh,
+    "sinh": ca.sinh,
+    "cosh": ca.cosh,
+    "asinh": ca.asinh,
+    "fabs": ca.fabs,
+    "sign": ca.sign,
+    "neg": lambda a: -a,
+    "square": lambda a: a * a,
+    "cube": lambda a: a**3,
+    "inverse": lambda a: 1 / a,
+    "fraction": lambda a: a**1.5,
+    "third": lambda a: a ** (-7 / 3),
+    "erf": ca.erf,
+}
+BINARY = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "min": ca.fmin,
+    "max": ca.fmax,
+    "choice": lambda a, b: ca.if_else(a < b, a * b, a - b),
+    "hypot": ca.hypot,
+    "atan2": ca.atan2,
+}
+X = ca.SX.sym("x", 3)
+number = st.sampled_from([-3.0, -1.0, -0.1, 0.0, 0.3, 1.0, 2.0, 7.1])
+
+
+@st.composite
+def expressions(draw, depth=4):
+    if depth == 0 or draw(st.integers(0, 5)) == 0:
+        return draw(st.one_of(st.sampled_from([X[0], X[1], X[2]]), number.map(ca.SX)))
+    if draw(st.booleans()):
+        name = draw(st.sampled_from(sorted(UNARY)))
+        return UNARY[name](draw(expressions(depth=depth - 1)))
+    name = draw(st.sampled_from(sorted(BINARY)))
+    return BINARY[name](draw(expressions(depth=depth - 1)), draw(expressions(depth=depth - 1)))
+
+
+@st.composite
+def boxes(draw):
+    ends = []
+    for _ in range(3):
+        centre = draw(st.floats(-4, 4, allow_nan=False).map(lambda v: round(v, 3)))
+        width = draw(st.sampled_from([0.0, 0.0, 1e-9, 0.01, 0.5, 3.0]))
+        ends.append((centre, centre + width))
+    return np.array(ends)
+
+
+def outside(low, high, ball):
+    """Whether a ball certainly lies outside [low, high]; undefined values prove nothing."""
+    if not ball.is_finite():
+        return False
+    return bool(ball < flint.arb(low)) or bool(ball > flint.arb(high))
+
+
+def points_of(box, count, seed=0):
+    share = np.random.default_rng(seed).random((count, len(box)))
+    share[:1], share[1:2] = 0.0, 1.0
+    where = box[:, 0] + share * (box[:, 1] - box[:, 0])
+    return np.clip(where, box[:, 0], box[:, 1])
+
+
+def leaks(exactly, function, box, count=6):
+    """Points of the box at which the natural enclosure is wrong."""
+    lo, hi = evaluate(Program.from_casadi(function), box[:, :1], box[:, 1:])
+    found = []
+    for point in points_of(box, count):
+        try:
+            values = exactly(function, point)
+        except ArithmeticError:
+            continue
+        found += [point for k, v in enumerate(values) if outside(lo[k, 0], hi[k, 0], v)]
+    return found
+
+
+@QUICK
+@given(expression=expressions(), box=boxes())
+def test_random_expressions_never_leave_their_enclosure(exactly, expression, box):
+    assert not leaks(exactly, ca.Function("f", [X], [expression]), box)
+
+
+@QUICK
+@given(expression=expressions(depth=3), box=boxes())
+def test_random_gradients_never_leave_their_enclosure(exactly, expression, box):
+    gradient = ca.densify(ca.gradient(expression, X))
+    assert not leaks(exactly, ca.Function("f", [X], [gradient]), box, count=3)
+
+
+FIXED = [
+    X[0] / 3 + X[1],
+    X[0] * X[1] - X[2],
+    ca.sqrt(X[0]) * 0.1,
+    ca.exp(X[0]) + ca.sin(X[1]),
+    X[0] ** 1.7,
+]
+
+
+def point_leaks(exactly):
+    """Failures at single points, where only the rounding stands between the bounds."""
+    rng = np.random.default_rng(1)
+    found = 0
+    for expression in FIXED:
+        function = ca.Function("f", [X], [expression])
+        for _ in range(20):
+            point = rng.random(3) * 3 + 0.1
+            found += len(leaks(exactly, function, np.stack([point, point], axis=1), count=1))
+    return found
+
+
+def test_single_points_are_enclosed(exactly):
+    assert point_leaks(exactly) == 0
+
+
+@pytest.mark.parametrize("names", [("down", "up"), ("down",), ("up",)])
+def test_removed_rounding_is_caught(exactly, monkeypatch, names):
+    for name in names:
+        monkeypatch.setattr(arithmetic, name, lambda value: value)
+    monkeypatch.setattr(functions, "widen", lambda ends, ulps: ends)
+    assert point_leaks(exactly) > 0
+
+
+@pytest.mark.parametrize("shift", [-1.0, 1.0])
+def test_misplaced_crest_is_caught(exactly, monkeypatch, shift):
+    function = ca.Function("f", [X], [ca.sin(X[0])])
+    box = np.array([[1.0, 2.2], [0.0, 0.0], [0.0, 0.0]])
+    assert not leaks(exactly, function, box, count=50)
+    monkeypatch.setattr(functions, "_HALF_PI", functions._HALF_PI + shift)
+    assert leaks(exactly, function, box, count=50)
+
+
+# -- libraries of elementary functions ---------------------------------------------------------
+
+LIBRARY = {
+    "exp": (np.exp, "exp", (-700, 700)),
+    "log": (np.log, "log", (1e-300, 1e300)),
+    "log1p": (np.log1p, "log1p", (-0.999, 10)),
+    "expm1": (np.expm1, "expm1", (-30, 30)),
+    "sin": (np.sin, "sin", (-1e6, 1e6)),
+    "cos": (np.cos, "cos", (-1e6, 1e6)),
+    "tan": (np.tan, "tan", (-100, 100)),
+    "asin": (np.arcsin, "asin", (-1, 1)),
+    "acos": (np.arccos, "acos", (-1, 1)),
+    "atan": (np.arctan, "atan", (-100, 100)),
+    "sinh": (np.sinh, "sinh", (-50, 50)),
+    "cosh": (np.cosh, "cosh", (-50, 50)),
+    "tanh": (np.tanh, "tanh", (-20, 20)),
+    "asinh": (np.arcsinh, "asinh", (-100, 100)),
+    "acosh": (np.arccosh, "acosh", (1, 100)),
+    "atanh": (np.arctanh, "atanh", (-0.999, 0.999)),
+    "erf": (rules._erf, "erf", (-5, 5)),
+}
+
+
+@pytest.mark.parametrize("name", sorted(LIBRARY))
+def test_library_is_within_half_of_the_allowed_ulps(name):
+    function, oracle, (low, high) = LIBRARY[name]
+    at = low + np.random.default_rng(3).random(400) * (high - low)
+    values = function(at)
+    before, flint.ctx.prec = flint.ctx.prec, 200
+    try:
+        exact = [getattr(flint.arb(float(v)), oracle)() for v in at]
+        errors = [
+            abs(float((flint.arb(float(v)) - e) / flint.arb(float(np.spacing(abs(v))))))
+            for v, e in zip(values, exact, strict=True)
+        ]
+    finally:
+        flint.ctx.prec = before
+    assert max(errors) <= functions.ULPS / 2
+
+
+# -- rules at their edges ------------------------------------------------------------------------
+
+
+def interval(lo, hi):
+    return np.array([lo], dtype=float), np.array([hi], dtype=float)
+
+
+def ends(result):
+    return float(result[0][0]), float(result[1][0])
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ((1, 2), (0, 4), (0.25, np.inf)),
+        ((-2, -1), (0, 4), (-np.inf, -0.25)),
+        ((1, 2), (-4, 0), (-np.inf, -0.25)),
+        ((-2, -1), (-4, 0), (0.25, np.inf)),
+        ((1, 2), (-1, 4), (np.nan, np.nan)),
+        ((-1, 2), (0, 4), (np.nan, np.nan)),
+        ((1, 2), (0, 0), (np.nan, np.nan)),
+        ((0, 0), (1, 2), (0.0, 0.0)),
+    ],
+)
+def test_division_by_intervals_that_touch_zero(a, b, expected):
+    with np.errstate(all="ignore"):
+        found = ends(arithmetic.divide(interval(*a), interval(*b)))
+    np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+def test_exact_zeros_stay_exact():
+    zero, some = interval(0, 0), interval(0.1, 0.3)
+    assert ends(arithmetic.multiply(zero, some)) == (0.0, 0.0)
+    assert ends(arithmetic.multiply(interval(0, 2), some))[0] == 0.0
+    assert ends(arithmetic.add(interval(-1, 1), interval(1, 1)))[0] == 0.0
+    assert ends(arithmetic.power_int(interval(-1, 2), 2))[0] == 0.0
+    assert ends(arithmetic.sqrt(zero)) == (0.0, 0.0)
+
+
+def test_underflow_is_no_exact_zero():
+    tiny = interval(1e-200, 1e-200)
+    lo, hi = ends(arithmetic.multiply(tiny, arithmetic.negate(tiny)))
+    assert lo < 0.0 <= hi
+    lo, hi = ends(arithmetic.multiply(tiny, tiny))
+    assert lo == 0.0 < hi
+
+
+def test_unknown_operands_stay_unknown():
+    nothing = interval(np.nan, np.nan)
+    for rule in (arithmetic.add, arithmetic.multiply, arithmetic.subtract, arithmetic.minimum):
+        assert np.isnan(ends(rule(nothing, interval(1, 2)))).all()
+    for rule in (arithmetic.absolute, arithmetic.sqrt, arithmetic.negate):
+        assert np.isnan(ends(rule(nothing))).all()
+    assert ends(functions.sine(nothing)) == (-1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("expression", "ops"),
+    [
+        (X[0] * X[0], {"power_int"}),
+        (ca.sqrt(X[0] * X[0]), {"absolute"}),
+        # two copies that CasADi does not recognise as equal
+        (
+            ca.sqrt(ca.sin(X[0]) * X[1]) * ca.sqrt(ca.sin(X[0]) * X[1]),
+            {"sine", "multiply", "sqrt", "nonnegative"},
+        ),
+        (X[0] ** 6, {"power_int"}),
+        (ca.sign(X[0]) * X[0], {"sign", "absolute"}),
+        (ca.if_else(X[0] < X[1], X[0], X[1]), {"less", "logical_not", "if_else_zero", "select"}),
+        (ca.jacobian(ca.fmin(X[0], X[1]), X[0]), {"less_equal", "add", "boundary_weight"}),
+    ],
+)
+def test_rewrites(expression, ops):
+    program = Program.from_casadi(ca.Function("f", [X], [expression]))
+    used = {program.nodes[k].op for k in range(len(program.nodes))} - {"input", "constant"}
+    assert used == ops
+
+
+def test_equal_expressions_are_one_node():
+    a, b = ca.sin(X[0] + X[1]), ca.sin(X[1] + X[0])
+    program = Program.from_casadi(ca.Function("f", [X], [a * X[2], b / X[2]]))
+    assert sum(node.op == "sine" for node in program.nodes) == 1
+
+
+def test_narrower_for_the_rewrites():
+    box = np.array([[-1.0], [0.0], [0.0]]), np.array([[2.0], [0.0], [0.0]])
+    square = evaluate(Program.from_casadi(ca.Function("f", [X], [X[0] * X[0]])), *box)
+    assert (square[0][0, 0], square[1][0, 0]) == (0.0, np.nextafter(4.0, 5.0))
+    both = ca.if_else(X[0] < 0, -X[0], X[0])
+    choice = evaluate(Program.from_casadi(ca.Function("f", [X], [both])), *box)
+    assert (choice[0][0, 0], choice[1][0, 0]) == (-2.0, 2.0)
+
+
+def test_constants_are_widened_unless_short():
+    assert constant_interval(3.0) == (3.0, 3.0)
+    assert constant_interval(-0.375) == (-0.375, -0.375)
+    lo, hi = constant_interval(0.1 * 3)
+    assert lo < 0.3 < hi
+    assert hi - lo <= 9 * np.spacing(0.3)
+
+
+def test_constants_as_inputs_are_intervals():
+    c = ca.SX.sym("c")
+    function = ca.Function("f", [X, c], [X[0] * c])
+    program = Program.from_casadi(function, {1: [(0.25, 0.5)]})
+    lo, hi = evaluate(program, np.ones((3, 1)), 2 * np.ones((3, 1)))
+    assert program.n_variables == 3
+    assert (lo[0, 0], hi[0, 0]) == pytest.approx((0.25, 1.0), rel=1e-15)
+
+
+def test_operation_without_a_rule_is_refused():
+    with pytest.raises(DerivationError, match="no range rule"):
+        Program.from_casadi(ca.Function("f", [X], [ca.erfinv(X[0])]))
