@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.arithmetic import Array
-from obsynth.derive.intervals.branch import Budget, Outcome, Problem, maximise
+from obsynth.derive.intervals.batch import Problem
+from obsynth.derive.intervals.branch import Budget, Outcome, maximise
 from obsynth.derive.intervals.evaluate import first_failure
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import JUMPS

@@ -165,6 +165,4 @@ def _walk(function: ca.Function, point: list[float]) -> list[Any]:
             work[out[0]] = _UNARY[code](work[args[0]])
         else:
             work[out[0]] = _BINARY[code](work[args[0]], work[args[1]])
-    return [
-        results[(i, j)] for i in range(function.n_out()) for j in range(function.nnz_out(i))
-    ]
+    return [results[(i, j)] for i in range(function.n_out()) for j in range(function.nnz_out(i))]

@@ -192,7 +192,12 @@ def test_the_reason_can_be_read(bounds):
 def test_scalars_of_the_peak_bounds(bounds):
     family = bounds.family
     np.testing.assert_allclose(family.half_ranges, RADII, rtol=0, atol=6e-9)
-    expected = [(0, 0, 1.0)], [(1, 1, 1.0)], [(2, 2, 1.0), (0, 2, -1.0)], [(3, 3, 1.0), (1, 3, -1.0)]
+    expected = (
+        [(0, 0, 1.0)],
+        [(1, 1, 1.0)],
+        [(2, 2, 1.0), (0, 2, -1.0)],
+        [(3, 3, 1.0), (1, 3, -1.0)],
+    )
     for direction, entries in zip(family.directions, expected, strict=True):
         built = np.zeros((4, 4))
         for i, j, value in entries:
