@@ -26,6 +26,14 @@ from obsynth.designs.lmi.lazy import LazySolution, solve_lazily
 from obsynth.designs.lmi.problem import Block, Problem
 from obsynth.designs.lmi.proof import FamilyProof, prove_family
 from obsynth.designs.lmi.recipe import Margin, MarginSolution, largest_margin, solve_with_margin
+from obsynth.designs.lmi.reductions import (
+    Extremes,
+    SplitFamily,
+    distinct_members,
+    extreme_points,
+    split_common,
+)
+from obsynth.designs.lmi.relaxation import relax_sum
 from obsynth.designs.lmi.retry import solve_with_retries
 from obsynth.designs.lmi.search import (
     Bisection,
@@ -44,6 +52,7 @@ __all__ = [
     "Enclosure",
     "ExactMatrix",
     "ExpressionError",
+    "Extremes",
     "Family",
     "FamilyProof",
     "Inequality",
@@ -55,22 +64,27 @@ __all__ = [
     "ProofResult",
     "Search",
     "Solution",
+    "SplitFamily",
     "bisect_feasible",
     "block",
     "constant",
     "diagonal",
+    "distinct_members",
+    "extreme_points",
     "full",
     "he",
     "is_positive_definite",
     "largest_margin",
     "prove_family",
     "prove_positive_definite",
+    "relax_sum",
     "scalar",
     "search_line",
     "smallest_changes",
     "solve_lazily",
     "solve_with_margin",
     "solve_with_retries",
+    "split_common",
     "symmetric",
     "symmetric_block",
     "trace",

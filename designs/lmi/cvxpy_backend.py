@@ -1,5 +1,6 @@
 """The same problem in cvxpy: transparent, any solver, and the second opinion in tests."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,10 @@ def solve_with_cvxpy(
 
     translated = to_cvxpy(problem)
     try:
-        translated.solve(solver=solver, **options)
+        with warnings.catch_warnings():
+            # The status says the same, and says it to the caller.
+            warnings.simplefilter("ignore", UserWarning)
+            translated.solve(solver=solver, **options)
     except cp.error.SolverError as trouble:
         raise SolverTrouble(
             f"{problem.name}: {solver} failed", [str(trouble).splitlines()[0]], solver=solver

@@ -55,7 +55,7 @@ def solve_lazily(
     *,
     start: Mapping[str, IntArray] | None = None,
     add: int = 6,
-    floor: float = 0.0,
+    floor: float | Callable[[Solution], float] = 0.0,
     solve: Callable[[Problem], Solution] = solve_with_retries,
 ) -> LazySolution:
     """Solve a problem whose families have many vertices.
@@ -70,7 +70,7 @@ def solve_lazily(
         Vertices to begin with.
     add : int
         Vertices added per family and round.
-    floor : float
+    floor : float, or callable that takes a Solution
         Smallest eigenvalue accepted at a vertex; a little below zero where the problem asks
         for no margin, since solvers end on the boundary.
     solve : callable
@@ -108,8 +108,9 @@ def solve_lazily(
     for count in range(1, _ROUNDS + 1):
         stated = _with_vertices(problem, families, chosen)
         solution = solve(stated)
+        least = floor(solution) if callable(floor) else floor
         fresh = {
-            name: _to_add(family, solution, chosen[name], floor, add)
+            name: _to_add(family, solution, chosen[name], least, add)
             for name, family in every.items()
         }
         if not any(len(new) for new in fresh.values()):
@@ -153,7 +154,7 @@ def _with_vertices(
 def _to_add(
     family: Family, solution: Solution, stated: IntArray, floor: float, add: int
 ) -> IntArray:
-    if len(stated) == family.count:
+    if len(stated) == family.count or floor == -np.inf:
         return np.zeros(0, dtype=np.intp)
     if family.count > 4 * _SAMPLE:
         sample = np.random.default_rng(len(stated)).choice(family.count, _SAMPLE, replace=False)

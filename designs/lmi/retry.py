@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,10 @@ _SWEEPS = 6
 
 
 def solve_with_retries(
-    problem: Problem, second_solvers: Sequence[str] = SECOND_SOLVERS, **settings: Any
+    problem: Problem,
+    second_solvers: Sequence[str] = SECOND_SOLVERS,
+    good_enough: Callable[[Solution], bool] | None = None,
+    **settings: Any,
 ) -> Solution:
     """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers.
 
@@ -36,6 +39,8 @@ def solve_with_retries(
         What to solve.
     second_solvers : sequence of str
         cvxpy's names; those that are not installed are skipped and named.
+    good_enough : callable, optional
+        Whether an answer that is not solved to full accuracy serves its purpose all the same.
     **settings
         Clarabel's settings.
 
@@ -63,13 +68,26 @@ def solve_with_retries(
     """
     form = conic_form(problem)
     attempts: list[str] = []
+
+    def final(solution: Solution) -> bool:
+        attempts.append(f"{solution.solver}: {solution.status}")
+        if solution.infeasible:
+            raise InfeasibleDesign(
+                f"{problem.name}: the solver reports that no values satisfy all constraints",
+                attempts,
+                duals=solution.duals,
+                attempts=tuple(attempts),
+                **solution.facts(),
+            )
+        return solution.solved or (good_enough is not None and good_enough(solution))
+
     solution = solve_form(form, problem, settings)
-    if _final(solution, attempts, problem):
+    if final(solution):
         return replace(solution, attempts=tuple(attempts))
     scaled, columns, rows = rescaled(form)
     solution = solve_form(scaled, problem, settings, columns=columns, rows=rows)
     solution = replace(solution, solver="Clarabel, scaled")
-    if _final(solution, attempts, problem):
+    if final(solution):
         return replace(solution, attempts=tuple(attempts))
     import cvxpy as cp
 
@@ -83,7 +101,7 @@ def solve_with_retries(
         except SolverTrouble as trouble:
             attempts.append(str(trouble))
             continue
-        if _final(solution, attempts, problem):
+        if final(solution):
             return replace(solution, attempts=tuple(attempts))
     raise SolverTrouble(
         f"{problem.name}: no solver solved it",
@@ -91,19 +109,6 @@ def solve_with_retries(
         attempts=tuple(attempts),
         status=solution.status,
     )
-
-
-def _final(solution: Solution, attempts: list[str], problem: Problem) -> bool:
-    attempts.append(f"{solution.solver}: {solution.status}")
-    if solution.infeasible:
-        raise InfeasibleDesign(
-            f"{problem.name}: the solver reports that no values satisfy all constraints",
-            attempts,
-            duals=solution.duals,
-            attempts=tuple(attempts),
-            **solution.facts(),
-        )
-    return solution.solved
 
 
 def rescaled(form: ConicForm) -> tuple[ConicForm, NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,260 @@
+"""Fewer and smaller matrix inequalities that say the same.
+
+Everything here is exact: the reduced inequalities hold if and only if the given ones do. What
+is only sufficient stands in :mod:`obsynth.designs.lmi.relaxation` and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.lmi.blocks import block
+from obsynth.designs.lmi.expression import Affine, symmetric
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = [
+    "Extremes",
+    "SplitFamily",
+    "distinct_members",
+    "extreme_points",
+    "present_entries",
+    "split_common",
+]
+
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Extremes:
+    """The extreme points among given points, and how the others follow from them.
+
+    Parameters
+    ----------
+    kept : ndarray of int
+        Row numbers of the extreme points.
+    weights : mapping of int to mapping of int to Fraction
+        For every other row, weights of kept rows that sum to one and give the row exactly;
+        a repeated row refers to its first occurrence with weight one.
+    """
+
+    kept: IntArray
+    weights: Mapping[int, Mapping[int, Fraction]]
+
+    def expand(self, row: int) -> Mapping[int, Fraction]:
+        """Write any row as an exact convex combination of kept rows."""
+        if row not in self.weights:
+            return {row: Fraction(1)}
+        total: dict[int, Fraction] = {}
+        for other, weight in self.weights[row].items():
+            for kept, share in self.expand(other).items():
+                total[kept] = total.get(kept, Fraction(0)) + weight * share
+        return total
+
+
+def extreme_points(points: ArrayLike) -> Extremes:
+    """Drop points that are convex combinations of others.
+
+    An inequality that is affine in a parameter holds at all points if it holds at the
+    extreme ones. What stands twice is dropped too. Merge what enters only through a
+    difference by passing the differences.
+
+    Parameters
+    ----------
+    points : array_like, shape (N, k)
+        Doubles, taken exactly.
+
+    Returns
+    -------
+    Extremes
+        A point is dropped only if exact rational weights prove that it may.
+
+    Examples
+    --------
+    >>> extreme_points([[0.0], [1.0], [0.5], [1.0]]).kept.tolist()
+    [0, 1]
+    """
+    array = np.asarray(points, dtype=float)
+    if array.ndim != 2 or not np.isfinite(array).all():
+        raise ObsynthError(f"points of shape {array.shape}: finite rows (N, k) are needed")
+    _, first, inverse = np.unique(array, axis=0, return_index=True, return_inverse=True)
+    weights: dict[int, Mapping[int, Fraction]] = {}
+    for row, group in enumerate(inverse.ravel()):
+        if first[group] != row:
+            weights[row] = {int(first[group]): Fraction(1)}
+    alive = sorted(int(i) for i in first)
+    for row in list(alive):
+        others = [i for i in alive if i != row]
+        combination = _convex_combination(array, row, others)
+        if combination is not None:
+            weights[row] = combination
+            alive = others
+    return Extremes(np.array(alive, dtype=np.intp), weights)
+
+
+def distinct_members(family: Affine) -> IntArray:
+    """Find the first member of every set of equal members of a family.
+
+    Parameters
+    ----------
+    family : Affine, shape (N, r, c)
+        Compared entry by entry, without tolerance.
+
+    Examples
+    --------
+    >>> M = np.array([[[1.0]], [[2.0]], [[1.0]]])
+    >>> distinct_members(symmetric("P", 1) @ M).tolist()
+    [0, 1]
+    """
+    count = family.members or 1
+    rows = [family.constant.reshape(count, -1)]
+    rows += [
+        np.asarray(sparse.csr_array(op).reshape((count, -1)).todense())
+        for op in family.terms.values()
+    ]
+    _, first = np.unique(np.hstack(rows), axis=0, return_index=True)
+    return np.sort(first)
+
+
+@dataclass(frozen=True, eq=False)
+class SplitFamily:
+    """A family written as one common inequality and a small one per vertex.
+
+    Parameters
+    ----------
+    common : Affine or None
+        One inequality >= 0; None if nothing is common.
+    members : Affine
+        The part that depends on the vertex, >= 0 at each.
+    rows : ndarray of int
+        Rows of the family that ``members`` has.
+    shared : ndarray of int
+        Rows that both have, with the slack variable between them.
+    """
+
+    common: Affine | None
+    members: Affine
+    rows: IntArray
+    shared: IntArray
+
+
+def split_common(family: Affine, slack: str) -> SplitFamily:
+    """Split the common rows of a family of inequalities ``F_i >= 0`` from those that vary.
+
+    With J the rows that hold every entry that depends on i, and S the rows of J that the
+    others K couple with, all F_i >= 0 if and only if some symmetric Z satisfies
+    ``[Z, F_SK; F_KS, F_KK] >= 0`` and ``F_i[J, J] - Z >= 0`` for all i (Z in the rows S): the
+    first forces Z above the Schur complement F_SK F_KK^+ F_KS, and this value serves all i.
+
+    Parameters
+    ----------
+    family : Affine, shape (N, n, n)
+        Symmetric.
+    slack : str
+        Name of the new variable Z.
+
+    Examples
+    --------
+    >>> P = symmetric("P", 2)
+    >>> M = np.diag([1.0, 0.0]) * np.arange(3.0).reshape(3, 1, 1)
+    >>> split = split_common(P - M, "Z")
+    >>> split.members.shape, split.common.shape, split.shared.tolist()
+    ((1, 1), (2, 2), [0])
+    """
+    n = family.shape[0]
+    varies, present = _varying_entries(family), present_entries(family)
+    varying = varies.any(axis=0) | varies.any(axis=1)
+    rows, rest = np.flatnonzero(varying), np.flatnonzero(~varying)
+    if not len(rest) or not len(rows):
+        return SplitFamily(None, family, np.arange(n), np.zeros(0, dtype=np.intp))
+    coupled = present[np.ix_(rows, rest)].any(axis=1)
+    shared = rows[coupled]
+    inner = _rows_of(family, rows)
+    first = family.member(0)
+    if not len(shared):
+        return SplitFamily(_rows_of(first, rest), inner, rows, shared)
+    Z = symmetric(slack, len(shared))
+    place = np.eye(len(rows))[:, coupled]
+    selected = first[shared, :][:, rest]
+    common = block([[Z, selected], [selected.T, _rows_of(first, rest)]])
+    return SplitFamily(common, inner - place @ Z @ place.T, rows, shared)
+
+
+def _rows_of(expression: Affine, rows: IntArray) -> Affine:
+    return expression[rows, :][:, rows]
+
+
+def _varying_entries(family: Affine) -> NDArray[np.bool_]:
+    """Entries that are not the same at all vertices."""
+    n = family.shape[0]
+    count = family.members or 1
+    constant = family.constant.reshape(count, n, n)
+    varies = (constant != constant[0]).any(axis=0)
+    for operator in family.terms.values():
+        first = sparse.csr_array(operator[: n * n])
+        repeated = sparse.csr_array(sparse.kron(np.ones((count, 1)), first))
+        difference = (operator - repeated).tocoo()
+        changed = difference.row[difference.data != 0] % (n * n)
+        varies[changed % n, changed // n] = True
+    return np.asarray(varies | varies.T)
+
+
+def present_entries(family: Affine) -> NDArray[np.bool_]:
+    """Find the entries of a symmetric family that are not zero at all vertices.
+
+    Parameters
+    ----------
+    family : Affine, shape (n, n) or (N, n, n)
+        Explicit zeros of the operators do not count.
+    """
+    n = family.shape[0]
+    present = (family.constant.reshape(-1, n, n) != 0).any(axis=0)
+    for operator in family.terms.values():
+        entries = operator.tocoo()
+        found = entries.row[entries.data != 0] % (n * n)
+        present[found % n, found // n] = True
+    return np.asarray(present | present.T)
+
+
+def _convex_combination(
+    points: NDArray[np.float64], row: int, others: list[int]
+) -> dict[int, Fraction] | None:
+    """Exact weights of other rows that give a row, or None."""
+    from scipy.optimize import linprog
+
+    if len(others) < 2:
+        return None
+    target = np.append(points[row], 1.0)
+    columns = np.vstack([points[others].T, np.ones(len(others))])
+    found = linprog(np.zeros(len(others)), A_eq=columns, b_eq=target, method="highs-ds")
+    if not found.success:
+        return None
+    support = np.flatnonzero(found.x > 1e-12)
+    return _exact_weights(columns[:, support], target, [others[i] for i in support])
+
+
+def _exact_weights(
+    columns: NDArray[np.float64], target: NDArray[np.float64], rows: list[int]
+) -> dict[int, Fraction] | None:
+    """Solve for the weights on a support in rational arithmetic and check their signs."""
+    from obsynth.designs.lmi.exact import ExactMatrix
+
+    system = ExactMatrix.of(np.column_stack([columns, target]))
+    reduced, rank = system.entries.rref()
+    count = len(rows)
+    solution: list[Any] = [Fraction(0)] * count
+    for i in range(rank):
+        pivot = next(j for j in range(count + 1) if reduced[i, j] != 0)
+        if pivot == count:
+            return None
+        value = reduced[i, count]
+        solution[pivot] = Fraction(int(value.p), int(value.q))
+    if any(weight < 0 for weight in solution):
+        return None
+    return {k: weight for k, weight in zip(rows, solution, strict=True) if weight}
