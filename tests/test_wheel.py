@@ -30,7 +30,5 @@ def test_the_wheel_holds_every_module(tmp_path):
     expected = {name.removeprefix("src/") for name in tracked("src/obsynth/*.py")}
     expected |= {"obsynth/py.typed"}
     expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/*.py")}
-    expected |= {
-        f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/templates/*")
-    }
+    expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/templates/*")}
     assert names == expected

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from obsynth.symbolic import Plant
 __all__ = ["METHOD", "EllipsoidBound", "PeakData", "UioDesign"]
 
 METHOD = "bounded_error_uio"
+LinearForm = Literal["frozen", "terms", "jacobian"]
+LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 FloatArray = NDArray[np.float64]
 
 
@@ -46,7 +48,7 @@ class EllipsoidBound:
     inverse_diagonal: FloatArray
 
     def shape_of(self, component: int) -> int:
-        """Number of the ellipsoid that bounds a component of xi."""
+        """Return the number of the ellipsoid that bounds a component of xi."""
         return 0 if len(self.P) == 1 else component
 
 
@@ -95,7 +97,7 @@ class UioDesign:
     """
 
     plant: Plant
-    linear: str
+    linear: LinearForm
     x_at: FloatArray
     u_at: FloatArray
     A: FloatArray
@@ -170,20 +172,21 @@ class UioDesign:
         """
         try:
             plant = Plant.from_dict(record["plant"])
-            family = AffineFamily(
-                **{
-                    **{key: np.asarray(record["family"][key], dtype=float) for key in _FAMILY},
-                    "labels": tuple(record["family"]["labels"]),
-                    "exact": bool(record["family"]["exact"]),
-                }
-            )
             n = len(plant.x)
-            family = replace(family, directions=family.directions.reshape(-1, n, n))
+            stored = record["family"]
+            family = AffineFamily(
+                constant=np.asarray(stored["constant"], dtype=float),
+                directions=np.asarray(stored["directions"], dtype=float).reshape(-1, n, n),
+                ranges=np.asarray(stored["ranges"], dtype=float).reshape(-1, 2),
+                radius=np.asarray(stored["radius"], dtype=float),
+                labels=tuple(stored["labels"]),
+                exact=bool(stored["exact"]),
+            )
             arrays = {name: np.asarray(record[name], dtype=float) for name in _SHAPES}
             bound = _read_bound(record["bound"])
             design = cls(
                 plant=plant,
-                linear=str(record["linear"]),
+                linear=_read_linear(record["linear"]),
                 family=family,
                 bound=bound,
                 options=dict(record["options"]),
@@ -219,7 +222,6 @@ class UioDesign:
                 raise CertificateError(f"{name} of the stored design is not finite")
 
 
-_FAMILY = ("constant", "directions", "ranges", "radius")
 _SHAPES: Mapping[str, tuple[str, ...]] = {
     "x_at": ("n",),
     "u_at": ("n_u",),
@@ -264,6 +266,13 @@ def _plain(value: Any) -> dict[str, Any]:
             entry = list(entry)
         plain[field.name] = entry
     return plain
+
+
+def _read_linear(value: Any) -> LinearForm:
+    for form in LINEAR_FORMS:
+        if value == form:
+            return form
+    raise ValueError(f"linear = {value!r}")
 
 
 def _read_bound(record: Mapping[str, Any]) -> EllipsoidBound | PeakData:

@@ -127,6 +127,9 @@ def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:
     n, _, m, _ = data.sizes
     E, C = lift(data.E, arithmetic), lift(data.C, arithmetic)
     width = lift(np.diag(data.w_radius), arithmetic)
+    T: Any
+    Pi: Any
+    M: Any
     if arithmetic == "float":
         T, Pi, M = data.T, data.Pi, data.vertices
     else:
@@ -205,7 +208,7 @@ def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSys
     StructureError
         If T of the stored doubles is no exact projector onto coordinates.
     """
-    n, n_f, m, n_w = data.sizes
+    n, n_f, m, _ = data.sizes
     keep = kept_coordinates(data.T)
     part = _parts(data, arithmetic)
 
@@ -231,9 +234,9 @@ def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSys
 
 
 def kept_coordinates(T: FloatArray) -> list[int]:
-    """Coordinates onto which T projects, for T = diag(0 or 1)."""
+    """Return the coordinates onto which T projects, for T = diag(0 or 1)."""
     diagonal = np.diag(T)
-    if np.any(T != np.diag(diagonal)) or np.any((diagonal != 0) & (diagonal != 1)):
+    if np.any(np.diag(diagonal) != T) or np.any((diagonal != 0) & (diagonal != 1)):
         raise StructureError(
             'error="shifted" needs an unknown input that takes away whole state coordinates '
             "(T = I + E C a diagonal of zeros and ones); here T mixes states, so rounding would "

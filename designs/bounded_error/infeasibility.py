@@ -128,9 +128,7 @@ def _null_space(rows: Any) -> list[list[Fraction]]:
     m, n = rows.shape
     matrix = fmpq_mat(m, n, [fmpq(v.numerator, v.denominator) for v in rows.ravel()])
     reduced, rank = matrix.rref()
-    pivots = []
-    for i in range(rank):
-        pivots.append(next(j for j in range(n) if reduced[i, j] != 0))
+    pivots = [next(j for j in range(n) if reduced[i, j] != 0) for i in range(rank)]
     basis = []
     for free in (j for j in range(n) if j not in pivots):
         vector = [Fraction(0)] * n
@@ -179,40 +177,39 @@ def find_fixed_point(
         return None
     n, n_f = len(_fractions(A)), len(_fractions(B_f)[0])
     basis = np.array([[float(value) for value in row] for row in space]).T
-    scale = np.abs(basis[:n]).max(axis=0)
     rng = np.random.default_rng(seed)
-    numeric = np.array(
-        [[[float(v) for v in row] for row in _fractions(M)] for M in vertices], dtype=float
-    )
-
-    def constraints(c: FloatArray, M: FloatArray) -> tuple[float, float]:
-        vector = basis @ c
-        e, s = vector[:n], vector[n + n_f :]
-        size = float(e @ e)
-        if size < 1e-12:
-            return -1.0, -1.0
-        Me = M @ e
-        return float(e @ Me - s @ e) / size, float(Me @ Me - s @ s) / size
-
-    for start in range(starts):
-        c0 = rng.standard_normal(basis.shape[1])
-        c0 = np.where(scale > 0, c0 / np.maximum(scale, 1e-3), 0.0)
+    numeric = [
+        np.array([[float(v) for v in row] for row in _fractions(M)], dtype=float) for M in vertices
+    ]
+    # directions that do not move e only cost |s|^2: start without them
+    moves = np.abs(basis[:n]).max(axis=0)
+    for _ in range(starts):
+        c0 = np.where(moves > 0, rng.standard_normal(len(space)) / np.maximum(moves, 1e-3), 0.0)
         for number, M in enumerate(numeric):
-            size = max(float(np.abs(M).max()), 1e-12)
-
-            def objective(c: FloatArray, M: FloatArray = M, size: float = size) -> float:
-                q1, q2 = constraints(c, M)
-                return -min(q1 / size, q2 / size**2)
-
-            found = minimize(objective, c0, method="Nelder-Mead", options={"maxfev": 400})
+            found = minimize(
+                _shortfall, c0, (basis, M, n_f), method="Nelder-Mead", options={"maxfev": 400}
+            )
             if found.fun >= 0.0:
                 continue
-            point = _rounded_point(found.x, space, n, n_f, (A, B_f, C, T, vertices[number]), number)
+            data = (A, B_f, C, T, vertices[number])
+            point = _rounded_point(found.x, space, n, n_f, data, number)
             if point is not None:
                 return point
-        if start == 0 and basis.shape[1] == 1:
-            break
     return None
+
+
+def _shortfall(c: FloatArray, basis: FloatArray, M: FloatArray, n_f: int) -> float:
+    """Return ``-min(q1, q2)``, each relative to ``|e|`` and the size of M."""
+    vector = basis @ c
+    n = len(M)
+    e, s = vector[:n], vector[n + n_f :]
+    length = float(e @ e)
+    if length < 1e-12:
+        return 1.0
+    Me = M @ e
+    unit = max(float(np.abs(M).max()), 1e-12)
+    q1, q2 = float(e @ Me - s @ e) / length, float(Me @ Me - s @ s) / length
+    return -min(q1 / unit, q2 / unit**2)
 
 
 def _rounded_point(
@@ -220,7 +217,7 @@ def _rounded_point(
     space: list[list[Fraction]],
     n: int,
     n_f: int,
-    data: tuple[Any, ...],
+    data: tuple[Any, Any, Any, Any, Any],
     vertex: int,
 ) -> FixedPoint | None:
     """Round the coordinates to ever longer rationals until the exact check passes."""

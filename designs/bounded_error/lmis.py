@@ -22,9 +22,7 @@ from obsynth.designs.lmi import Enclosure, he, symmetric_block
 __all__ = ["direct_block", "fixed_gain_block", "multiplier_block"]
 
 
-def direct_block(
-    system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any
-) -> Any:
+def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:
     """Quadratic boundedness at every vertex, without relaxation.
 
         [ keep P            *       *
@@ -98,4 +96,3 @@ def multiplier_block(
     else:
         rows.append([-(U @ M @ V), 0, 0, 0, he(U) - b])
     return symmetric_block(rows)
-

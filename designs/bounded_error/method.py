@@ -30,7 +30,7 @@ from obsynth.designs.bounded_error.synthesis import (
     search_gamma,
     synthesise,
 )
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
@@ -255,9 +255,7 @@ class BoundedErrorUIO:
 
             data = _with_vertices(prepared, box_vertices(prepared.bounds))
             noise, weights = self._noise(prepared, 3), self._weights(prepared)
-            return multiplier_problem(
-                data, self.gamma, noise, self.objective, weights, self.form
-            )
+            return multiplier_problem(data, self.gamma, noise, self.objective, weights, self.form)
         system, free_or_fixed, weights = self._setting(prepared)
         return design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
 
@@ -286,7 +284,9 @@ class BoundedErrorUIO:
 
     def _setting(self, prepared: Prepared) -> tuple[ErrorSystem, FloatArray | None, FloatArray]:
         system = build_error_system(prepared.design.data, self.error)
-        noise = None if self.multipliers == "per_component" else self._noise(prepared, system.blocks)
+        noise = (
+            None if self.multipliers == "per_component" else self._noise(prepared, system.blocks)
+        )
         return system, noise, self._weights(prepared)
 
     def _design_ellipsoid(self, prepared: Prepared) -> UioDesign:
@@ -316,6 +316,7 @@ class BoundedErrorUIO:
     def _multiplier_form(self, prepared: Prepared, weights: FloatArray) -> tuple[Any, Any]:
         from obsynth.designs.bounded_error.multipliers import (
             box_vertices,
+            largest_multiplier_gamma,
             refuse_printed,
             synthesise_multipliers,
         )
@@ -331,7 +332,7 @@ class BoundedErrorUIO:
             return synthesise_multipliers(data, gamma, noise, self.objective, weights, form)
 
         def top() -> float:
-            return largest_gamma(build_error_system(data, "plain"))
+            return largest_multiplier_gamma(data)
 
         return solve, top
 
@@ -347,9 +348,7 @@ class BoundedErrorUIO:
         gain = np.vstack([given.K[self._kept(given)], given.F])
         solutions = [solution]
         if self.post == "per_component":
-            solutions = [
-                analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))
-            ]
+            solutions = [analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))]
         shapes = np.stack([s.P for s in solutions])
         gammas = np.array([s.gamma for s in solutions])
         rows = np.stack([s.weights for s in solutions])
@@ -365,14 +364,10 @@ class BoundedErrorUIO:
 
 
 def _with_vertices(prepared: Prepared, vertices: FloatArray) -> Any:
-    return replace(
-        prepared.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices)
-    )
+    return replace(prepared.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices))
 
 
-def _read_gains(
-    design: UioDesign, gains: Mapping[str, ArrayLike]
-) -> tuple[FloatArray, FloatArray]:
+def _read_gains(design: UioDesign, gains: Mapping[str, ArrayLike]) -> tuple[FloatArray, FloatArray]:
     missing = {"K", "F"} - set(gains)
     if missing:
         raise ObsynthError(
@@ -410,8 +405,10 @@ def _solve_or_explain(
         return search_gamma(solve, weights, largest)
     try:
         solution: EllipsoidSolution = solve(gamma)
-    except InfeasibleDesign as error:
+    except (InfeasibleDesign, SolverTrouble) as error:
         largest = top()
+        if gamma < largest:
+            raise
         raise InfeasibleDesign(
             f"gamma = {gamma:.6g} is infeasible",
             [

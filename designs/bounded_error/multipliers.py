@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -16,13 +17,21 @@ from obsynth.designs.bounded_error.synthesis import (
     MARGIN,
     EllipsoidSolution,
     Objective,
+    largest_feasible,
+    largest_margin,
     set_objective,
     solve_reliably,
 )
 from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.lmi import Problem, diagonal, full, scalar, symmetric
 
-__all__ = ["box_vertices", "multiplier_problem", "refuse_printed", "synthesise_multipliers"]
+__all__ = [
+    "box_vertices",
+    "largest_multiplier_gamma",
+    "multiplier_problem",
+    "refuse_printed",
+    "synthesise_multipliers",
+]
 
 FloatArray = NDArray[np.float64]
 MOST_ENTRIES = 12
@@ -48,9 +57,7 @@ def box_vertices(bounds: JacobianBounds) -> FloatArray:
     vertices = np.repeat(low[None], 2**count, axis=0)
     for number, choice in enumerate(itertools.product((False, True), repeat=count)):
         picked = np.array(choice, dtype=bool)
-        vertices[number, rows, columns] = np.where(
-            picked, high[rows, columns], low[rows, columns]
-        )
+        vertices[number, rows, columns] = np.where(picked, high[rows, columns], low[rows, columns])
     return vertices
 
 
@@ -65,6 +72,8 @@ def multiplier_problem(
 ) -> Problem:
     """State (51) with variables P, H, alpha, beta, U (printed) or P, H, a, b (repaired).
 
+    The multipliers a of the repaired form keep the sign that the paper gives to
+    alpha. (s = M e would allow any sign, which is a little less conservative.)
     As in `design_problem`, P and H stand for gamma times those of the paper, in
     scaled coordinates.
     """
@@ -88,13 +97,15 @@ def multiplier_problem(
             full("U", n, n),
         )
     else:
+        a = diagonal("a", n)
+        problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
         block = multiplier_block(
             data,
             back @ P @ back,
             back @ H,
             1.0 - gamma,
             np.diag(noise),
-            diagonal("a", n),
+            a,
             diagonal("b", n),
         )
     extra = block.shape[0] - 2 * p - noise.size
@@ -103,6 +114,23 @@ def multiplier_problem(
     problem.add_lmi("(51)", block, ">>", margin=MARGIN)
     set_objective(problem, P, objective, weights, scale)
     return problem
+
+
+def largest_multiplier_gamma(data: ModelData) -> float:
+    """Return the largest gamma for which the repaired form is feasible; noise does not enter."""
+    quiet = replace(data, w_radius=data.w_radius * 0.0, rate=data.rate * 0.0)
+    n, n_f, m, n_w = data.sizes
+    p, n_v = n + n_f, 2 * n_w + n_f
+
+    def room(gamma: float) -> float:
+        problem = Problem(f"(51), repaired, decay at gamma = {gamma:.6g}")
+        P, H = symmetric("P", p), full("H", p, m)
+        a, b = diagonal("a", n), diagonal("b", n)
+        problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
+        block = multiplier_block(quiet, P, H, 1.0 - gamma, np.eye(n_v), a, b)
+        return largest_margin(problem, block, P)
+
+    return largest_feasible(room)
 
 
 def synthesise_multipliers(

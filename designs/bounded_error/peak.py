@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.design import PeakData, UioDesign
-from obsynth.designs.bounded_error.error_system import build_error_system, kept_coordinates
+from obsynth.designs.bounded_error.error_system import (
+    ErrorKind,
+    build_error_system,
+    kept_coordinates,
+)
 from obsynth.designs.bounded_error.prepare import Prepared
 from obsynth.designs.bounded_error.runtime import StartBox, noise_offset, reset_box
 from obsynth.designs.bounded_error.step import RuntimeBound
@@ -94,9 +98,9 @@ def design_peak(prepared: Prepared, method: BoundedErrorUIO) -> UioDesign:
     design = prepared.design
     n, n_f = design.A.shape[0], design.rate.size
     weights = np.ones(n + n_f) if method.weights is None else np.array(method.weights)
-    diagonal = not np.any(design.T != np.diag(np.diag(design.T)))
-    error = "shifted" if diagonal else "plain"
-    system = build_error_system(design.data, "shifted" if diagonal else "plain")
+    diagonal = not np.any(design.T - np.diag(np.diag(design.T)))
+    error: ErrorKind = "shifted" if diagonal else "plain"
+    system = build_error_system(design.data, error)
     kept = kept_coordinates(design.T) if diagonal else list(range(n))
     gamma = method.gamma
     if gamma is None:

@@ -147,7 +147,7 @@ def prepare(model_or_split: Plant | Split, bounds: JacobianBounds | None = None)
 
 
 def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:
-    """Allowance for the rounding errors of one step, shape (n + n_f,).
+    """Return the allowance for the rounding errors of one step, shape (n + n_f,).
 
     2^-40 of the largest magnitude of the states (or 1), and the share of the
     unknown input that rounding leaves in the error.

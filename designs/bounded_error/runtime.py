@@ -31,13 +31,13 @@ CORNERS = 14
 
 
 def noise_offset(design: UioDesign) -> FloatArray:
-    """Bound of ``E W2 w_k``, which separates e from zeta, shape (n,)."""
+    """Return the bound of ``E W2 w_k``, which separates e from zeta, shape (n,)."""
     bound: FloatArray = np.abs(design.E) @ (np.abs(design.W2) @ design.w_radius) * UP
     return bound
 
 
 def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
-    """Upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
+    """Return an upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
 
     Exact up to rounding at the corners for up to 14 components, by the sum of
     ``|P_ij| r_i r_j`` beyond.
@@ -113,7 +113,7 @@ def _component_map(design: UioDesign, bound: EllipsoidBound) -> list[int | None]
 
 
 def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
-    """Recursion of eq. (36) for every component, rounding errors of the step included.
+    """Return the recursion of eq. (36) for every component, rounding errors of the step included.
 
     An error of at most `UioDesign.rounding` per step is at most rho in the norm
     of P, so ``V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho + rho^2``.
@@ -146,7 +146,7 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
 
 
 def reset_box(design: UioDesign) -> StartBox | None:
-    """Errors when state, fault and their estimates lie in their declared boxes."""
+    """Return the errors when state, fault and their estimates lie in their declared boxes."""
     x_box, f_box = design.plant.box("x"), design.plant.box("f")
     if not (np.isfinite(x_box).all() and np.isfinite(f_box).all()):
         return None

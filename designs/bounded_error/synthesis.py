@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -11,15 +12,28 @@ from numpy.typing import NDArray
 from obsynth.designs.bounded_error.error_system import ErrorSystem
 from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
 from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import Problem, Solution, diagonal, full, symmetric, symmetric_block, trace
+from obsynth.designs.lmi import (
+    Affine,
+    Problem,
+    Solution,
+    diagonal,
+    full,
+    scalar,
+    symmetric,
+    symmetric_block,
+    trace,
+)
 
 __all__ = [
     "OBJECTIVES",
     "EllipsoidSolution",
     "Objective",
     "analyse_gain",
+    "decay_room",
     "design_problem",
+    "largest_feasible",
     "largest_gamma",
+    "largest_margin",
     "search_gamma",
     "set_objective",
     "solve_reliably",
@@ -184,8 +198,8 @@ def synthesise(
     return EllipsoidSolution(K, 0.5 * (P + P.T), gamma, np.maximum(Q_v, 0.0))
 
 
-def _accuracy(tolerance: float) -> dict[str, float]:
-    return {name: tolerance for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas")}
+def _accuracy(tolerance: float) -> dict[str, Any]:
+    return dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), tolerance)
 
 
 def solve_reliably(problem: Problem) -> Solution:
@@ -217,15 +231,13 @@ def analyse_gain(
 
 
 def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:
-    """Largest spectral radius of the error map over the vertices."""
+    """Return the largest spectral radius of the error map over the vertices."""
     X, _ = system.closed_loop(gain)
     return float(np.abs(np.linalg.eigvals(X)).max())
 
 
-def largest_gamma(
-    system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | None = None
-) -> float:
-    """Largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``, by bisection.
+def largest_gamma(system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | None = None) -> float:
+    """Return the largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``.
 
     Bounds of the noise do not enter: they only scale P.
 
@@ -234,45 +246,59 @@ def largest_gamma(
     float
         A feasible value, within `rtol` of the largest; 0 where nothing is feasible.
     """
-    low, high = 0.0, 1.0
-    if _decay_room(system, 0.0, gain) <= 0:
+    return largest_feasible(lambda gamma: decay_room(system, gamma, gain), rtol)
+
+
+def largest_feasible(room: Callable[[float], float], rtol: float = 1e-3) -> float:
+    """Bisect for the largest gamma in (0, 1) with ``room(gamma) > 0``; room falls with gamma."""
+    if room(0.0) <= 0:
         return 0.0
-    probe = 1e-4
-    while probe < 1.0 and _decay_room(system, probe, gain) > 0:
-        low, probe = probe, probe * 3.0
-    high = min(probe, 1.0)
-    if low == 0.0:
-        while probe > 1e-9 and _decay_room(system, probe, gain) <= 0:
-            high, probe = probe, probe / 3.0
-        low = probe
+    low, high = 0.0, 1e-4
+    while high < 1.0 and room(high) > 0:
+        low, high = high, min(3.0 * high, 1.0)
+    while low == 0.0:
+        if high < 1e-9:
+            return 0.0
+        if room(high / 3.0) > 0:
+            low = high / 3.0
+        else:
+            high /= 3.0
     while high - low > rtol * high:
         middle = 0.5 * (low + high)
-        if _decay_room(system, middle, gain) > 0:
+        if room(middle) > 0:
             low = middle
         else:
             high = middle
     return low
 
 
-def _decay_room(system: ErrorSystem, gamma: float, gain: FloatArray | None) -> float:
-    """Largest t with ``[(1-gamma) P, X'P; P X, P] >= t I`` and P <= I, minus the tolerance."""
+def decay_room(system: ErrorSystem, gamma: float, gain: FloatArray | None = None) -> float:
+    """Return the largest t with ``[(1-gamma) P, X'P; P X, P] >= t I`` and P <= I, minus the tolerance."""
     p, m, _ = system.sizes
     problem = Problem(f"decay at gamma = {gamma:.6g}")
-    P, room = symmetric("P", p), symmetric("t", 1)
+    P = symmetric("P", p)
     if gain is None:
         X = P @ system.Abar - full("H", p, m) @ system.Cbar
     else:
         X = P @ system.closed_loop(gain)[0]
-    block = symmetric_block([[P * (1.0 - gamma)], [X, P]])
-    problem.add_lmi("decay", block - room * np.eye(2 * p), ">>")
-    problem.add_lmi("size", P - np.eye(p), "<<")
+    return largest_margin(problem, symmetric_block([[P * (1.0 - gamma)], [X, P]]), P)
+
+
+def largest_margin(problem: Problem, block: Affine, P: Affine) -> float:
+    """Phase 1: the largest t with ``block >= t I`` and P <= I, minus the solver's tolerance."""
+    room = scalar("t")
+    problem.add_lmi("block", block - room * np.eye(block.shape[0]), ">>")
+    problem.add_lmi("size", P - np.eye(P.shape[0]), "<<")
     problem.maximise(room)
     solution = problem.solve(accept_inaccurate=True)
-    return float(solution["t"].item()) - 1e-9
+    return solution.number("t") - 1e-9
 
 
 def search_gamma(
-    solve: Any, weights: FloatArray, top: float, xatol: float = 5e-3
+    solve: Callable[[float], EllipsoidSolution],
+    weights: FloatArray,
+    top: float,
+    xatol: float = 5e-3,
 ) -> EllipsoidSolution:
     """Line search over gamma for the smallest sum of the (weighted) half widths.
 

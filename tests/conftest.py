@@ -1,0 +1,55 @@
+"""The quadruple tank and its designs, made once for all tests of a worker."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+
+# Gains of the last row of the comparison in the peak-bound analysis, exact decimals.
+PEAK_GAINS = {
+    "K": np.array([[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]),
+    "F": np.array([[0.6766, 0.0023, 0], [-0.0042, 0.6263, 0]]),
+}
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """Reference numbers of the bounded-error paper's example, all digits."""
+    path = Path(__file__).parent / "reference" / "bounded_error_uio.json"
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="session")
+def tank():
+    return ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
+
+
+@pytest.fixture(scope="session")
+def tank_split(tank):
+    return ob.split(tank)
+
+
+@pytest.fixture(scope="session")
+def tank_bounds(tank_split):
+    return ob.jacobian_bounds(tank_split)
+
+
+@pytest.fixture(scope="session")
+def base(tank_split, tank_bounds):
+    """BASE: corrected, 16 vertices, gamma = .005, min trace(P^-1)."""
+    return ob.BoundedErrorUIO(gamma=0.005).design(tank_split, tank_bounds)
+
+
+@pytest.fixture(scope="session")
+def given_peak(tank_split, tank_bounds):
+    """Peak bounds of the given gains."""
+    return ob.BoundedErrorUIO(bounds="peak").analyse(tank_split, PEAK_GAINS, tank_bounds)
+
+
+@pytest.fixture(scope="session")
+def peak(tank_split, tank_bounds):
+    """Peak bounds with a gain designed for them."""
+    return ob.BoundedErrorUIO(bounds="peak").design(tank_split, tank_bounds)

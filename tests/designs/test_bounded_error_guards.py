@@ -1,0 +1,494 @@
+"""What guards the guarantee of the bounded-error observer, each with a mutant that it catches."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+from obsynth.designs.bounded_error.assembly import assemble, to_record
+from obsynth.designs.bounded_error.design import UioDesign
+from obsynth.designs.bounded_error.error_system import plain_error, shifted_error
+from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.step import build_step
+from obsynth.designs.bounded_error.synthesis import synthesise
+
+# M_min and M_max as printed in section 6 of the paper.
+PRINTED_RANGES = {"m11": (0.0026, 0.0065), "m22": (0.0008, 0.0033)}
+PRINTED_M13 = (-0.0144, 0.0039)
+
+
+@pytest.fixture(scope="module")
+def design(base):
+    return UioDesign.from_record(base.record)
+
+
+@pytest.fixture(scope="module")
+def run(tank, base):
+    return ob.simulate(tank, base, ob.scenarios.quadruple_tank("FS2"), seed=0)
+
+
+def recursion_residual(design, tank_split, run, Wbar, shift=0):
+    """Largest violation of eq. (16) along a simulated run."""
+    system = plain_error(design.data.without_nonlinearity())
+    X = system.Abar[0] - design.gain @ system.Cbar
+    Z = (Wbar - design.gain @ system.Vbar) / design.data_scale
+    Y = np.vstack([design.T, np.zeros((2, 4))])
+    g = tank_split.g_function().map(len(run.x))
+    s = np.array(g(run.x.T, run.u.T) - g(run.xhat.T, run.u.T)).T
+    error = np.hstack([run.x - run.xhat, run.f - run.fhat])
+    rates = np.diff(run.f, axis=0)
+    last = len(rates) - 1
+    now, later = slice(0, last), slice(1 + shift, last + 1 + shift)
+    v = np.hstack([run.w[now], rates[now], run.w[later]])
+    predicted = error[now] @ X.T + s[now] @ Y.T + v @ Z.T
+    return np.abs(error[1 : last + 1] - predicted).max()
+
+
+@pytest.fixture(scope="module")
+def scaled(design):
+    """The design with the radii of v attached, to undo the scaling of the error system."""
+    stacked = NoiseBox(design.w_centre, design.w_radius, design.rate).stacked
+    object.__setattr__(design, "data_scale", stacked)
+    return design
+
+
+def test_error_recursion_16(scaled, tank_split, run):
+    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar
+    assert recursion_residual(scaled, tank_split, run, Wbar) < 1e-12
+
+
+def test_error_recursion_16_with_the_printed_third_block_fails(scaled, tank_split, run):
+    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar.copy()
+    Wbar[:4, -3:] = scaled.E @ np.zeros((3, 3))  # E W1, as (18) prints it
+    assert recursion_residual(scaled, tank_split, run, Wbar) > 0.05
+
+
+def test_error_recursion_16_with_a_set_of_the_next_instant_fails(scaled, tank_split, run):
+    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar
+    assert recursion_residual(scaled, tank_split, run, Wbar, shift=1) > 0.05
+
+
+def test_h3_is_not_covered_with_the_printed_third_block(scaled, run):
+    system = plain_error(scaled.data)
+    Wbar = system.Wbar.copy()
+    Wbar[..., :4, -3:] = 0.0
+    noise = NoiseBox(scaled.w_centre, scaled.w_radius, scaled.rate).equal_weights()
+    mutant = synthesise(
+        replace(system, Wbar=Wbar), 0.005, noise, "trace_inverse", np.array([1, 1, 1, 1, 1, 1.0])
+    )
+    width = np.sqrt(mutant.inverse_diagonal[2])
+    assert np.abs(run.x - run.xhat)[2000:, 2].max() > width
+
+
+def test_step_is_the_observer_of_the_paper(base, design, tank_split, run):
+    """(10)-(12) with N, G, L, T and g, against the step, from the same memory."""
+    g = tank_split.g_function()
+    gains, layout = base.gains, base.memory_layout
+    scenario = ob.scenarios.quadruple_tank("FS2")
+    memory = base.memory0(scenario.guess, x_range=scenario.x_range, f_range=scenario.f_range)
+    for k in range(50):
+        z, fhat = memory[layout["z"]], memory[layout["fhat"]]
+        xhat = z - gains["E"] @ run.y[k]
+        expected = (
+            gains["N"] @ z
+            + gains["G"] @ run.u[k]
+            + gains["L"] @ run.y[k]
+            + gains["T"] @ design.B_f @ fhat
+            + gains["T"] @ np.array(g(xhat, run.u[k])).ravel()
+        )
+        out = base.step(memory, run.u[k], run.y[k])
+        memory = np.array(out[0]).ravel()
+        np.testing.assert_allclose(np.array(out[1]).ravel(), xhat, atol=1e-12)
+        np.testing.assert_allclose(memory[layout["z"]], expected, atol=1e-11)
+        new = fhat + gains["F"] @ (run.y[k] - design.C @ xhat)
+        np.testing.assert_allclose(memory[layout["fhat"]], new, atol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_set_reported_for_another_instant_is_not_covered(given_peak, tank, shift):
+    run = ob.simulate(tank, given_peak, ob.scenarios.quadruple_tank("FS1"), seed=0)
+    lower, upper = np.roll(run.x_lower, shift, axis=0), np.roll(run.x_upper, shift, axis=0)
+    inside = (lower <= run.x) & (run.x <= upper)
+    assert ((run.x_lower <= run.x) & (run.x <= run.x_upper)).all()
+    assert not inside[5:-5, 2].all()
+
+
+def admissible(tank, observer, seed, steps=400):
+    """Random admissible trajectories: bang-bang noise, faults that walk at their rate."""
+    rng = np.random.default_rng(seed)
+    scenario = ob.scenarios.quadruple_tank("FS1")
+    rates = np.array([s.rate for s in tank.f])
+    increments = rng.choice([-1.0, 1.0], (steps, 2)) * rates
+    faults = np.vstack([np.zeros(2), np.cumsum(increments, axis=0)])
+    corners = np.array([rng.choice(pair) for pair in scenario.x_range])
+    noise = rng.choice([-0.1, 0.1], (steps + 1, 3))
+    return replace(
+        scenario,
+        name=f"random {seed}",
+        steps=steps,
+        x0=corners,
+        inputs=scenario.inputs[: steps + 1],
+        faults=faults,
+        unknown_inputs=rng.uniform(-0.5, 0.5, (steps + 1, 1)),
+        disturbances=noise,
+    )
+
+
+@pytest.mark.parametrize("which", ["base", "given_peak"])
+def test_random_admissible_trajectories_are_inside_from_the_first_instant(which, tank, request):
+    observer = request.getfixturevalue(which)
+    for seed in range(8):
+        run = ob.simulate(tank, observer, admissible(tank, observer, seed), seed=seed)
+        assert min(run.coverage.values()) == 1.0, f"seed {seed}"
+
+
+def test_a_start_box_that_is_too_small_is_not_covered(given_peak, tank):
+    scenario = admissible(tank, given_peak, 0)
+    small = 0.2 * (scenario.x_range - scenario.guess[:, None]) + scenario.guess[:, None]
+    run = ob.simulate(tank, given_peak, replace(scenario, x_range=small), seed=0)
+    assert min(run.coverage.values()) < 1.0
+
+
+# -- certificates ------------------------------------------------------------------------------
+
+
+def spoilt(observer, change):
+    record = json.loads(json.dumps(observer.record))
+    change(record)
+    return record
+
+
+def shrink_P_inverse(record):
+    record["bound"]["inverse_diagonal"][0] *= 1 - 1e-9
+
+
+def larger_gamma(record):
+    record["bound"]["gamma"][0] *= 2.0
+
+
+def other_gain(record):
+    record["K"][0][0] += 0.02
+
+
+def flipped_gain(record):
+    record["F"][1][1] = -record["F"][1][1]
+
+
+def more_noise_than_allowed(record):
+    record["bound"]["weights"][0][0] *= 1.001
+
+
+def smaller_noise_box(record):
+    record["w_radius"][0] *= 0.99
+
+
+def slower_faults(record):
+    record["rate"][0] *= 0.5
+
+
+def tilted_P(record):
+    record["bound"]["P"][0][0][3] *= 1.5
+    record["bound"]["P"][0][3][0] *= 1.5
+
+
+def other_decoupling(record):
+    record["E"][2][2] = -0.999
+
+
+SPOILS = [
+    (shrink_P_inverse, "half_widths"),
+    (larger_gamma, "lmi"),
+    (other_gain, "lmi"),
+    (flipped_gain, "lmi"),
+    (more_noise_than_allowed, "weights"),
+    (smaller_noise_box, "boxes"),
+    (slower_faults, "boxes"),
+    (tilted_P, "lmi"),
+    (other_decoupling, "decoupling"),
+]
+
+
+@pytest.mark.parametrize(("change", "claim"), SPOILS, ids=[c.__name__ for c, _ in SPOILS])
+def test_a_spoilt_design_is_refused(base, change, claim):
+    with pytest.raises(ob.CertificateError) as refusal:
+        assemble(spoilt(base, change), level="lmi")
+    assert claim in {failed.name for failed in refusal.value.failed}
+
+
+def printed_bounds(record):
+    record["family"]["ranges"][2] = [-PRINTED_M13[1], -PRINTED_M13[0]]
+
+
+def other_dynamics(record):
+    plant = record["plant"]["continuous"]
+    text = json.dumps(plant["dynamics"])
+    assert "a3" in text
+    plant["dynamics"] = json.loads(text.replace("a3", "a4"))
+
+
+def larger_domain(record):
+    for signal in record["plant"]["continuous"]["signals"]:
+        if signal["name"] == "h3":
+            signal["lower"] = 4.0
+
+
+@pytest.mark.parametrize("change", [printed_bounds, other_dynamics, larger_domain])
+def test_the_full_check_derives_the_bounds_again(base, change):
+    record = spoilt(base, change)
+    with pytest.raises(ob.CertificateError) as refusal:
+        assemble(record, level="full")
+    names = {failed.name for failed in refusal.value.failed}
+    assert names & {"jacobian", "model"}
+
+
+@pytest.mark.parametrize("factor", [1 - 1e-9, 0.9])
+def test_a_peak_bound_that_is_too_tight_is_refused(given_peak, factor):
+    def tighter(record):
+        record["bound"]["b"] = [value * factor for value in record["bound"]["b"]]
+
+    with pytest.raises(ob.CertificateError, match="not certified"):
+        assemble(spoilt(given_peak, tighter), level="lmi")
+
+
+def test_save_load_and_prove_from_the_file_alone(base, given_peak, tmp_path):
+    for name, observer in (("base", base), ("peak", given_peak)):
+        path = tmp_path / f"{name}.json"
+        observer.save(path)
+        again = ob.load(path)
+        assert again.record == json.loads(json.dumps(observer.record))
+        np.testing.assert_array_equal(again.half_widths, observer.half_widths)
+        checked = again.certificate.check()
+        assert checked.valid
+        assert {"model", "jacobian"} <= {claim.name for claim in checked}
+        memory = observer.memory0([125, 165, 25, 35])
+        for out, other in zip(
+            observer.step(memory, [10, 10], [128, 168, 30]),
+            again.step(memory, [10, 10], [128, 168, 30]),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(np.array(out), np.array(other))
+
+
+def test_the_check_needs_no_solver(base, monkeypatch):
+    import clarabel
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("a solver was called")
+
+    monkeypatch.setattr(clarabel, "DefaultSolver", refuse)
+    assert base.certificate.check().valid
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("not json", "not JSON"),
+        ("[1, 2]", "no design"),
+        ('{"format": "other"}', "no design"),
+        ('{"format": "obsynth design", "version": 99}', "version"),
+        ('{"format": "obsynth design", "version": 1, "method": "x"}', "not known"),
+        (
+            '{"format": "obsynth design", "version": 1, "method": "bounded_error_uio"}',
+            "cannot be read",
+        ),
+    ],
+)
+def test_files_that_are_no_design(tmp_path, text, message):
+    path = tmp_path / "design.json"
+    path.write_text(text)
+    with pytest.raises(ob.CertificateError, match=message):
+        ob.load(path)
+
+
+def test_a_matrix_of_the_wrong_shape_is_named(base):
+    def cut(record):
+        record["K"] = record["K"][:3]
+
+    with pytest.raises(ob.CertificateError, match=r"K has shape \(3, 3\)"):
+        assemble(spoilt(base, cut))
+
+
+def test_saving_replaces_only_complete_files(base, tmp_path, monkeypatch):
+    path = tmp_path / "design.json"
+    path.write_text("kept")
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        base.save(path)
+    assert path.read_text() == "kept"
+    assert [p.name for p in tmp_path.iterdir()] == ["design.json"]
+
+
+def test_records_are_plain_json(base, given_peak):
+    for observer in (base, given_peak):
+        record = to_record(UioDesign.from_record(observer.record))
+        assert json.loads(json.dumps(record, allow_nan=False)) == json.loads(
+            json.dumps(observer.record)
+        )
+
+
+# -- the step --------------------------------------------------------------------------------
+
+
+def step(observer, memory, u=(10.0, 10.0), y=(128.0, 168.0, 30.0)):
+    names = ("memory", "xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper", "status")
+    values = observer.step(memory, list(u), list(y))
+    return {name: np.array(v).ravel() for name, v in zip(names, values, strict=True)}
+
+
+def test_not_initialised(base):
+    out = step(base, np.zeros(base.step.size1_in(0)))
+    assert int(out["status"][0]) & 1
+    assert np.all(np.isinf(out["x_lower"]))
+    assert np.all(out["memory"] == 0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_missing_measurement_gives_no_bounds_and_keeps_running(base, bad):
+    memory = base.memory0(
+        [125, 165, 25, 35], x_range=np.array([[115, 135], [155, 175], [15, 35], [25, 45]])
+    )
+    good = step(base, memory)
+    out = step(base, good["memory"], y=(128.0, bad, 30.0))
+    status = int(out["status"][0])
+    assert status & 2
+    assert status & 16
+    assert np.all(np.isneginf(out["x_lower"]))
+    assert np.all(np.isposinf(out["f_upper"]))
+    assert np.all(np.isfinite(out["xhat"]))
+    layout = base.memory_layout
+    assert np.all(np.isfinite(out["memory"][layout["z"]]))
+    later = step(base, out["memory"])
+    # no range is declared for the faults, so the error cannot be bounded again
+    assert np.all(np.isposinf(later["x_upper"]))
+    assert np.all(np.isfinite(later["xhat"]))
+
+
+def test_a_missing_input_costs_the_bounds_of_the_next_instant_only(base):
+    memory = base.memory0(
+        [125, 165, 25, 35], x_range=np.array([[115, 135], [155, 175], [15, 35], [25, 45]])
+    )
+    out = step(base, memory, u=(np.nan, 10.0))
+    assert int(out["status"][0]) & 2
+    assert np.all(np.isfinite(out["x_lower"]))
+    assert np.all(np.isinf(step(base, out["memory"])["x_lower"]))
+
+
+def test_an_impossible_measurement_is_flagged(given_peak):
+    box = np.array([[124, 126], [164, 166], [24, 26], [34, 36.0]])
+    memory = given_peak.memory0([125, 165, 25, 35], x_range=box)
+    start = memory[given_peak.memory_layout["bound"]]
+    far = 125 + 10 * (given_peak.half_widths[0] + start[0]) + 5
+    assert int(step(given_peak, memory, y=(125, 165, 25))["status"][0]) & 8 == 0
+    assert int(step(given_peak, memory, y=(far, 165, 25))["status"][0]) & 8
+
+
+def test_leaving_the_domain_is_flagged_and_survived(base):
+    memory = base.memory0([125, 165, 25, 35])
+    out = step(base, memory, y=(-50.0, 20.0, -4.0))
+    assert int(out["status"][0]) & 4
+    assert np.all(np.isfinite(out["memory"]))
+
+
+def test_bounds_return_after_a_missing_measurement_where_faults_have_a_range():
+    plant = ob.Plant("tank")
+    (h,) = plant.states("h", range=(10, 100))
+    (v,) = plant.inputs("v", range=(0, 10), nominal=5)
+    plant.actuator_faults("f", of=v, rate=0.01, range=(-2, 2))
+    (w,) = plant.disturbances("w", bound=0.1)
+    plant.dynamics([0.1 * v - 0.1 * h**0.5])
+    plant.outputs([h + w])
+    observer = ob.BoundedErrorUIO().design(plant.discretise("euler", Ts=1.0))
+    memory = observer.memory0([40], x_range=[[30, 50]])
+    lost = step(observer, memory, u=[5], y=[np.nan])
+    assert np.isinf(lost["x_upper"][0])
+    back = step(observer, lost["memory"], u=[5], y=[40.0])
+    assert np.isfinite(back["x_upper"][0])
+    assert back["x_upper"][0] - back["xhat"][0] >= 1.0
+    unsure = np.array(lost["memory"])
+    unsure[observer.memory_layout["fhat"]] = 3.0
+    assert np.isinf(step(observer, unsure, u=[5], y=[40.0])["x_upper"][0])
+
+
+def test_rounding_of_a_step_is_within_its_allowance(base, design, run):
+    """One step in doubles against the same step in exact arithmetic with 60-digit roots."""
+    import sympy as sp
+
+    model = base.model
+    values = model.constant_values
+    rows = [
+        row.subs(dict.fromkeys([s.symbol for s in (*model.d, *model.w)], 0)) for row in model.rhs
+    ]
+    rng = np.random.default_rng(0)
+    layout = base.memory_layout
+    for k in rng.integers(10, 5000, 5):
+        memory = np.zeros(base.step.size1_in(0))
+        z = design.T @ run.xhat[k]
+        memory[layout["z"]], memory[layout["fhat"]] = z, run.fhat[k]
+        memory[layout["initialised"]] = 1.0
+        after = step(base, memory, run.u[k], run.y[k])["memory"]
+        exact = [
+            [sp.Rational(float(v)) for v in row] for row in (z, run.y[k], run.u[k], run.fhat[k])
+        ]
+        E, C, T, K = (
+            sp.Matrix(m).applyfunc(sp.Rational) for m in (design.E, design.C, design.T, design.K)
+        )
+        xhat = sp.Matrix(exact[0]) - E * sp.Matrix(exact[1])
+        point = dict(
+            zip(
+                [s.symbol for s in (*model.x, *model.u, *model.f)],
+                [*xhat, *exact[2], *exact[3]],
+                strict=True,
+            )
+        )
+        next_state = sp.Matrix([row.subs(values).subs(point).evalf(40) for row in rows])
+        true = T * next_state + K * (sp.Matrix(exact[1]) - C * xhat)
+        lost = max(
+            abs(sp.Float(float(a), 40) - b) for a, b in zip(after[layout["z"]], true, strict=True)
+        )
+        assert lost < 1e-3 * design.rounding.min()
+
+
+def test_a_step_without_the_fault_is_not_certified_by_chance(design, base, tank):
+    """Coverage is lost if the deployed step is not the proved one (a sign of F flipped)."""
+    from obsynth.designs.bounded_error.runtime import ellipsoid_runtime
+
+    mutant = build_step(
+        design.plant,
+        design.C,
+        design.W2,
+        design.E,
+        design.T,
+        design.K,
+        -design.F,
+        design.w_centre,
+        design.w_radius,
+        ellipsoid_runtime(design),
+    )
+    run = ob.simulate(tank, replace(base, step=mutant), ob.scenarios.quadruple_tank("FS1"), seed=0)
+    assert min(run.coverage.values()) < 1.0
+
+
+def test_shifted_error_recursion(design, tank_split, run):
+    """zeta = T x - z follows its own recursion, without w_{k+1}."""
+    still = shifted_error(design.data.without_nonlinearity())
+    scale = np.concatenate([design.w_radius, design.rate])
+    kept = [0, 1, 3]
+    gain = np.vstack([design.K[kept], design.F])
+    X, Z = still.Abar[0] - gain @ still.Cbar, (still.Wbar[0] - gain @ still.Vbar) / scale
+    error = run.x - run.xhat
+    zeta = error - run.w @ (design.E @ design.W2).T
+    g = tank_split.g_function().map(len(run.x))
+    s = np.array(g(run.x.T, run.u.T) - g(run.xhat.T, run.u.T)).T
+    xi = np.hstack([zeta[:, kept], run.f - run.fhat])
+    v = np.hstack([run.w[:-1], np.diff(run.f, axis=0)])
+    # column 3 of K and zeta_3 vanish for k >= 1, up to the solver's last digits
+    predicted = (
+        xi[:-1] @ X.T + v @ Z.T + np.hstack([s[:-1] @ design.T.T[:, kept], np.zeros((5000, 2))])
+    )
+    assert np.abs(xi[1:] - predicted)[1:].max() < 1e-4
