@@ -23,7 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.lmi.enclosure import Enclosure
 from obsynth.designs.peak_responses import PowerSum, Response, power_sum, response
-from obsynth.designs.peak_rounding import TINY, add_up, lowered, product_up, raised
+from obsynth.designs.peak_rounding import add_up, lowered, product_up, raised
+from obsynth.designs.peak_small_gain import contraction, small_gain_solution, spectral_radius
 from obsynth.designs.peak_system import PeakSystem, peak_system
 from obsynth.symbolic.errors import ObsynthError
 
@@ -33,14 +34,9 @@ __all__ = [
     "channel_inputs",
     "peak_bound",
     "prove_peak",
-    "small_gain_solution",
-    "spectral_radius",
 ]
 
 FloatArray = NDArray[np.float64]
-
-# Room that the certificate leaves for other orders of summation on other machines.
-SLACK = 2.0**-40
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,47 +311,6 @@ def _sums(
     return _Sums(n=n, G=G, Hw=Hw, He=He, Hp=Hc[:, : len(system.channels)], powers=powers)
 
 
-def small_gain_solution(G: FloatArray, n: FloatArray) -> FloatArray:
-    """Return a b, barely above ``(I - G)^-1 n``, with ``n + G b <= b`` in rounded-up numbers.
-
-    Parameters
-    ----------
-    G : ndarray, shape (n_o, n_o)
-        Nonnegative, spectral radius below one.
-    n : ndarray, shape (n_o,)
-        Nonnegative.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the spectral radius is so near to one that no solution is found.
-
-    Examples
-    --------
-    >>> small_gain_solution(np.array([[0.5]]), np.array([1.0])).round(9).tolist()
-    [2.0]
-    """
-    eye = np.eye(len(n))
-    b = np.maximum(np.linalg.solve(eye - G, n), n)
-    b = np.maximum(np.linalg.solve(eye - G, n + SLACK * b + 64.0 * TINY), n)
-    for _ in range(100):
-        image = add_up(n, product_up(G, b))
-        if np.all(image <= b) and np.all(np.isfinite(b)):
-            return b
-        b = np.maximum(b, image * (1.0 + 2.0**-45))
-    raise InfeasibleDesign(
-        "peak bounds: the small-gain condition holds without a margin that doubles can prove",
-        ["use other gains, or a smaller domain"],
-        rho=spectral_radius(G),
-        G=G,
-    )
-
-
-def spectral_radius(matrix: FloatArray) -> float:
-    """Return the largest absolute eigenvalue as computed."""
-    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
-
-
 def _prove(system: PeakSystem, sums: _Sums, b: FloatArray) -> PeakProof:
     image = add_up(sums.n, product_up(sums.G, b))
     slack = lowered(np.maximum(b - image, 0.0), 2)
@@ -369,7 +324,7 @@ def _prove(system: PeakSystem, sums: _Sums, b: FloatArray) -> PeakProof:
             output=worst,
             shortfall=float(shortfall[worst]),
         )
-    gain = _small_gain(sums.G, b)
+    gain = contraction(sums.G, b)
     if not gain < 1.0:
         raise CertificateError(
             "peak bounds: the spectral radius of G is not proved to be below one",
@@ -382,18 +337,6 @@ def _prove(system: PeakSystem, sums: _Sums, b: FloatArray) -> PeakProof:
         remainder=sums.powers.contraction,
         steps=sums.powers.steps,
     )
-
-
-def _small_gain(G: FloatArray, b: FloatArray) -> float:
-    """Return max (G v)_i / v_i over the outputs that feed back, rounded up."""
-    coupled = np.flatnonzero(np.any(G, axis=0))
-    if coupled.size == 0:
-        return 0.0
-    inner, scale = G[np.ix_(coupled, coupled)], b[coupled]
-    # an output without noise of its own has (G b)_i = b_i, so b itself need not do
-    v = np.linalg.solve(np.eye(coupled.size) - inner, scale)
-    v = np.maximum(v, 2.0**-500 * np.max(np.abs(v)))
-    return float(np.max(raised(product_up(inner, v) / v, 1)))
 
 
 def _inputs(

@@ -28,44 +28,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.lmi.enclosure import Enclosure
 from obsynth.designs.lmi.exact import ExactMatrix
+from obsynth.designs.peak_channels import Channels, split_channels
 from obsynth.designs.peak_rounding import nearest
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["Channels", "PeakSystem", "peak_system", "projected_gains"]
+__all__ = ["PeakSystem", "peak_system", "projected_gains"]
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DATA = (
     *("A", "B_f", "C", "D", "W1", "W2", "E", "K", "F"),
     *("constant", "directions", "ranges", "radius"),
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Channels:
-    """Rank-one uncertainties ``delta_j b_j c_j'``, ``|delta_j| <= r_j``, of the Jacobian.
-
-    Attributes
-    ----------
-    columns : ndarray, shape (n, J)
-        The b_j.
-    rows : ndarray, shape (J, n)
-        The c_j'.
-    radii : ndarray, shape (J,)
-        The r_j, rounded up.
-    source : ndarray of int, shape (J,)
-        Which direction of the affine family a channel comes from. A direction
-        that is not of rank one makes one channel for each of its columns.
-    """
-
-    columns: FloatArray
-    rows: FloatArray
-    radii: FloatArray
-    source: IntArray
-
-    def __len__(self) -> int:
-        return int(self.radii.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +224,7 @@ def peak_system(
         raise ObsynthError("radius has a negative entry; it is a bound of an absolute value")
 
     middle = ranges.mean(axis=1)
-    channels = _channels(directions, ranges, middle)
+    channels = split_channels(directions, ranges, middle)
     of = ExactMatrix.of
     eA, eB, eC, eD, eE, eK, eF, eW1, eW2 = (of(v) for v in (A, B_f, C, D, E, K, F, W1, W2))
     jacobian = of(constant)
@@ -371,39 +345,6 @@ def _blocks(rows: Sequence[Sequence[ExactMatrix]]) -> Enclosure:
 def _magnitude(value: Enclosure) -> FloatArray:
     total: FloatArray = np.abs(value.mid) + value.rad
     return np.where(value.rad > 0, np.nextafter(total, np.inf), total)
-
-
-def _channels(directions: FloatArray, ranges: FloatArray, middle: FloatArray) -> Channels:
-    n = directions.shape[-1]
-    columns, rows, radii, source = [], [], [], []
-    half = np.maximum(ranges[:, 1] - middle, middle - ranges[:, 0])
-    for k, direction in enumerate(directions):
-        if ranges[k, 0] == ranges[k, 1] or not np.any(direction):
-            continue
-        for column, row in _rank_one_parts(direction):
-            columns.append(column)
-            rows.append(row)
-            radii.append(np.nextafter(half[k], np.inf))
-            source.append(k)
-    return Channels(
-        columns=np.array(columns).reshape(-1, n).T,
-        rows=np.array(rows).reshape(-1, n),
-        radii=np.array(radii),
-        source=np.array(source, dtype=np.int64),
-    )
-
-
-def _rank_one_parts(direction: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Split a matrix into b c' without rounding: one part where that is exact, else columns."""
-    i, j = np.unravel_index(np.argmax(np.abs(direction)), direction.shape)
-    column, row, pivot = direction[:, j], direction[i], direction[i, j]
-    given = ExactMatrix.of(direction).to_fractions()
-    for left, right in ((column, row / pivot), (column / pivot, row)):
-        product = ExactMatrix.of(left[:, None]) @ ExactMatrix.of(right[None, :])
-        if product.to_fractions() == given:
-            return [(left, right)]
-    eye = np.eye(direction.shape[1])
-    return [(direction[:, k], eye[k]) for k in np.flatnonzero(np.any(direction, axis=0))]
 
 
 def _outputs(channels: Channels, n: int, n_f: int) -> tuple[FloatArray, FloatArray]:

@@ -26,14 +26,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.lmi.enclosure import UNIT_ROUNDOFF, Enclosure
-from obsynth.designs.peak_bound import (
-    PeakBound,
-    channel_inputs,
-    small_gain_solution,
-    spectral_radius,
-)
+from obsynth.designs.peak_bound import PeakBound, channel_inputs
 from obsynth.designs.peak_responses import Response, power_sum, response
 from obsynth.designs.peak_rounding import add_up, lowered, product_up, raised
+from obsynth.designs.peak_small_gain import small_gain_solution, spectral_radius
 from obsynth.designs.peak_system import PeakSystem, peak_system
 from obsynth.symbolic.errors import ObsynthError
 
