@@ -10,6 +10,7 @@ its small-gain argument may give away at most.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ def _vertices(peak: PeakBound) -> FloatArray:
     weight = np.zeros(len(middle))
     np.add.at(weight, channels.source, np.sum(peak.Hp / peak.b[:, None], axis=0) * channels.radii)
     free = np.sort(np.argsort(-weight)[: min(MOST_FREE, np.count_nonzero(weight))])
-    corners = np.indices((2,) * len(free)).reshape(len(free), -1).T
+    corners = np.array(list(product((0, 1), repeat=len(free))), dtype=np.int64)
     schedules = np.tile(middle, (len(corners), 1))
     schedules[:, free] = system.ranges[free, corners]
     return schedules
