@@ -93,6 +93,7 @@ def solve_form(
         solved=status == "Solved",
         infeasible=status == "PrimalInfeasible",
         objective=form.sign * raw.obj_val + form.constant,
+        gap=abs(raw.obj_val - raw.obj_val_dual) / max(1.0, abs(raw.obj_val)),
         solver="Clarabel",
         solve_time=raw.solve_time,
         iterations=raw.iterations,

@@ -203,9 +203,9 @@ class Affine:
     def _take(self, numbers: NDArray[np.intp]) -> Affine:
         rows = _stack(numbers)
         picked = _stack(self.constant)[rows]
-        return Affine(
-            _unstack(picked, numbers.shape), {v: op[rows] for v, op in self.terms.items()}
-        )
+        terms = {v: op[rows] for v, op in self.terms.items()}
+        kept = {v: op for v, op in terms.items() if op.nnz}
+        return Affine(_unstack(picked, numbers.shape), kept)
 
     def _broadcast(self, shape: tuple[int, ...]) -> Affine:
         if self.constant.shape == shape:

@@ -33,6 +33,10 @@ _MARGIN = "margin.t"
 # Below this the margin is no more than the accuracy of a solver.
 _LEAST_MARGIN = 1e-9
 
+# An answer that the solver does not call solved serves if it is within this of the optimum and
+# keeps half the margin: whether it is feasible is decided by the proof, not by the solver.
+_GAP = 1e-4
+
 # Shares of the phase 1 point that are mixed in, one after the other, until the proof holds.
 _BACK_OFF = (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
 
@@ -277,15 +281,23 @@ def _phase_one(problem: Problem) -> Solution:
     return solve_with_retries(problem, good_enough=lambda s: _measured(problem, s) > _LEAST_MARGIN)
 
 
+def _nearly_optimal(problem: Problem, solution: Solution, kept: float) -> bool:
+    return solution.gap < _GAP and _lowest(problem, solution) > -0.5 * kept
+
+
 def _measured(problem: Problem, solution: Solution) -> float:
     """Smallest eigenvalue of the strict blocks at a point, their margin added back."""
-    least = float(solution.values[_MARGIN].item())
+    return float(solution.values[_MARGIN].item()) + _lowest(problem, solution)
+
+
+def _lowest(problem: Problem, solution: Solution) -> float:
+    """Smallest eigenvalue of the strict blocks as stated."""
     lowest = np.inf
     for item in problem.blocks.values():
         if item.cone == "psd" and item.strict:
             matrices = solution.value(item.expression)
             lowest = min(lowest, float(np.linalg.eigvalsh(matrices).min()))
-    return least + lowest
+    return lowest
 
 
 def _phase_one_floor(solution: Solution) -> float:
@@ -309,6 +321,9 @@ def _phase_two(
             tight,
             start=margin.found.chosen,
             floor=-0.5 * kept,
+            solve=lambda stated: solve_with_retries(
+                stated, good_enough=lambda solution: _nearly_optimal(stated, solution, kept)
+            ),
         )
     except InfeasibleDesign as trouble:
         raise SolverTrouble(

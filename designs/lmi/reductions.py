@@ -226,17 +226,36 @@ def _convex_combination(
     points: NDArray[np.float64], row: int, others: list[int]
 ) -> dict[int, Fraction] | None:
     """Exact weights of other rows that give a row, or None."""
+    candidates = [others]
+    while candidates:
+        allowed = candidates.pop(0)
+        support, columns, target = _support(points, row, allowed)
+        if not support:
+            continue
+        weights = _exact_weights(columns, target, support)
+        if weights is not None:
+            return weights
+        # Rounding spoils this combination; another one may be exact.
+        if allowed is others:
+            candidates = [[i for i in others if i != k] for k in support]
+    return None
+
+
+def _support(
+    points: NDArray[np.float64], row: int, others: list[int]
+) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+    """Few rows of which a row is a convex combination up to rounding, none if there are none."""
     from scipy.optimize import linprog
 
-    if len(others) < 2:
-        return None
     target = np.append(points[row], 1.0)
     columns = np.vstack([points[others].T, np.ones(len(others))])
+    if len(others) < 2:
+        return [], columns, target
     found = linprog(np.zeros(len(others)), A_eq=columns, b_eq=target, method="highs-ds")
     if not found.success:
-        return None
-    support = np.flatnonzero(found.x > 1e-12)
-    return _exact_weights(columns[:, support], target, [others[i] for i in support])
+        return [], columns, target
+    used = np.flatnonzero(found.x > 1e-12)
+    return [others[i] for i in used], columns[:, used], target
 
 
 def _exact_weights(

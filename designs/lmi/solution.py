@@ -28,6 +28,9 @@ class Solution:
         True only where the solver reports infeasibility to full accuracy.
     objective : float
         In the sense of the problem (what was minimised or maximised).
+    gap : float
+        Difference to the dual objective, relative to the objective where that is above one;
+        inf where the solver does not tell.
     solver : str
         Name of the solver.
     solve_time : float
@@ -43,6 +46,7 @@ class Solution:
     solved: bool
     infeasible: bool
     objective: float
+    gap: float
     solver: str
     solve_time: float
     iterations: int = 0

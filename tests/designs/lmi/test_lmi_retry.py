@@ -1,0 +1,114 @@
+"""Solver trouble: scaled, handed to a second solver, and told."""
+
+import numpy as np
+import pytest
+
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi import Problem, retry, solve_with_retries, symmetric, trace
+from obsynth.designs.lmi.cones import conic_form
+from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy
+
+
+def problem():
+    scale = np.diag([1.0, 1e4, 1e-3])
+    A = np.linalg.inv(scale) @ (np.diag([0.5, 0.4, 0.3]) + 0.1) @ scale
+    P = symmetric("P", 3)
+    stated = Problem("badly scaled")
+    stated.add("decay", P - A.T @ P @ A >> scale @ scale)
+    stated.minimise(trace(P))
+    return stated
+
+
+def test_scaling_keeps_the_problem():
+    stated = problem()
+    form = conic_form(stated)
+    scaled, columns, rows = retry.rescaled(form)
+    assert np.abs(np.log2(columns) - np.round(np.log2(columns))).max() == 0
+    spread = abs(form.A).max() / abs(form.A.data).min()
+    assert abs(scaled.A).max() / abs(scaled.A.data).min() < 1e-3 * spread
+    plain = retry.solve_form(form, stated, {})
+    other = retry.solve_form(scaled, stated, {}, columns=columns, rows=rows)
+    assert other.solved
+    # The second state has the unit 1e-4: its entry of P carries the objective.
+    assert other.objective == pytest.approx(plain.objective, rel=1e-2)
+    decay = stated.blocks["decay"].expression
+    inner = np.sum(other.value(decay) * other.duals["decay"])
+    assert abs(inner) < 1e-5 * abs(other.objective)
+    assert np.linalg.eigvalsh(other.duals["decay"])[0] > -1e-9
+
+
+def stubborn(monkeypatch, fails):
+    """Let the first attempts of Clarabel run out of iterations."""
+    calls = []
+    whole = retry.solve_form
+
+    def limited(form, stated, settings, **scales):
+        calls.append(form)
+        if len(calls) <= fails:
+            settings = {**settings, "max_iter": 2}
+        return whole(form, stated, settings, **scales)
+
+    monkeypatch.setattr(retry, "solve_form", limited)
+    return calls
+
+
+def test_the_scaled_problem_is_tried_second(monkeypatch):
+    calls = stubborn(monkeypatch, 1)
+    solution = solve_with_retries(problem())
+    assert len(calls) == 2 and solution.solved
+    assert solution.attempts == ("Clarabel: MaxIterations", "Clarabel, scaled: Solved")
+
+
+def test_another_solver_is_tried_third(monkeypatch):
+    pytest.importorskip("scs")
+    stubborn(monkeypatch, 2)
+    P = symmetric("P", 2)
+    easy = Problem("easy")
+    easy.add("floor", P >> np.eye(2))
+    easy.minimise(trace(P))
+    solution = solve_with_retries(easy, second_solvers=("NO SUCH SOLVER", "SCS"))
+    assert solution.solver == "SCS" and solution.objective == pytest.approx(2.0, abs=1e-3)
+    assert solution.attempts[2] == "NO SUCH SOLVER: not installed"
+
+
+def test_when_all_fail_every_attempt_is_told(monkeypatch):
+    stubborn(monkeypatch, 2)
+    with pytest.raises(SolverTrouble, match="badly scaled") as caught:
+        solve_with_retries(problem(), second_solvers=())
+    assert len(caught.value.attempts) == 2 and "MaxIterations" in str(caught.value)
+
+
+def test_an_answer_good_enough_ends_the_attempts(monkeypatch):
+    stubborn(monkeypatch, 2)
+    solution = solve_with_retries(problem(), good_enough=lambda solution: True)
+    assert not solution.solved and len(solution.attempts) == 1
+
+
+def infeasible():
+    P = symmetric("P", 2)
+    stated = Problem("empty")
+    stated.add("low", P << -np.eye(2))
+    stated.add("high", P >> np.eye(2))
+    stated.minimise(trace(P))
+    return stated
+
+
+def test_infeasibility_is_final():
+    with pytest.raises(InfeasibleDesign, match="empty") as caught:
+        solve_with_retries(infeasible())
+    assert caught.value.attempts == ("Clarabel: PrimalInfeasible",)
+    with pytest.raises(InfeasibleDesign, match="empty"):
+        solve_with_cvxpy(infeasible(), "CLARABEL")
+
+
+@pytest.mark.parametrize("name", ["SDPA", "SCS"])
+def test_second_solvers_agree_with_clarabel(name):
+    pytest.importorskip({"SDPA": "sdpap", "SCS": "scs"}[name])
+    A = np.array([[0.7, 0.3], [-0.2, 0.6]])
+    P = symmetric("P", 2)
+    stated = Problem("Lyapunov")
+    stated.add("decay", P - A.T @ P @ A >> np.eye(2))
+    stated.minimise(trace(P))
+    other = solve_with_cvxpy(stated, name)
+    assert other.objective == pytest.approx(stated.solve().objective, rel=1e-3)
+    assert other.solver == name

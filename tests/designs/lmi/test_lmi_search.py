@@ -1,0 +1,78 @@
+"""Bisection, line search, the smallest change that helps."""
+
+import pytest
+
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi import Knob, bisect_feasible, search_line, smallest_changes
+from obsynth.symbolic.errors import ObsynthError
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+def test_bisection_brackets_the_limit_with_few_evaluations(logarithmic):
+    limit = 0.00903
+    found = bisect_feasible(lambda g: g <= limit, 1e-5, 0.2, rtol=1e-4, logarithmic=logarithmic)
+    assert found.feasible <= limit < found.infeasible
+    assert found.infeasible - found.feasible <= 1e-4 * found.infeasible
+    assert found.evaluations < 40
+
+
+def test_bisection_knows_both_ends():
+    assert bisect_feasible(lambda g: True, 0.0, 1.0).feasible == 1.0
+    assert bisect_feasible(lambda g: True, 0.0, 1.0).infeasible is None
+    assert bisect_feasible(lambda g: False, 0.0, 1.0) is None
+    # From below and from above.
+    found = bisect_feasible(lambda g: g >= 3.0, 10.0, 0.0, rtol=1e-5)
+    assert found.feasible == pytest.approx(3.0, rel=1e-4) and found.feasible >= 3.0
+    with pytest.raises(ObsynthError, match="positive"):
+        bisect_feasible(lambda g: True, 0.0, 1.0, logarithmic=True)
+
+
+def test_a_limit_at_zero_ends():
+    found = bisect_feasible(lambda g: g <= 0.0, 0.0, 1.0, rtol=1e-3)
+    assert found.feasible == 0.0 and found.evaluations < 40
+
+
+def design(value):
+    if value > 0.8:
+        raise InfeasibleDesign("no room")
+    if value < 0.05:
+        raise SolverTrouble("stuck")
+    return value
+
+
+def cost(value):
+    return (value - 0.37) ** 2 + 1.0
+
+
+def test_the_line_search_refines_around_the_best_value():
+    grid = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    found = search_line(design, cost, grid, refine=15)
+    assert found.value == pytest.approx(0.37, abs=2e-3)
+    assert found.result == found.value and found.objective == cost(found.value)
+    assert len(found.tried) == len(grid) + 15
+    assert dict(found.tried)[1.0] == float("inf")
+
+
+@pytest.mark.long
+def test_the_grid_can_run_in_processes():
+    found = search_line(design, cost, [0.1, 0.3, 0.5], jobs=2)
+    assert found.value == 0.3
+
+
+def test_a_search_without_a_design_says_what_happened():
+    with pytest.raises(InfeasibleDesign, match="gamma") as caught:
+        search_line(design, cost, [0.01, 0.9], name="gamma")
+    assert "stuck" in str(caught.value) and "no room" in str(caught.value)
+
+
+def test_changes_are_listed_and_what_does_not_help_is_said():
+    lines = smallest_changes(
+        [
+            Knob("gamma", 0.01, 1e-4, lambda g: g < 0.00903),
+            Knob("box of h3", 47.5, 0.0, lambda w: w < 30.0, unit="cm"),
+            Knob("noise", 0.1, 0.0, lambda w: False),
+        ]
+    )
+    assert lines[0].startswith("gamma: 0.01 is infeasible, 0.00")
+    assert "29." in lines[1] and "cm" in lines[1]
+    assert "does not enter feasibility" in lines[2]
