@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.dependence import AffineDependence
+from obsynth.derive.errors import DerivationError
 from obsynth.derive.exact import round_number
 
 __all__ = ["AffineFamily", "build_family"]
@@ -15,6 +16,7 @@ __all__ = ["AffineFamily", "build_family"]
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _UNIT = 2.0**-53
+_MOST_SCALARS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,11 @@ class AffineFamily:
         """Half widths of the ranges, shape (K,)."""
         return 0.5 * (self.ranges[:, 1] - self.ranges[:, 0])
 
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, without making them."""
+        return 1 << int((self.ranges[:, 1] > self.ranges[:, 0]).sum())
+
     def at(self, scalars: Sequence[float] | Array) -> Array:
         """Matrix for given scalars.
 
@@ -90,7 +97,19 @@ class AffineFamily:
         ndarray, shape (N, n, k)
             N = 2^K for K scalars with a range of positive width, the last scalar fastest, lower
             end first.
+
+        Raises
+        ------
+        DerivationError
+            More than 2^16 vertices.
         """
+        if self.vertex_count > 2**_MOST_SCALARS:
+            raise DerivationError(
+                f"the family has {self.vertex_count} vertices, more than a polytopic design can "
+                f"use; fix or drop some of the {len(self.ranges)} scalars, or use the entrywise "
+                "bounds",
+                vertices=self.vertex_count,
+            )
         ends = [sorted(set(pair)) for pair in self.ranges.tolist()]
         corners = [self.at(corner) for corner in product(*ends)]
         return np.array(corners).reshape(-1, *self.constant.shape)

@@ -79,9 +79,10 @@ def _monomials(entry: sp.Expr, variables: set[sp.Symbol]) -> dict[sp.Expr, sp.Ex
     return found
 
 
-def _preferred(entry: Entry) -> tuple[bool, int, int]:
-    """Diagonal entries first: their ranges are the ones a reader looks for."""
-    return (entry[0] != entry[1], entry[0], entry[1])
+def _preferred(entry: Entry, expression: sp.Expr, variables: set[sp.Symbol]) -> tuple[int, ...]:
+    """Few variables first, since such scalars are independent; then the diagonal."""
+    count = len(expression.free_symbols & variables)
+    return (count, int(entry[0] != entry[1]), *entry)
 
 
 def _solve(
@@ -145,11 +146,13 @@ def find_dependences(
     ([(0, 0)], 'm21 = -2 m11 + 3: both depend on x only; difference proved zero (syntactic)')
     """
     known = set(variables)
+    if any(len(values) <= len(entries) for values in samples.values()):
+        return sorted(entries), []
     basis: list[Entry] = []
     columns: list[Array] = []
     dependences: list[AffineDependence] = []
     parts = {entry: _monomials(expression, known) for entry, expression in entries.items()}
-    for entry in sorted(entries, key=_preferred):
+    for entry in sorted(entries, key=lambda e: _preferred(e, entries[e], known)):
         expression = entries[entry]
         centred = samples[entry] - samples[entry].mean()
         size = float(np.linalg.norm(centred))

@@ -9,6 +9,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.affine_family import AffineFamily, build_family
+from obsynth.derive.continuity import refuse_jumps
 from obsynth.derive.dependence import AffineDependence, find_dependences
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.exact import enclose_number, rational, substitute
@@ -73,7 +74,7 @@ class JacobianBounds:
         return self.family.radius
 
     def __str__(self) -> str:
-        count = len(self.vertices())
+        count = self.family.vertex_count
         kind = "exact" if self.family.exact else "outer"
         lines = [
             f"{int((self.max > self.min).sum())} varying entries, {count} vertices ({kind}) "
@@ -101,7 +102,7 @@ class JacobianBounds:
         kind = "exact" if self.family.exact else "outer"
         return (
             "<table><tr><th>entry</th><th>min</th><th>max</th><th>gap</th><th>status</th></tr>"
-            f"{rows}</table><p>{len(self.vertices())} vertices ({kind}) in place of "
+            f"{rows}</table><p>{self.family.vertex_count} vertices ({kind}) in place of "
             f"{self.naive_vertex_count}</p><ul>{reasons}</ul>"
         )
 
@@ -194,7 +195,9 @@ def _sample(entries: _Entries) -> dict[tuple[int, int], Array]:
     middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
     function = ca.Function("sample", [entries.variables, entries.constants], [entries.values])
     result = np.array(function(points.T, np.tile(middle[:, None], (1, _SAMPLES))))
-    return dict(zip(entries.places, result, strict=True))
+    # points outside the domain of some entry say nothing about dependences
+    usable = np.isfinite(result).all(axis=0)
+    return dict(zip(entries.places, result[:, usable], strict=True))
 
 
 def _refuse(entries: _Entries, ranges: Ranges, what: str) -> None:
@@ -254,6 +257,8 @@ def jacobian_bounds(
 
     Raises
     ------
+    StructureError
+        The dynamics jump inside the box.
     UnboundedError
         An entry has no finite bound over the box; entry, operation and sub-box are named.
     DerivationError
@@ -272,7 +277,7 @@ def jacobian_bounds(
         raise DerivationError(f"wrt={wrt!r} is not known; choose 'states' or 'inputs'", wrt=wrt)
     part = split_or_model if isinstance(split_or_model, Split) else None
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
-    model.check()
+    refuse_jumps(model.check())
     entries = _collect(model, part, wrt)
     ranges = bound_ranges(
         entries.values,

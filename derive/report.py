@@ -8,9 +8,10 @@ from typing import TypeVar
 import numpy as np
 
 from obsynth.derive.equilibrium import Equilibrium
+from obsynth.derive.faults import invariant_zeros, separable_faults
 from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.split import Split, split
-from obsynth.derive.structure import detectability, separable_faults, unknown_input_condition
+from obsynth.derive.structure import detectability, unknown_input_condition
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
 
@@ -168,8 +169,7 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
     family = bounds
     kind = "exact" if family.family.exact else "outer"
     reasons = "\n".join(str(d) for d in family.dependences if d.coefficients)
-    count = len(family.vertices())
-    text = f"{count} ({kind}) in place of {family.naive_vertex_count}"
+    text = f"{family.family.vertex_count} ({kind}) in place of {family.naive_vertex_count}"
     notes.inform("vertices", text + (f":\n{reasons}" if reasons else ""))
     if decoupling is not None:
         notes.step("detectability", lambda: _detect(found, family))
@@ -226,6 +226,10 @@ def _detect(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:
 def _separate(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:
     apart, rank, signals = separable_faults(part, bounds.family.midpoint)
     names = part.model.names("f")
+    zeros = invariant_zeros(part, bounds.family.midpoint)
+    if signals <= len(part.C):
+        listed = ", ".join(f"{z.real:.6g}" if z.imag == 0 else f"{z:.6g}" for z in zeros)
+        notes.inform("invariant zeros", listed or "none, from faults and unknown inputs to outputs")
     if len(apart) == len(names):
         text = f"{', '.join(names)} can be told apart (rank {rank} of {signals})"
         notes.checks.append(Check("faults", True, text))

@@ -1,5 +1,6 @@
 """A plant as constant matrices plus a nonlinearity, with the proof that they add up."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -51,9 +52,14 @@ class IdentityProof:
 
     def __str__(self) -> str:
         worst = max((float(e.max(initial=0.0)) for e in self.rounding.values()), default=0.0)
-        rows = ", ".join(f"row {k + 1}: {m or 'not proved'}" for k, m in enumerate(self.methods))
+        ways = ", ".join(sorted(set(self.methods) - {""}))
+        missing = [str(k + 1) for k, method in enumerate(self.methods) if not method]
+        rows = f"all {len(self.methods)} rows: {ways}"
+        if missing:
+            rows = f"rows {', '.join(missing)} not proved"
         return (
-            f"parts add up to the plant exactly ({rows}); largest rounding of a matrix {worst:.2g}"
+            f"the parts add up to the plant exactly ({rows}); "
+            f"largest rounding of a matrix entry {worst:.2g}"
         )
 
 
@@ -128,6 +134,45 @@ class Split:
         value = ca.vertcat(*to_sx(list(self.g), symbols, labels))
         return ca.Function("g", columns, [value], kinds, ["g"])
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what is needed to derive the split again, as JSON-able data.
+
+        Returns
+        -------
+        dict
+            The plant, the form and the point of operation; no matrices, since reading them back
+            would bypass the proof.
+        """
+        at = {"x": self.at.x.tolist(), "u": self.at.u.tolist()}
+        return {"plant": self.model.to_dict(), "linear": self.linear, "at": at}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Split":
+        """Derive a split again from what `to_dict` returned.
+
+        Parameters
+        ----------
+        data : mapping
+            From `to_dict`, possibly through a file.
+
+        Returns
+        -------
+        Split
+            Equal to the original to the last bit, with a proof of its own.
+
+        Raises
+        ------
+        DerivationError
+            Data without a plant, a form or a point.
+        """
+        try:
+            model, at = Plant.from_dict(data["plant"]), data["at"]
+            return split(model, (at["x"], at["u"]), data["linear"])
+        except (KeyError, TypeError) as error:
+            raise DerivationError(
+                f"this is no stored split: {error} is missing or wrong"
+            ) from error
+
     def _repr_latex_(self) -> str:
         short = self.g.applyfunc(lambda e: e.evalf(6))
         return f"$\\displaystyle g = {sp.latex(short)}$"
@@ -185,6 +230,16 @@ def _check_outputs(model: Plant) -> None:
                 "in states and disturbances with constant coefficients",
                 symbol=str(symbol),
                 row=name,
+            )
+        signals = [s.symbol for kind in ("x", "w", "f") for s in getattr(model, kind)]
+        rest = substitute(row, model.constant_values).subs(dict.fromkeys(signals, 0))
+        if not is_zero(rest):
+            raise StructureError(
+                f"the output {name} has the constant part {rest}; leave it out of the output and "
+                "subtract it from the measurement",
+                symbol=name,
+                row=name,
+                offset=rest,
             )
 
 

@@ -14,7 +14,6 @@ __all__ = [
     "Detectability",
     "augmented_pair",
     "detectability",
-    "separable_faults",
     "unknown_input_condition",
 ]
 
@@ -302,49 +301,3 @@ def _undetectable(
         vertex=M,
         vertex_index=index,
     )
-
-
-def separable_faults(split: Split, M: Array) -> tuple[tuple[str, ...], int, int]:
-    """Faults that can be told apart from all others and from unknown inputs.
-
-    The normal rank of the transfer matrix from unknown inputs and faults to the outputs is taken
-    at a few fixed points off the axes, where a rank below it has probability zero.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    M : ndarray, shape (n, n)
-        Matrix of the Jacobian family at which the plant is frozen.
-
-    Returns
-    -------
-    names : tuple of str
-        Faults whose effect is no combination of the effects of the others.
-    rank : int
-        Normal rank of the transfer matrix.
-    signals : int
-        Number of unknown inputs and faults.
-    """
-    names = split.model.names("f")
-    q, n_f = split.D.shape[1], len(names)
-    inputs = np.hstack([split.D, split.B_f])
-    direct = np.hstack([np.zeros((len(split.C), q)), split.D_f])
-
-    def rank(columns: list[int]) -> int:
-        found = 0
-        for z in (1.37 + 0.61j, -0.83 + 1.29j):
-            pencil = z * np.eye(len(split.A)) - split.A - M
-            transfer = split.C @ np.linalg.solve(pencil, inputs[:, columns]) + direct[:, columns]
-            size = np.linalg.norm(transfer, axis=0)
-            scaled = transfer / np.where(size > 0.0, size, 1.0)
-            if scaled.size:
-                found = max(found, int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE)))
-        return found
-
-    every = list(range(q + n_f))
-    whole = rank(every)
-    apart = tuple(
-        name for k, name in enumerate(names) if rank([c for c in every if c != q + k]) < whole
-    )
-    return apart, whole, q + n_f

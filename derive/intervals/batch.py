@@ -93,12 +93,15 @@ class RowRanges:
     slope_lower, slope_upper : ndarray, shape (v, N)
         Enclosure of the gradient; the whole line where the expression may jump or be undefined
         in the box, zero where no gradient was asked for.
+    rough : ndarray of bool, shape (N,)
+        Where the expression may jump or be undefined in the box.
     """
 
     lower: Array
     upper: Array
     slope_lower: Array
     slope_upper: Array
+    rough: Mask
 
 
 def _batches(
@@ -145,13 +148,14 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
     entry = rows.goal // 2
     lo, hi = np.empty(n), np.empty(n)
     slope_lo, slope_hi = np.zeros((v, n)), np.zeros((v, n))
+    rough = np.zeros(n, dtype=bool)
     for chosen, index, entries in _batches(problem, entry, slopes):
         found = enclose(
             problem.program,
             rows.lower[:, index],
             rows.upper[:, index],
             chosen,
-            len(entries) if slopes else 0,
+            len(entries),
         )
         position = {k: row for row, k in enumerate(chosen)}
         for e in entries:
@@ -159,13 +163,14 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
             inside = np.flatnonzero(entry[index] == e)
             target = index[inside]
             lo[target], hi[target] = found.lower[row, inside], found.upper[row, inside]
+            rough[target] = found.rough[row, inside]
             if not slopes:
                 continue
             for j, k in enumerate(problem.gradient[e].tolist()):
                 if k >= 0:
                     slope_lo[j, target] = found.lower[position[k], inside]
                     slope_hi[j, target] = found.upper[position[k], inside]
-            touched = np.ix_(problem.relevant[e], target[found.rough[row, inside]])
+            touched = np.ix_(problem.relevant[e], target[rough[target]])
             slope_lo[touched], slope_hi[touched] = -np.inf, np.inf
     low = rows.goal % 2 == 0
     return RowRanges(
@@ -173,6 +178,7 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
         np.where(low, -lo, hi),
         np.where(low, -slope_hi, slope_lo),
         np.where(low, -slope_lo, slope_hi),
+        rough,
     )
 
 

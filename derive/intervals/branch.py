@@ -107,7 +107,9 @@ class _Search:
         """Evaluate at points (boxes without width), remember the best of every goal."""
         found = enclose_rows(self.problem, rows, slopes=False)
         usable = np.isfinite(found.lower) & np.isfinite(found.upper)
-        np.maximum.at(self.noise, rows.goal[usable], (found.upper - found.lower)[usable])
+        # at a tie or a jump the width is the hull of several values, not what rounding costs
+        smooth = usable & ~found.rough
+        np.maximum.at(self.noise, rows.goal[smooth], (found.upper - found.lower)[smooth])
         order = np.flatnonzero(usable)[np.argsort(found.lower[usable], kind="stable")]
         # later assignments win, so the largest value of every goal is the one that stays
         better = order[found.lower[order] > self.best[rows.goal[order]]]

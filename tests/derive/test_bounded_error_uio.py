@@ -50,7 +50,7 @@ def sampled_points(count, seed=0):
     return low + np.random.default_rng(seed).random((count, 4)) * (high - low)
 
 
-# -- equilibrium and matrices ----------------------------------------------------------------
+# -- equilibrium and matrices ------------------------------------------------------------------
 
 
 def test_equilibrium_of_section_6(model, reference):
@@ -170,7 +170,7 @@ def test_printed_bounds_are_forward_differences_of_one_centimetre(bounds, refere
     assert reference["FDmax"][0, 2] < 0.8 * bounds.max[0, 2]
 
 
-# -- vertices ------------------------------------------------------------------------------------
+# -- vertices ----------------------------------------------------------------------------------
 
 
 def test_sixteen_exact_vertices_in_place_of_64(bounds):
@@ -250,7 +250,7 @@ def test_tanks_of_different_areas_scale_the_dependence(tanks):
     assert 0.0 < found.family.radius[0, 2] < 1e-15
 
 
-# -- structure -------------------------------------------------------------------------------------
+# -- structure ---------------------------------------------------------------------------------
 
 
 def test_decoupling_matrices_as_printed(parts):

@@ -170,7 +170,7 @@ def test_trusting_the_derivative_across_a_jump_is_caught(exactly, monkeypatch):
     assert wrong_bounds(exactly, jumps, box)
 
 
-# -- cases with known answers --------------------------------------------------------------------
+# -- cases with known answers ------------------------------------------------------------------
 
 
 def one(expression, box=UNIT, **options):

@@ -192,7 +192,7 @@ def test_library_is_within_half_of_the_allowed_ulps(name):
     assert max(errors) <= functions.ULPS / 2
 
 
-# -- rules at their edges ------------------------------------------------------------------------
+# -- rules at their edges ----------------------------------------------------------------------
 
 
 def interval(lo, hi):
