@@ -1,1 +1,28 @@
 """What it is worth: simulation, coverage, plots, report."""
+
+from obsynth.evaluate.domain import Domain, StatusCount
+from obsynth.evaluate.errors import ReportError, SimulationError
+from obsynth.evaluate.interface import StepObserver
+from obsynth.evaluate.plots import plot_errors, plot_run, plot_signal, plot_widths
+from obsynth.evaluate.report import report
+from obsynth.evaluate.run import Run, Trace, Violation
+from obsynth.evaluate.simulate import simulate
+from obsynth.evaluate.table import Table
+
+__all__ = [
+    "Domain",
+    "ReportError",
+    "Run",
+    "SimulationError",
+    "StatusCount",
+    "StepObserver",
+    "Table",
+    "Trace",
+    "Violation",
+    "plot_errors",
+    "plot_run",
+    "plot_signal",
+    "plot_widths",
+    "report",
+    "simulate",
+]

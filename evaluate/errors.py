@@ -1,0 +1,13 @@
+"""Refusals of the evaluation room."""
+
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["ReportError", "SimulationError"]
+
+
+class SimulationError(ObsynthError):
+    """A simulation that cannot be started or whose truth is no number any more."""
+
+
+class ReportError(ObsynthError):
+    """A table, plot or page that cannot be made from what was given."""

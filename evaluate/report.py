@@ -1,0 +1,362 @@
+"""One self-contained page: what was derived, designed, proved, simulated and shipped."""
+
+import html
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from obsynth.evaluate.equations import constants_html, equations_html, signals_table
+from obsynth.evaluate.errors import ReportError
+from obsynth.evaluate.layout import panels
+from obsynth.evaluate.plots import plot_errors, plot_run, plot_widths
+from obsynth.evaluate.run import Run, percent
+from obsynth.evaluate.style import style
+from obsynth.evaluate.svg import figure_svg
+from obsynth.evaluate.table import Table, text
+
+if TYPE_CHECKING:
+    from obsynth.designs.observer import Observer
+    from obsynth.symbolic import Plant
+
+__all__ = ["report"]
+
+Tables = Table | Sequence[Table]
+
+
+@dataclass
+class _Section:
+    """A heading with the pieces of HTML below it."""
+
+    key: str
+    title: str
+    parts: list[str] = field(default_factory=list)
+
+    def add(self, *parts: str) -> None:
+        self.parts += [part for part in parts if part]
+
+
+def report(
+    path: str | os.PathLike[str],
+    observer: "Observer | Mapping[str, Observer]",
+    runs: Run | Sequence[Run] | Mapping[str, Run | Sequence[Run]] = (),
+    tables: Tables | Mapping[str, Tables] = (),
+    *,
+    title: str | None = None,
+    lead: str = "",
+    highlights: Mapping[str, str] | None = None,
+    half_widths: Mapping[str, Any] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Path:
+    """Write one HTML page that needs nothing but a browser.
+
+    Figures and formulas are inline SVG and follow the reader's light or dark
+    mode; the page prints in light. An existing file is replaced only when the
+    new page is complete.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to write; its folder has to exist.
+    observer : Observer or mapping of label to Observer
+        The designs; the first one's plant is the page's plant.
+    runs : Run, sequence of Run, or mapping of design label to runs
+        Coverage of all of them is tabulated. The first run of each scenario and
+        design is plotted, and the errors of all designs in one figure.
+    tables : Table, sequence of Table, or mapping of heading to tables
+        More tables. The headings ``"Plant"``, ``"Derived bounds"``,
+        ``"Design and certificate"``, ``"Half widths"``, ``"Simulation"`` and
+        ``"C code"`` put them into the page's own sections, others make new ones.
+    title : str, optional
+        Heading of the page; the plant's name by default.
+    lead : str
+        One paragraph below the heading.
+    highlights : mapping of label to value, optional
+        Figures to show large at the top; by default what the page knows.
+    half_widths : mapping of label to (n_x + n_f,), optional
+        Half widths for the bar plot, for instance ``{"paper": ..., "peak": ...}``;
+        by default those of the observers.
+    progress : callable, optional
+        Called with a word before each figure is drawn.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    ReportError
+        If there is no observer, or the folder does not exist.
+
+    Examples
+    --------
+    >>> report("report.html", observer, runs=[run])      # doctest: +SKIP
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise ReportError(f"the folder {str(target.parent)!r} does not exist.", path=str(target))
+    observers = _labelled_observers(observer)
+    labelled = _labelled_runs(runs)
+    extra = _labelled_tables(tables)
+    say = progress or (lambda word: None)
+    first = next(iter(observers.values()))
+    plant = first.model
+    widths = _half_widths(observers) if half_widths is None else dict(half_widths)
+    sections = [
+        _plant_section(plant),
+        _Section("bounds", "Derived bounds"),
+        _design_section(observers),
+        _width_section(plant, widths, say),
+        _run_section(labelled, say),
+        _Section("code", "C code"),
+    ]
+    known = {section.title: section for section in sections}
+    for heading, several in extra.items():
+        if heading not in known:
+            known[heading] = _Section(f"more{len(known)}", heading)
+            sections.append(known[heading])
+        known[heading].add(*(table._repr_html_() for table in several))
+    page = _render(
+        title=title or plant.name,
+        lead=lead,
+        highlights=_highlights(observers, labelled) if highlights is None else dict(highlights),
+        sections=[section for section in sections if section.parts],
+    )
+    _replace(target, page)
+    return target
+
+
+def _labelled_observers(given: Any) -> dict[str, "Observer"]:
+    observers = dict(given) if isinstance(given, Mapping) else {given.method: given}
+    if not observers:
+        raise ReportError("a report needs at least one observer.")
+    return observers
+
+
+def _labelled_runs(given: Any) -> dict[str, list[Run]]:
+    if isinstance(given, Run):
+        given = [given]
+    if isinstance(given, Mapping):
+        return {k: [v] if isinstance(v, Run) else list(v) for k, v in given.items()}
+    labelled: dict[str, list[Run]] = {}
+    for run in given:
+        labelled.setdefault(run.method, []).append(run)
+    return labelled
+
+
+def _labelled_tables(given: Any) -> dict[str, list[Table]]:
+    if isinstance(given, Table):
+        given = [given]
+    named = dict(given) if isinstance(given, Mapping) else ({"Tables": given} if given else {})
+    return {k: [v] if isinstance(v, Table) else list(v) for k, v in named.items()}
+
+
+def _half_widths(observers: Mapping[str, "Observer"]) -> dict[str, Any]:
+    return {k: o.half_widths for k, o in observers.items() if o.half_widths is not None}
+
+
+def _plant_section(model: "Plant") -> _Section:
+    section = _Section("plant", "Plant")
+    continuous = model.continuous
+    shown = model if continuous is None else continuous
+    section.add(equations_html(shown, "eq"))
+    if continuous is not None and model.Ts is not None:
+        section.add(
+            f"<p>Discretised with a sample time of {model.Ts:g} s "
+            f"({html.escape(str(model.discretisation))}). "
+            "All guarantees speak of the discrete model.</p>"
+        )
+    section.add(signals_table(shown)._repr_html_())
+    section.add(constants_html(shown))
+    return section
+
+
+def _design_section(observers: Mapping[str, "Observer"]) -> _Section:
+    section = _Section("design", "Design and certificate")
+    for label, observer in observers.items():
+        if len(observers) > 1:
+            section.add(f"<h3>{html.escape(label)}</h3>")
+        rows = [
+            ["✓" if c.holds else "✗", c.statement, c.margin, c.proof] for c in observer.certificate
+        ]
+        section.add(
+            Table(
+                f"Certificate: {sum(c.holds for c in observer.certificate)} of {len(rows)} "
+                "claims proved for the gains as stored",
+                ["", "claim", "margin", "proof"],
+                rows,
+            )._repr_html_(),
+            _bullets("Guaranteed", observer.guarantee.claims),
+            _bullets("Provided that", observer.guarantee.assumptions),
+        )
+        figures = [[key, value] for key, value in observer.performance.items()]
+        if figures:
+            section.add(Table("Performance", ["key", "value"], figures)._repr_html_())
+        section.add(_gains(observer))
+    return section
+
+
+def _bullets(head: str, lines: Sequence[str]) -> str:
+    if not lines:
+        return ""
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    return f'<p class="head">{html.escape(head)}</p><ul>{items}</ul>'
+
+
+def _gains(observer: "Observer") -> str:
+    blocks = []
+    for name, gain in observer.gains.items():
+        matrix = gain if gain.ndim == 2 else gain.reshape(1, -1)
+        rows = "".join(
+            "<tr>" + "".join(f'<td class="number">{text(v)}</td>' for v in row) + "</tr>"
+            for row in matrix
+        )
+        blocks.append(
+            f'<figure class="matrix"><figcaption>{html.escape(name)}</figcaption>'
+            f"<table><tbody>{rows}</tbody></table></figure>"
+        )
+    if not blocks:
+        return ""
+    return (
+        f'<details><summary>Gains</summary><div class="matrices">{"".join(blocks)}</div></details>'
+    )
+
+
+def _width_section(
+    plant: "Plant", widths: Mapping[str, Any], say: Callable[[str], None]
+) -> _Section:
+    section = _Section("widths", "Half widths")
+    if not widths:
+        return section
+    say("half widths")
+    signals = (*plant.x, *plant.f)
+    names, units = [s.name for s in signals], [s.unit for s in signals]
+    with style():
+        figure = _new_figure(7.4, 3.0)
+        plot_widths(widths, names, units, ax=figure.subplots())
+    section.add(_figure_html(figure, "widths", ""))
+    rows = [[label, *(float(v) for v in row), float(sum(row))] for label, row in widths.items()]
+    section.add(Table("Half widths in steady state", ["", *names, "sum"], rows)._repr_html_())
+    return section
+
+
+def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) -> _Section:
+    section = _Section("runs", "Simulation")
+    scenarios = dict.fromkeys(run.scenario for several in runs.values() for run in several)
+    if not scenarios:
+        return section
+    section.add(_coverage(runs, list(scenarios))._repr_html_())
+    for i, scenario in enumerate(scenarios):
+        section.add(f"<h3>{html.escape(scenario)}</h3>")
+        first: dict[str, Run] = {}
+        for label, several in runs.items():
+            for run in several:
+                if run.scenario == scenario:
+                    first.setdefault(label, run)
+        for j, (label, run) in enumerate(first.items()):
+            caption = f"{scenario}, {label}, seed {run.seed}: truth, estimate and interval"
+            say(caption)
+            figure, axes = _panels(run)
+            with style():
+                plot_run(run, axes=axes)
+            section.add(_figure_html(figure, f"run{i}{j}", caption), _facts(run))
+        caption = f"{scenario}: errors between their guaranteed bounds, settled"
+        say(caption)
+        figure, axes = _panels(next(iter(first.values())))
+        with style():
+            plot_errors(first if len(first) > 1 else next(iter(first.values())), axes=axes)
+        section.add(_figure_html(figure, f"err{i}", caption))
+    return section
+
+
+def _coverage(runs: Mapping[str, Sequence[Run]], scenarios: Sequence[str]) -> Table:
+    entries = [
+        (scenarios.index(run.scenario), label, run)
+        for label, several in runs.items()
+        for run in several
+    ]
+    names = entries[0][2].estimated
+    rows = [
+        [
+            run.scenario,
+            label,
+            run.seed,
+            *(percent(run.coverage.get(name, float("nan"))) for name in names),
+            run.domain.ok and not run.outside,
+        ]
+        for _, label, run in sorted(entries, key=lambda entry: entry[0])
+    ]
+    return Table(
+        "Coverage",
+        ["scenario", "design", "seed", *names, "assumptions kept"],
+        rows,
+        note="Fraction of all instants, the first included, at which the truth is inside its "
+        "interval; counted at tolerance zero.",
+    )
+
+
+def _facts(run: Run) -> str:
+    lines = [f"truth: {run.truth}", *(f"outside the guarantee: {line}" for line in run.outside)]
+    lines += str(run.domain).splitlines() + [str(v) for v in run.violations]
+    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def _panels(run: Run) -> tuple[Any, Any]:
+    """Make a figure with one panel for each estimated signal, two beside each other."""
+    count = len(run.estimated)
+    with style():
+        figure = _new_figure(7.4, 0.6 + 1.45 * ((count + 1) // 2))
+        return figure, panels(figure, count)
+
+
+def _new_figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _figure_html(figure: Any, key: str, caption: str) -> str:
+    picture = figure_svg(figure, key, caption or "bar plot")
+    words = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
+    return f"<figure>{picture}{words}</figure>"
+
+
+def _highlights(
+    observers: Mapping[str, "Observer"], runs: Mapping[str, Sequence[Run]]
+) -> dict[str, str]:
+    claims = [claim for observer in observers.values() for claim in observer.certificate]
+    shown = {"claims proved": f"{sum(c.holds for c in claims)} of {len(claims)}"}
+    every = [run for several in runs.values() for run in several]
+    if every:
+        worst = min(min(run.coverage.values(), default=1.0) for run in every)
+        shown["of all instants inside"] = percent(worst)
+    return shown
+
+
+def _render(**content: Any) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("obsynth.evaluate", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(**content)
+
+
+def _replace(target: Path, page: str) -> None:
+    """Write beside the target and rename, so that no reader meets half a page."""
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(page)
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,381 @@
+"""What a simulation gives: the truth, the claims about it, and whether they hold."""
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.evaluate.domain import Domain
+from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.table import Table
+
+if TYPE_CHECKING:
+    from obsynth.evaluate.interface import StepObserver
+    from obsynth.symbolic import Plant
+
+__all__ = ["Run", "Trace", "Violation"]
+
+Array = NDArray[np.float64]
+
+# Instants listed for each violated signal; the count is always complete.
+LISTED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One signal over time: truth, estimate and interval, all about the same instants.
+
+    Signals without an estimate (inputs, outputs, disturbances) have None there.
+    With ``fault_delay = 1`` a fault's trace ends one sample before the run, as
+    its claims arrive one sample late.
+    """
+
+    name: str
+    unit: str
+    t: Array
+    true: Array
+    estimate: Array | None = None
+    lower: Array | None = None
+    upper: Array | None = None
+
+    @property
+    def label(self) -> str:
+        """Name with its unit, for axes and heads."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Where the truth is inside the interval, tolerance zero; no number is outside."""
+        if self.lower is None or self.upper is None:
+            raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
+        return np.asarray((self.lower <= self.true) & (self.true <= self.upper))
+
+    @property
+    def error(self) -> Array:
+        """Truth minus estimate."""
+        if self.estimate is None:
+            raise SimulationError(f"{self.name} is not estimated.", symbol=self.name)
+        return np.asarray(self.true - self.estimate)
+
+    @property
+    def half_width(self) -> Array:
+        """Half the length of the interval."""
+        if self.lower is None or self.upper is None:
+            raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
+        return np.asarray(0.5 * (self.upper - self.lower))
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A signal that was outside its interval.
+
+    Attributes
+    ----------
+    signal : str
+    count : int
+        Violated instants in the whole run.
+    instants, amounts : tuple
+        The first few instants k, and how far outside the truth was.
+    worst, worst_at : float, int
+        The largest amount and its instant.
+    """
+
+    signal: str
+    count: int
+    instants: tuple[int, ...]
+    amounts: tuple[float, ...]
+    worst: float
+    worst_at: int
+
+    def __str__(self) -> str:
+        first = ", ".join(
+            f"k = {k} by {a:.3g}" for k, a in zip(self.instants, self.amounts, strict=True)
+        )
+        more = ", ..." if self.count > len(self.instants) else ""
+        return (
+            f"{self.signal}: {self.count} instants outside ({first}{more}; "
+            f"worst {self.worst:.3g} at k = {self.worst_at})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated scenario; arrays are (N + 1, ...), time first, read-only.
+
+    Attributes
+    ----------
+    t : (N + 1,)
+        Time in seconds.
+    x, y, u, d, f, w, rho : (N + 1, number of signals)
+        The truth at every instant.
+    xhat, fhat, x_lower, x_upper, f_lower, f_upper : (N + 1, n_x or n_f)
+        What ``Observer.step`` returned at that instant. A set carries the
+        index of the state that it encloses; with ``fault_delay = 1`` the fault
+        columns at k speak of instant k - 1, and ``run[name]`` aligns them.
+    status : (N + 1,) int
+        Bit mask of the step, explained by :attr:`domain`.
+    names, units : dict
+        Signal names and units by group ("x", "y", "u", "d", "f", "w", "rho").
+    box : (n_x, 2)
+        Box of the states over which the guarantee holds.
+    half_widths : (n_x + n_f,) or None
+        Steady half widths that the observer promises.
+    scenario, seed, model, method, truth : str and int
+        Where the run came from.
+    outside : tuple of str
+        Why the guarantee does not cover this run: another truth, or a declared
+        bound that the scenario does not keep; empty when it does.
+    """
+
+    t: Array
+    x: Array
+    y: Array
+    u: Array
+    d: Array
+    f: Array
+    w: Array
+    rho: Array
+    xhat: Array
+    fhat: Array
+    x_lower: Array
+    x_upper: Array
+    f_lower: Array
+    f_upper: Array
+    status: NDArray[np.int64]
+    names: Mapping[str, tuple[str, ...]]
+    units: Mapping[str, tuple[str, ...]]
+    box: Array
+    half_widths: Array | None
+    fault_delay: int
+    model: str
+    scenario: str
+    seed: int
+    method: str
+    truth: str
+    outside: tuple[str, ...]
+
+    @classmethod
+    def collect(
+        cls,
+        *,
+        model: "Plant",
+        observer: "StepObserver",
+        scenario: str,
+        seed: int,
+        truth: str,
+        outside: tuple[str, ...],
+        t: Array,
+        truths: Mapping[str, Array],
+        claims: Mapping[str, Array],
+    ) -> "Run":
+        """Label what the simulation loop recorded."""
+        groups = {key: getattr(model, key) for key in ("x", "u", "d", "f", "w", "rho")}
+        names = {key: tuple(s.name for s in signals) for key, signals in groups.items()}
+        units = {key: tuple(s.unit for s in signals) for key, signals in groups.items()}
+        names["y"] = tuple(model.output_names)
+        units["y"] = tuple(getattr(model, "output_units", ("",) * len(names["y"])))
+        status = np.asarray(claims["status"], dtype=np.int64).reshape(-1)
+        arrays = {key: value for key, value in claims.items() if key != "status"}
+        arrays |= truths
+        for array in (t, status, *arrays.values()):
+            array.setflags(write=False)
+        half_widths = observer.half_widths
+        return cls(
+            t=t,
+            status=status,
+            names=names,
+            units=units,
+            box=np.asarray(model.box("x"), dtype=float),
+            half_widths=None if half_widths is None else np.asarray(half_widths, dtype=float),
+            fault_delay=int(observer.fault_delay),
+            model=model.name,
+            scenario=scenario,
+            seed=seed,
+            method=observer.method,
+            truth=truth,
+            outside=outside,
+            **arrays,
+        )
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Names of all signals with an estimate: states, then faults."""
+        return self.names["x"] + self.names["f"]
+
+    def __getitem__(self, name: str) -> Trace:
+        for group, names in self.names.items():
+            if name in names:
+                return self._trace(group, names.index(name))
+        known = ", ".join(n for names in self.names.values() for n in names)
+        raise SimulationError(f"no signal is called {name!r}; there are {known}.", symbol=name)
+
+    def _trace(self, group: str, i: int) -> Trace:
+        name, unit = self.names[group][i], self.units[group][i]
+        true: Array = getattr(self, group)[:, i]
+        if group == "x":
+            claims = (self.xhat[:, i], self.x_lower[:, i], self.x_upper[:, i])
+            return Trace(name, unit, self.t, true, *claims)
+        if group == "f":
+            late = self.fault_delay
+            until = len(self.t) - late
+            claims = (self.fhat[late:, i], self.f_lower[late:, i], self.f_upper[late:, i])
+            return Trace(name, unit, self.t[:until], true[:until], *claims)
+        return Trace(name, unit, self.t, true)
+
+    @cached_property
+    def coverage(self) -> dict[str, float]:
+        """Fraction of all instants at which each state and fault is inside its interval.
+
+        Counted at tolerance zero over every instant, the transient included;
+        a bound that is no number counts as outside.
+        """
+        return {name: float(np.mean(self[name].inside)) for name in self.estimated}
+
+    @cached_property
+    def violations(self) -> tuple[Violation, ...]:
+        """Every signal that was outside its interval, with first instants and amounts."""
+        found = []
+        for name in self.estimated:
+            trace = self[name]
+            at = np.flatnonzero(~trace.inside)
+            if at.size:
+                lower, upper = _bounds(trace)
+                amount = np.maximum(lower - trace.true, trace.true - upper)[at]
+                amount = np.where(np.isnan(amount), np.inf, amount)
+                worst = int(np.argmax(amount))
+                found.append(
+                    Violation(
+                        name,
+                        int(at.size),
+                        tuple(int(k) for k in at[:LISTED]),
+                        tuple(float(a) for a in amount[:LISTED]),
+                        float(amount[worst]),
+                        int(at[worst]),
+                    )
+                )
+        return tuple(found)
+
+    def rms(self, from_step: int = 0) -> dict[str, float]:
+        """Root mean square of truth minus estimate, from instant `from_step` on.
+
+        Raises
+        ------
+        SimulationError
+            If no instant is left.
+        """
+        if not 0 <= from_step < len(self.t) - self.fault_delay:
+            raise SimulationError(
+                f"from_step={from_step} leaves no instant of 0..{len(self.t) - 1}.",
+                from_step=from_step,
+            )
+        errors = {name: self[name].error[from_step:] for name in self.estimated}
+        return {name: float(np.sqrt(np.mean(e**2))) for name, e in errors.items()}
+
+    @cached_property
+    def widths(self) -> dict[str, Array]:
+        """Half the length of each interval at every instant."""
+        return {name: self[name].half_width for name in self.estimated}
+
+    @cached_property
+    def domain(self) -> Domain:
+        """Whether truth and estimate stayed inside the box, and the status bits in words."""
+        return Domain.of(self.x, self.xhat, self.box, self.status, self.names["x"])
+
+    def summary(self, from_step: int = 0) -> Table:
+        """Coverage, rms error and half widths of every estimated signal."""
+        rms = self.rms(from_step)
+        rows = []
+        for name in self.estimated:
+            width = self.widths[name]
+            rows.append(
+                [
+                    self[name].label,
+                    percent(self.coverage[name]),
+                    rms[name],
+                    float(width[0]),
+                    float(width[-1]),
+                ]
+            )
+        since = f", rms from k = {from_step}" if from_step else ""
+        title = (
+            f"{self.scenario}, seed {self.seed}: {self.method} over {len(self.t)} instants{since}"
+        )
+        columns = ["signal", "inside", "rms error", "half width at k = 0", "at the end"]
+        return Table(title, columns, rows, note="; ".join(str(v) for v in self.violations))
+
+    def to_xarray(self) -> Any:
+        """Return an ``xarray.Dataset`` with labelled dimensions and units.
+
+        Variables are those of the run; dimensions are ``time`` and ``state``,
+        ``fault``, ``output``, ``input``, ``unknown_input``, ``disturbance``,
+        ``scheduling``; units stand in coordinates such as ``state_unit``.
+        """
+        import xarray as xr
+
+        dims = {"x": "state", "f": "fault", "y": "output", "u": "input", "d": "unknown_input"}
+        dims |= {"w": "disturbance", "rho": "scheduling"}
+        coords: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
+        for group, dim in dims.items():
+            coords[dim] = (dim, np.array(self.names[group], dtype=np.str_))
+            coords[f"{dim}_unit"] = (dim, np.array(self.units[group], dtype=np.str_))
+        claims = {"xhat": "x", "x_lower": "x", "x_upper": "x"}
+        claims |= {"fhat": "f", "f_lower": "f", "f_upper": "f"}
+        groups = {**{key: key for key in dims}, **claims}
+        data: dict[str, Any] = {
+            key: (("time", dims[group]), getattr(self, key)) for key, group in groups.items()
+        }
+        data["status"] = (("time",), self.status)
+        attrs = {
+            "model": self.model,
+            "scenario": self.scenario,
+            "seed": self.seed,
+            "method": self.method,
+            "truth": self.truth,
+            "outside_guarantee": "; ".join(self.outside),
+            "fault_delay": self.fault_delay,
+        }
+        return xr.Dataset(data, coords=coords, attrs=attrs)
+
+    def plot(self, signals: tuple[str, ...] | None = None) -> Any:
+        """Plot all estimated signals in a grid; see :func:`obsynth.evaluate.plot_run`."""
+        from obsynth.evaluate.plots import plot_run
+
+        return plot_run(self, signals)
+
+    def __repr__(self) -> str:
+        worst = min(self.coverage.values(), default=1.0)
+        return (
+            f"<Run of {self.method} on {self.model!r}, {self.scenario}, seed {self.seed}, "
+            f"{len(self.t)} instants, inside at {percent(worst)} or more>"
+        )
+
+    def _repr_html_(self) -> str:
+        reasons = "".join(f"<li>{html.escape(reason)}</li>" for reason in self.outside)
+        outside = f"<p>Outside the guarantee:</p><ul>{reasons}</ul>" if reasons else ""
+        return (
+            f"{self.summary()._repr_html_()}<p>Truth: {html.escape(self.truth)}.</p>{outside}"
+            f"{self.domain._repr_html_()}"
+        )
+
+
+def _bounds(trace: Trace) -> tuple[Array, Array]:
+    if trace.lower is None or trace.upper is None:
+        raise SimulationError(f"{trace.name} has no interval.", symbol=trace.name)
+    return trace.lower, trace.upper
+
+
+def percent(fraction: float) -> str:
+    """Write a fraction as per cent; never 100 % when one instant is missing.
+
+    Examples
+    --------
+    >>> percent(1.0), percent(5000 / 5001), percent(0.99999)
+    ('100 %', '99.98 %', '99.99 %')
+    """
+    if fraction == 1.0:
+        return "100 %"
+    return f"{np.floor(fraction * 1e4) / 1e2:.2f} %"

@@ -1,0 +1,166 @@
+"""The truth of a simulation: one step of the plant, discrete or integrated."""
+
+import typing
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.interface import StepObserver
+from obsynth.symbolic import Plant
+
+__all__ = ["Call", "Truth", "dense"]
+
+Array = NDArray[np.float64]
+
+
+class Truth:
+    """One plant step (x, u, d, f, w, rho) -> (next x, y) and what the run says about it."""
+
+    def __init__(self, model: Plant, observer: StepObserver, substeps: int | None) -> None:
+        own = observer.model
+        _same_signals(model, own)
+        self.model = model
+        self.Ts = _sample_time(own)
+        self.outside: tuple[str, ...] = ()
+        p = np.array([_nominal(signal) for signal in model.p], dtype=float)
+        if substeps is not None:
+            self._continuous(substeps)
+            step = _held(self.plant, self.Ts, substeps, p)
+        else:
+            self._discrete(own)
+            x, u, d, f, w, rho = _symbols(model)
+            step = ca.Function("truth", [x, u, d, f, w, rho], _call(model, x, u, d, f, w, p, rho))
+        self.function = dense(step)
+        if p.size:
+            values = ", ".join(f"{s.name} = {v:g}" for s, v in zip(model.p, p, strict=True))
+            self.description += f"; {values}"
+
+    def _continuous(self, substeps: int) -> None:
+        if isinstance(substeps, bool) or int(substeps) != substeps or substeps < 1:
+            raise SimulationError(
+                f"substeps={substeps!r} is not a positive whole number.", substeps=substeps
+            )
+        source = self.model if self.model.Ts is None else self.model.continuous
+        if source is None:
+            raise SimulationError(
+                f"substeps={substeps} needs a continuous plant, but {self.model.name!r} was "
+                "declared in discrete time: leave substeps out, or give the plant that was "
+                "discretised.",
+                substeps=substeps,
+            )
+        self.plant = source
+        self.description = f"continuous plant, {substeps} Runge-Kutta steps per sample, inputs held"
+        self.outside = (
+            "the truth is the continuous plant; the error of its discretisation is no declared "
+            "disturbance, so the guarantee does not cover it",
+        )
+
+    def _discrete(self, own: Plant) -> None:
+        if self.model.Ts is None:
+            raise SimulationError(
+                f"{self.model.name!r} is a continuous plant: give substeps= to integrate it, or "
+                "the discrete model for which the observer was designed (observer.model).",
+                model=self.model.name,
+            )
+        if self.model.Ts != own.Ts:
+            raise SimulationError(
+                f"the model's sample time {self.model.Ts:g} is not the observer's {own.Ts:g}.",
+                Ts=self.model.Ts,
+            )
+        self.plant = self.model
+        way = f" ({self.model.discretisation})" if self.model.discretisation else ""
+        if self.model is own or self.model.to_dict() == own.to_dict():
+            self.description = f"the observer's own discrete model{way}"
+        else:
+            self.description = f"another discrete model{way}"
+            self.outside = ("the truth is not the model for which the observer was designed",)
+
+
+def _same_signals(model: Plant, own: Plant) -> None:
+    """Refuse a truth whose signals are not those of the observer's model."""
+    groups = {"x": "states", "u": "inputs", "d": "unknown inputs", "f": "faults"}
+    groups |= {"w": "disturbances", "rho": "scheduling signals"}
+    pairs = [(word, model.names(key), own.names(key)) for key, word in groups.items()]
+    pairs.append(("outputs", tuple(model.output_names), tuple(own.output_names)))
+    for word, given, expected in pairs:
+        if given != expected:
+            raise SimulationError(
+                f"the {word} of the model ({', '.join(given) or 'none'}) are not those of the "
+                f"observer's model ({', '.join(expected) or 'none'}): simulate the plant for "
+                "which the observer was designed.",
+                given=given,
+                expected=expected,
+            )
+
+
+def _sample_time(own: Plant) -> float:
+    if own.Ts is None:
+        raise SimulationError("the observer's model is continuous: its step has no sample time.")
+    return float(own.Ts)
+
+
+def _nominal(signal: Any) -> float:
+    """Return the value of a constant parameter in the truth: nominal, else mid-range."""
+    if signal.nominal is not None:
+        return float(signal.nominal)
+    return 0.5 * (float(signal.lower) + float(signal.upper))
+
+
+def _symbols(plant: Plant) -> tuple[ca.SX, ...]:
+    return tuple(ca.SX.sym(key, len(plant.names(key))) for key in ("x", "u", "d", "f", "w", "rho"))
+
+
+def _call(
+    plant: Plant, x: Any, u: Any, d: Any, f: Any, w: Any, p: Array, rho: Any
+) -> tuple[Any, Any]:
+    rhs, y = plant.function()(x, u, d, f, w, p, rho)
+    return rhs, y
+
+
+def _held(plant: Plant, Ts: float, substeps: int, p: Array) -> ca.Function:
+    """Classical Runge-Kutta over one sample with everything but x held."""
+    x, u, d, f, w, rho = _symbols(plant)
+
+    def rate(state: Any) -> Any:
+        return _call(plant, state, u, d, f, w, p, rho)[0]
+
+    h = Ts / substeps
+    state: Any = x
+    for _ in range(substeps):
+        k1 = rate(state)
+        k2 = rate(state + h / 2 * k1)
+        k3 = rate(state + h / 2 * k2)
+        k4 = rate(state + h * k3)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    y = _call(plant, x, u, d, f, w, p, rho)[1]
+    return ca.Function("truth", [x, u, d, f, w, rho], [state, y])
+
+
+def dense(function: ca.Function) -> ca.Function:
+    """Return the same function with dense inputs and outputs, as buffers write only nonzeros."""
+    sparse = any(function.nnz_in(i) != function.numel_in(i) for i in range(function.n_in()))
+    sparse |= any(function.nnz_out(i) != function.numel_out(i) for i in range(function.n_out()))
+    if not sparse:
+        return function
+    args = [ca.MX.sym(f"a{i}", function.size_in(i)) for i in range(function.n_in())]
+    results = [ca.densify(r) for r in function.call(args)]
+    return ca.Function(function.name(), args, results, function.name_in(), function.name_out())
+
+
+class Call:
+    """A CasADi function behind fixed NumPy buffers: about a microsecond a call."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self.args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self.results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        # CasADi's own stubs describe neither call as its Python layer takes it.
+        buffer, self.evaluate = typing.cast(Any, function).buffer()
+        for i, argument in enumerate(self.args):
+            buffer.set_arg(i, memoryview(typing.cast(Any, argument)))
+        for i, result in enumerate(self.results):
+            buffer.set_res(i, memoryview(typing.cast(Any, result)))
+        # The buffer owns the pointers, so it has to live as long as the arrays.
+        self._buffer = buffer

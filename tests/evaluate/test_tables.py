@@ -1,0 +1,20 @@
+"""Tables as text and HTML."""
+
+import pytest
+
+from obsynth.evaluate import ReportError, Table
+
+
+def test_rows_have_to_fit_the_columns():
+    with pytest.raises(ReportError, match="row 1 of table 'T' has 1 cells for 2 columns"):
+        Table("T", ["a", "b"], [[1, 2], [3]])
+
+
+def test_html_is_escaped_numbers_are_flush_right_and_marked_rows_marked():
+    page = Table("x < y", ["name", "value"], [["a&b", 1.5], ["c", 2]], "n > 1", marked=[1])
+    text = page._repr_html_()
+    assert "x &lt; y" in text
+    assert "a&amp;b" in text
+    assert "n &gt; 1" in text
+    assert '<td class="number">1.5</td>' in text
+    assert '<tr class="marked"><td>c</td>' in text
