@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.dependence import AffineDependence
+from obsynth.derive.dependence import AffineDependence, entry_name
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.exact import round_number
 
@@ -70,6 +70,11 @@ class AffineFamily:
     def vertex_count(self) -> int:
         """Number of vertices, without making them."""
         return 1 << int((self.ranges[:, 1] > self.ranges[:, 0]).sum())
+
+    @property
+    def vertex_radius(self) -> Array:
+        """How far a matrix of the family may lie from the hull of the vertices, elementwise."""
+        return self.radius
 
     def at(self, scalars: Sequence[float] | Array) -> Array:
         """Matrix for given scalars.
@@ -200,7 +205,7 @@ def build_family(
         names = set(supports[entry])
         disjoint = disjoint and not (names & seen)
         seen |= names
-    labels = tuple(f"{name}{i + 1}{j + 1}({', '.join(supports[(i, j)])})" for i, j in basis)
+    labels = tuple(f"{entry_name(entry, name)}({', '.join(supports[entry])})" for entry in basis)
     return AffineFamily(
         constant,
         directions,

@@ -7,6 +7,7 @@ dependence counts only when the difference is proved to be identically zero.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 import sympy as sp
@@ -15,11 +16,36 @@ from numpy.typing import NDArray
 from obsynth.derive.exact import is_zero
 from obsynth.derive.factorise import expand_terms
 
-__all__ = ["AffineDependence", "find_dependences"]
+__all__ = ["AffineDependence", "entry_name", "find_dependences"]
 
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _RANK_TOLERANCE = 1e-8
+_LARGEST_DENOMINATOR = 1000
+
+
+def entry_name(entry: Entry, name: str = "m") -> str:
+    """Return what an entry is called in texts, counted from 1.
+
+    Parameters
+    ----------
+    entry : (int, int)
+        Row and column, from 0.
+    name : str
+        Letter of the matrix.
+
+    Returns
+    -------
+    str
+        Such as ``m13``, or ``m10,11`` where two digits would be misread.
+
+    Examples
+    --------
+    >>> entry_name((0, 2)), entry_name((9, 10))
+    ('m13', 'm10,11')
+    """
+    i, j = entry[0] + 1, entry[1] + 1
+    return f"{name}{i}{j}" if max(i, j) < 10 else f"{name}{i},{j}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +76,11 @@ class AffineDependence:
     name: str = "m"
 
     def __str__(self) -> str:
-        def call(entry: Entry) -> str:
-            return f"{self.name}{entry[0] + 1}{entry[1] + 1}"
-
         terms = []
         for other, coefficient in self.coefficients.items():
             number = float(coefficient.evalf(17))
             factor = {1.0: "", -1.0: "-"}.get(number, f"{number:.6g} ")
-            terms.append(f"{factor}{call(other)}")
+            terms.append(f"{factor}{entry_name(other, self.name)}")
         constant = float(sp.N(self.constant, 17))
         if constant != 0.0 or not terms:
             terms.append(f"{constant:.6g}")
@@ -67,7 +90,8 @@ class AffineDependence:
             if len(self.coefficients) == 1
             else (f"all depend on {', '.join(self.shared)}" if self.coefficients else "constant")
         )
-        return f"{call(self.entry)} = {text}: {reason}; difference proved zero ({self.proof})"
+        left = entry_name(self.entry, self.name)
+        return f"{left} = {text}: {reason}; difference proved zero ({self.proof})"
 
 
 def _monomials(entry: sp.Expr, variables: set[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
@@ -102,10 +126,7 @@ def _solve(
     solutions = sp.linsolve(equations, unknowns)
     if not solutions:
         return None
-    values = [
-        sp.radsimp(sp.nsimplify(v)) if v.is_Rational else sp.radsimp(v)
-        for v in next(iter(solutions))
-    ]
+    values = [sp.radsimp(value) for value in next(iter(solutions))]
     return None if any(v.free_symbols for v in values) else values
 
 
@@ -151,58 +172,69 @@ def find_dependences(
     basis: list[Entry] = []
     columns: list[Array] = []
     dependences: list[AffineDependence] = []
-    parts = {entry: _monomials(expression, known) for entry, expression in entries.items()}
+    prover = _Prover(entries, known, name)
     for entry in sorted(entries, key=lambda e: _preferred(e, entries[e], known)):
-        expression = entries[entry]
         centred = samples[entry] - samples[entry].mean()
         size = float(np.linalg.norm(centred))
         floor = _RANK_TOLERANCE * max(float(np.abs(samples[entry]).max(initial=0.0)), 1e-300)
+        proved: AffineDependence | None
         if size <= floor * np.sqrt(len(centred)):
-            candidates: list[Entry] = []
+            proved = prover.constant(entry)
         else:
             matrix = np.array(columns).T if columns else np.zeros((len(centred), 0))
-            unit = centred / size
-            weights = np.linalg.lstsq(matrix, unit, rcond=None)[0]
-            if np.linalg.norm(unit - matrix @ weights) > _RANK_TOLERANCE:
-                basis.append(entry)
-                columns.append(unit)
-                continue
-            candidates = [
-                b for b, c in zip(basis, weights, strict=True) if abs(c) > _RANK_TOLERANCE
-            ]
-        proved = _prove(entry, expression, candidates, entries, parts, known, name)
+            scale = np.linalg.norm(matrix, axis=0)
+            weights = np.linalg.lstsq(matrix / scale, centred / size, rcond=None)[0]
+            proved = None
+            if np.linalg.norm(centred / size - matrix / scale @ weights) <= _RANK_TOLERANCE:
+                used = np.flatnonzero(np.abs(weights) > _RANK_TOLERANCE)
+                guess = {basis[k]: float(weights[k] * size / scale[k]) for k in used}
+                proved = prover.combination(entry, guess)
         if proved is None:
             basis.append(entry)
-            columns.append(centred / size if size > 0.0 else centred)
+            columns.append(centred if size > 0.0 else np.ones_like(centred))
         else:
             dependences.append(proved)
     return sorted(basis), sorted(dependences, key=lambda d: d.entry)
 
 
-def _prove(
-    entry: Entry,
-    expression: sp.Expr,
-    candidates: list[Entry],
-    entries: Mapping[Entry, sp.Expr],
-    parts: Mapping[Entry, Mapping[sp.Expr, sp.Expr]],
-    variables: set[sp.Symbol],
-    name: str,
-) -> AffineDependence | None:
-    values = _solve(parts[entry], [parts[c] for c in candidates]) if candidates else []
-    if values is None:
-        return None
-    combined = sum((v * entries[c] for v, c in zip(values, candidates, strict=True)), sp.Integer(0))
-    rest = sp.expand(expression - combined)
-    if rest.free_symbols & variables:
-        rest = sp.simplify(rest)
-        if rest.free_symbols & variables:
+class _Prover:
+    """Turns a proposed dependence into a proved one."""
+
+    def __init__(
+        self, entries: Mapping[Entry, sp.Expr], variables: set[sp.Symbol], name: str
+    ) -> None:
+        self.entries, self.variables, self.name = entries, variables, name
+        self.parts = {e: _monomials(expression, variables) for e, expression in entries.items()}
+
+    def constant(self, entry: Entry) -> AffineDependence | None:
+        return self._accept(entry, {})
+
+    def combination(self, entry: Entry, guess: Mapping[Entry, float]) -> AffineDependence | None:
+        exact = _solve(self.parts[entry], [self.parts[other] for other in guess])
+        if exact is not None:
+            return self._accept(entry, dict(zip(guess, exact, strict=True)))
+        # equal functions in different words: short rational coefficients are worth a try
+        limit = _LARGEST_DENOMINATOR
+        near = {e: Fraction(value).limit_denominator(limit) for e, value in guess.items()}
+        if any(abs(float(f) - guess[e]) > 1e-7 * abs(guess[e]) for e, f in near.items()):
             return None
-    proof = is_zero(expression - combined - rest)
-    if not proof:
-        return None
-    shared = sorted(
-        {str(s) for c in (entry, *candidates) for s in entries[c].free_symbols & variables}
-    )
-    return AffineDependence(
-        entry, dict(zip(candidates, values, strict=True)), rest, proof, tuple(shared), name
-    )
+        return self._accept(
+            entry, {e: sp.Rational(f.numerator, f.denominator) for e, f in near.items()}
+        )
+
+    def _accept(self, entry: Entry, coefficients: dict[Entry, sp.Expr]) -> AffineDependence | None:
+        combined = sum((c * self.entries[e] for e, c in coefficients.items()), sp.Integer(0))
+        difference = self.entries[entry] - combined
+        rest = sp.expand(difference)
+        if rest.free_symbols & self.variables:
+            rest = sp.simplify(rest)
+            if rest.free_symbols & self.variables:
+                return None
+        proof = is_zero(difference - rest)
+        if not proof:
+            return None
+        involved = (entry, *coefficients)
+        shared = {s for e in involved for s in self.entries[e].free_symbols & self.variables}
+        return AffineDependence(
+            entry, coefficients, rest, proof, tuple(sorted(map(str, shared))), self.name
+        )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive.affine_family import AffineFamily, build_family
 from obsynth.derive.continuity import refuse_jumps
-from obsynth.derive.dependence import AffineDependence, find_dependences
+from obsynth.derive.dependence import AffineDependence, entry_name, find_dependences
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.exact import enclose_number, rational, substitute
 from obsynth.derive.intervals import Ranges, Status, bound_ranges
@@ -21,6 +21,8 @@ __all__ = ["JacobianBounds", "jacobian_bounds"]
 
 Array = NDArray[np.float64]
 _SAMPLES = 96
+# Expanding a longer entry costs more than the zeros it may show.
+_LONG = 500
 _KINDS = ("x", "u", "p", "rho", "d", "f", "w")
 
 
@@ -84,7 +86,7 @@ class JacobianBounds:
             if self.max[i, j] > self.min[i, j]:
                 word = str(status).split(":")[0]
                 lines.append(
-                    f"  m{i + 1}{j + 1} in [{self.min[i, j]:.8g}, {self.max[i, j]:.8g}]  "
+                    f"  {entry_name((i, j))} in [{self.min[i, j]:.8g}, {self.max[i, j]:.8g}]  "
                     f"gap {self.gap[i, j]:.1e}  {word}"
                 )
         lines += [f"  {d}" for d in self.dependences if d.coefficients]
@@ -92,7 +94,7 @@ class JacobianBounds:
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>m{i + 1}{j + 1}</td><td>{self.min[i, j]:.8g}</td>"
+            f"<tr><td>{entry_name((i, j))}</td><td>{self.min[i, j]:.8g}</td>"
             f"<td>{self.max[i, j]:.8g}</td><td>{self.gap[i, j]:.1e}</td>"
             f"<td>{str(s).split(':')[0]}</td></tr>"
             for (i, j), s in np.ndenumerate(self.status)
@@ -150,7 +152,8 @@ def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
                 value, exact = value - symbol, exact - rational(offset)
             if part is not None:
                 exact = exact.subs(quiet)
-            exact = sp.expand(exact)
+            if exact.count_ops() < _LONG:
+                exact = sp.expand(exact)
             if exact == 0:
                 continue
             places.append((i, j))
@@ -218,7 +221,7 @@ def _refuse(entries: _Entries, ranges: Ranges, what: str) -> None:
             entries.names[k]: (float(failure.lower[k]), float(failure.upper[k])) for k in relevant
         }
         boxes[name] = box
-        where = ", ".join(f"{s} in [{lo:.6g}, {hi:.6g}]" for s, (lo, hi) in box.items())
+        where = ", ".join(f"{s} in [{lo:.9g}, {hi:.9g}]" for s, (lo, hi) in box.items())
         lines.append(f"{name} ({failure.operation} at {where})")
     shrink = sorted({s for box in boxes.values() for s in box})
     raise UnboundedError(

@@ -20,6 +20,7 @@ from obsynth.derive.intervals.batch import (
     mean_value_terms,
     shrink,
 )
+from obsynth.derive.intervals.progress import Patience
 
 __all__ = ["Budget", "Outcome", "maximise"]
 
@@ -205,13 +206,15 @@ class _Search:
         return now
 
     def run(self) -> Outcome:
-        rows = self.without_limits(self.initial())
-        while rows.count and self.boxes < self.budget.boxes and self.sweeps < self.budget.sweeps:
-            now = self.choose(rows)
-            rows = self.sweep(rows.take(now)).join(rows.take(~now))
-            if self.sweeps == 1 and rows.count:
-                self.sample(np.unique(rows.goal))
-            rows = rows.take(self.close(rows))
+        rows, budget = self.without_limits(self.initial()), self.budget
+        with Patience() as patience:
+            while rows.count and self.boxes < budget.boxes and self.sweeps < budget.sweeps:
+                now = self.choose(rows)
+                rows = self.sweep(rows.take(now)).join(rows.take(~now))
+                if self.sweeps == 1 and rows.count:
+                    self.sample(np.unique(rows.goal))
+                rows = rows.take(self.close(rows))
+                patience.tell(f"bounding: {self.boxes} boxes done, {rows.count} open")
         bound = self.closed.copy()
         np.maximum.at(bound, rows.goal, rows.bound)
         bound[list(self.singular)] = np.inf

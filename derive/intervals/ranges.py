@@ -261,9 +261,9 @@ def _ranges(problem: Problem, outcome: Outcome) -> Ranges:
         operation = first_failure(problem.program, lower, upper, goal // 2)
         failures.setdefault(goal // 2, Failure(goal // 2, operation, lower, upper))
     return Ranges(
-        -outcome.bound[0::2],
-        outcome.bound[1::2],
-        -outcome.attained[0::2],
+        0.0 - outcome.bound[0::2],
+        outcome.bound[1::2] + 0.0,
+        0.0 - outcome.attained[0::2],
         outcome.attained[1::2],
         outcome.points[0::2],
         outcome.points[1::2],

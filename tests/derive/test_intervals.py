@@ -305,3 +305,14 @@ def test_constants_as_inputs_are_intervals():
 def test_operation_without_a_rule_is_refused():
     with pytest.raises(DerivationError, match="no range rule"):
         Program.from_casadi(ca.Function("f", [X], [ca.erfinv(X[0])]))
+
+
+def test_exponents_stay_integers():
+    """A constant exponent n makes n - 1 in the derivative, which has to be exact."""
+    n = ca.SX.sym("n")
+    cube = X[0] ** n
+    function = ca.Function("f", [X, n], [cube, ca.jacobian(cube, X[0])])
+    program = Program.from_casadi(function, {1: [(3.0, 3.0)]})
+    lo, hi = evaluate(program, -2.0 * np.ones((3, 1)), -1.0 * np.ones((3, 1)))
+    assert (lo[0, 0], hi[0, 0]) == pytest.approx((-8.0, -1.0), rel=1e-14)
+    assert (lo[1, 0], hi[1, 0]) == pytest.approx((3.0, 12.0), rel=1e-14)
