@@ -1,6 +1,7 @@
 """What follows from a plant, with proof."""
 
 from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.decoupling import Decoupling, decouple
 from obsynth.derive.dependence import AffineDependence
 from obsynth.derive.equilibrium import Equilibrium, equilibrium
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
@@ -9,7 +10,6 @@ from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.report import Check, StructureReport, analyse
 from obsynth.derive.split import IdentityProof, Split, split
 from obsynth.derive.structure import (
-    Decoupling,
     Detectability,
     augmented_pair,
     detectability,
@@ -35,6 +35,7 @@ __all__ = [
     "analyse",
     "augmented_pair",
     "bound_ranges",
+    "decouple",
     "detectability",
     "equilibrium",
     "jacobian_bounds",

@@ -18,10 +18,11 @@ from obsynth.derive.linear_parts import LinearPart, constant_columns
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["IdentityProof", "Split", "split"]
+__all__ = ["IdentityProof", "LinearForm", "Split", "split"]
 
 Array = NDArray[np.float64]
-_FORMS = ("frozen", "terms", "jacobian")
+LinearForm = Literal["frozen", "terms", "jacobian"]
+_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ class Split:
     W2: Array
     D_f: Array
     g: sp.Matrix
-    linear: str
+    linear: LinearForm
     at: Equilibrium
     proof: IdentityProof
 
@@ -246,7 +247,7 @@ def _check_outputs(model: Plant) -> None:
 def split(
     model: Plant,
     at: Any = None,
-    linear: Literal["frozen", "terms", "jacobian"] = "frozen",
+    linear: LinearForm = "frozen",
 ) -> Split:
     """Split a plant into constant matrices and a nonlinearity g.
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.derive.decoupling import Decoupling, decouple
 from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian_bounds import JacobianBounds
 from obsynth.derive.split import Split
 
 __all__ = [
-    "Decoupling",
     "Detectability",
     "augmented_pair",
     "detectability",
@@ -21,26 +21,6 @@ Array = NDArray[np.float64]
 Modes = NDArray[np.complex128]
 _RANK_TOLERANCE = 1e-9
 _MODE_TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Decoupling:
-    """What removes the unknown inputs: T = I + E C with T D = 0.
-
-    Attributes
-    ----------
-    E : ndarray, shape (n, m)
-        -D [(C D)'(C D)]^-1 (C D)', equation (13) of Buciakowski et al.; zero without unknown
-        inputs.
-    T : ndarray, shape (n, n)
-        I + E C.
-    rank : int
-        Rank of D and of C D: the number q of unknown inputs.
-    """
-
-    E: Array
-    T: Array
-    rank: int
 
 
 @dataclass(frozen=True)
@@ -88,7 +68,7 @@ def unknown_input_condition(split: Split) -> Decoupling:
     Returns
     -------
     Decoupling
-        E and T.
+        E, T and Pi.
 
     Raises
     ------
@@ -107,7 +87,7 @@ def unknown_input_condition(split: Split) -> Decoupling:
     model, D, C = split.model, split.D, split.C
     n, m, q = len(D), len(C), D.shape[1]
     if q == 0:
-        return Decoupling(np.zeros((n, m)), np.eye(n), 0)
+        return decouple(C, D)
     names, states = model.names("d"), model.names("x")
     CD = C @ D
     rank_D, rank_CD = _rank(D), _rank(CD)
@@ -142,8 +122,7 @@ def unknown_input_condition(split: Split) -> Decoupling:
             symbols=tuple(symbols),
             states=tuple(acts),
         )
-    E = -D @ np.linalg.solve(CD.T @ CD, CD.T)
-    return Decoupling(E, np.eye(n) + E @ C, q)
+    return decouple(C, D)
 
 
 def _null_vectors(matrix: Array) -> Array:

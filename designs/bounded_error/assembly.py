@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive import JacobianBounds, Split
+from obsynth.derive import JacobianBounds, Split, decouple
 from obsynth.designs.bounded_error.derivation_proof import prove_derivation
 from obsynth.designs.bounded_error.design import METHOD, EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.noise import noise_box
@@ -16,7 +16,6 @@ from obsynth.designs.bounded_error.peak import peak_runtime, peak_start, prove_p
 from obsynth.designs.bounded_error.proof import prove_ellipsoid
 from obsynth.designs.bounded_error.runtime import ellipsoid_first, ellipsoid_runtime, make_start
 from obsynth.designs.bounded_error.step import RuntimeBound, build_step, memory_layout
-from obsynth.designs.bounded_error.unknown_input import decouple
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.observer import Observer
 from obsynth.designs.storage import FORMAT, VERSION

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.error_system import ERRORS, ErrorKind, ModelData
 from obsynth.designs.errors import CertificateError
 from obsynth.designs.lmi import Enclosure
@@ -19,7 +20,6 @@ from obsynth.symbolic import Plant
 __all__ = ["METHOD", "EllipsoidBound", "PeakData", "UioDesign"]
 
 METHOD = "bounded_error_uio"
-LinearForm = Literal["frozen", "terms", "jacobian"]
 LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 FloatArray = NDArray[np.float64]
 

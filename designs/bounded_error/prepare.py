@@ -12,7 +12,6 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.structure import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.design import PeakData, UioDesign
 from obsynth.designs.bounded_error.noise import noise_box
-from obsynth.designs.bounded_error.unknown_input import decouple
 from obsynth.symbolic import Plant, Role
 
 __all__ = ["Prepared", "check_class", "prepare"]
@@ -105,12 +104,11 @@ def prepare(model_or_split: Plant | Split, bounds: JacobianBounds | None = None)
     check_class(model)
     parts = split(model) if isinstance(model_or_split, Plant) else model_or_split
     noise = noise_box(model)
-    unknown_input_condition(parts)
+    decoupling = unknown_input_condition(parts)
     if bounds is None:
         bounds = jacobian_bounds(parts)
     detectability(parts, bounds)
     n, n_f, m = len(model.x), len(model.f), len(parts.C)
-    decoupling = decouple(parts.C, parts.D)
     if decoupling.residual > 0 and not np.isfinite(model.box("d")).all():
         names = ", ".join(model.names("d"))
         raise StructureError(

@@ -273,7 +273,7 @@ def largest_feasible(room: Callable[[float], float], rtol: float = 1e-3) -> floa
 
 
 def decay_room(system: ErrorSystem, gamma: float, gain: FloatArray | None = None) -> float:
-    """Return the largest t with ``[(1-gamma) P, X'P; P X, P] >= t I`` and P <= I, minus the tolerance."""
+    """Return the largest t with ``[(1-gamma) P, X'P; P X, P] >= t I``, P <= I, less a tolerance."""
     p, m, _ = system.sizes
     problem = Problem(f"decay at gamma = {gamma:.6g}")
     P = symmetric("P", p)

@@ -1,4 +1,4 @@
-"""Decoupling of the unknown input: the matrices E, T and Pi of the observer."""
+"""Decoupling of the unknown input: the matrices E, T and Pi, computed exactly."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
 
-__all__ = ["Decoupling", "decouple", "exact_matrix"]
+__all__ = ["Decoupling", "decouple"]
 
 FloatArray = NDArray[np.float64]
 
 
-def exact_matrix(values: Any) -> Any:
+def _exact(values: Any) -> Any:
     """Return the exact rational matrix of an array of doubles (`flint.fmpq_mat`)."""
     from flint import fmpq, fmpq_mat
 
@@ -46,6 +46,8 @@ class Decoupling:
         ``I + E C`` rounded to doubles.
     Pi : ndarray of shape (m, m)
         ``I + C E`` rounded to doubles.
+    rank : int
+        Rank of D and of C D: the number q of unknown inputs.
     residual : float
         Largest entry of ``|(I + E C) D|`` for the stored doubles, computed
         exactly: 0 where the decoupling is exact.
@@ -57,6 +59,7 @@ class Decoupling:
     E: FloatArray
     T: FloatArray
     Pi: FloatArray
+    rank: int
     residual: float
     projector: bool
 
@@ -96,8 +99,8 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     m, n = C.shape
     q = D.shape[1]
     if q == 0:
-        return Decoupling(np.zeros((n, m)), np.eye(n), np.eye(m), 0.0, True)
-    exact_C, exact_D = exact_matrix(C), exact_matrix(D)
+        return Decoupling(np.zeros((n, m)), np.eye(n), np.eye(m), 0, 0.0, True)
+    exact_C, exact_D = _exact(C), _exact(D)
     CD = exact_C * exact_D
     gram = CD.transpose() * CD
     if gram.det() == 0:
@@ -109,12 +112,12 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
             required=q,
         )
     E = _rounded(exact_D * gram.inv() * CD.transpose() * -1)
-    exact_E = exact_matrix(E)
+    exact_E = _exact(E)
     eye_n = fmpq_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
     eye_m = fmpq_mat(m, m, [int(i == j) for i in range(m) for j in range(m)])
     exact_T = eye_n + exact_E * exact_C
     T = _rounded(exact_T)
     Pi = _rounded(eye_m + exact_C * exact_E)
     residual = float(np.max(np.abs(_rounded(exact_T * exact_D)), initial=0.0))
-    projector = exact_T * exact_T == exact_T and exact_matrix(T) == exact_T
-    return Decoupling(E, T, Pi, residual, bool(projector))
+    projector = exact_T * exact_T == exact_T and _exact(T) == exact_T
+    return Decoupling(E, T, Pi, q, residual, bool(projector))
