@@ -57,7 +57,7 @@ def nearest_double(number: sp.Expr) -> float:
         if isinstance(number, sp.Rational):
             return int(number.p) / int(number.q)
         value = float(number if isinstance(number, sp.Float) else number.evalf(40))
-    except (OverflowError, TypeError) as error:
+    except (ArithmeticError, TypeError) as error:
         raise PlantError(f"the constant {number} is not a real double", number=number) from error
     if not math.isfinite(value):
         raise PlantError(f"the constant {number} is not finite", number=number)
@@ -124,7 +124,7 @@ class _Walker:
                 )
             return self.symbols[node]
         if isinstance(node, sp.Expr) and node.is_number:
-            return ca.SX(nearest_double(node))
+            return ca.SX(self._double(node))
         if isinstance(node, sp.Add):
             return self._add(node)
         if isinstance(node, sp.Mul):
@@ -146,6 +146,12 @@ class _Walker:
         result: ca.SX = function.casadi(*(self.visit(argument) for argument in node.args))
         return result
 
+    def _double(self, number: sp.Expr) -> float:
+        try:
+            return nearest_double(number)
+        except PlantError as error:
+            raise PlantError(f"{self.where}: {error}", where=self.where, number=number) from None
+
     def _add(self, node: sp.Add) -> ca.SX:
         constants = [term for term in node.args if term.is_number]
         total = ca.SX(0)
@@ -158,7 +164,7 @@ class _Walker:
             else:
                 total = total + self.visit(term)
         if constants:
-            constant = nearest_double(sp.Add(*constants))
+            constant = self._double(sp.Add(*constants))
             total = total - (-constant) if constant < 0 else total + constant
         return total
 
@@ -172,7 +178,7 @@ class _Walker:
                 bottom.append(self._pow(base, -exponent))
             else:
                 top.append(self.visit(factor))
-        constant = nearest_double(sp.Mul(*numbers)) if numbers else 1.0
+        constant = self._double(sp.Mul(*numbers)) if numbers else 1.0
         if constant not in (1.0, -1.0):
             top.insert(0, ca.SX(abs(constant)))
         product = _product(top)

@@ -5,7 +5,7 @@ from typing import Any
 
 import sympy as sp
 
-from obsynth.symbolic.declare import exact_number
+from obsynth.symbolic.arguments import exact_number
 from obsynth.symbolic.errors import PlantError
 
 __all__ = ["METHODS", "check_method", "next_values", "runge_kutta", "sampling_time"]

@@ -1,6 +1,5 @@
 """Reading equations: matching symbols by name, checking every node, one canonical form."""
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,12 +9,13 @@ import numpy as np
 import sympy as sp
 from sympy.core.relational import Relational
 from sympy.functions.elementary.piecewise import ExprCondPair
-from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
+from sympy.logic.boolalg import ITE, And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
 
-from obsynth.symbolic.declare import expand_names, per_symbol
+from obsynth.symbolic.arguments import expand_names, per_symbol
+from obsynth.symbolic.convert import nearest_double
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
-from obsynth.symbolic.text import TextError, read_text
+from obsynth.symbolic.text import TextError, read_text, undeclared
 
 __all__ = ["canonical", "read_dynamics", "read_outputs", "read_rows"]
 
@@ -199,14 +199,17 @@ def _rebuild(node: sp.Basic, done: dict[sp.Basic, sp.Basic]) -> sp.Basic:
             done[node] = sp.Float(float(node))
         elif node.args:
             arguments = [_rebuild(argument, done) for argument in node.args]
-            done[node] = _closed(node.func(*arguments))
+            done[node] = _plain(node.func(*arguments))
         else:
             done[node] = node
     return done[node]
 
 
-def _closed(node: sp.Basic) -> sp.Basic:
-    """Let the last case of an exhaustive Piecewise be the one that is left."""
+def _plain(node: sp.Basic) -> sp.Basic:
+    """Let an exhaustive Piecewise end with True; write an if-then-else by and, or, not."""
+    if isinstance(node, ITE):
+        condition, yes, no = node.args
+        return Or(And(condition, yes), And(Not(condition), no))
     if isinstance(node, sp.Piecewise) and node.args[-1][1] != sp.true:
         *cases, (last, condition) = node.args
         if Or(*(c for _, c in cases), condition) == sp.true:
@@ -237,7 +240,12 @@ def _read(row: Any, symbols: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
     replace = {}
     for symbol in sorted(expression.free_symbols, key=str):
         replace[symbol] = _match(symbol, symbols, where)
-    expression = canonical(expression.xreplace(replace))
+    try:
+        expression = canonical(expression.xreplace(replace))
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise PlantError(
+            f"{where}: {expression} is not a real function ({error})", where=where
+        ) from error
     _check_nodes(expression, where)
     return expression
 
@@ -247,14 +255,10 @@ def _match(symbol: sp.Basic, symbols: Mapping[str, sp.Symbol], where: str) -> sp
     name = str(symbol)
     declared = symbols.get(name)
     if declared is None:
-        close = difflib.get_close_matches(name, symbols, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        known = ", ".join(symbols) if symbols else "none yet"
         raise PlantError(
-            f"{where}: the symbol {name} is not declared (declared: {known}){hint}",
+            f"{where}: {undeclared(name, symbols)}",
             symbol=name,
             declared=tuple(symbols),
-            closest=close[0] if close else None,
             where=where,
         )
     if symbol == declared or (type(symbol) is sp.Symbol and symbol == sp.Symbol(name)):
@@ -275,6 +279,11 @@ def _check_nodes(expression: sp.Expr, where: str) -> None:
                 raise PlantError(
                     f"{where}: {node} in {expression} is not a finite real number", where=where
                 )
+        elif isinstance(node, sp.Expr) and node.is_number:
+            try:
+                nearest_double(node)
+            except PlantError as error:
+                raise PlantError(f"{where}: {error}", where=where, number=node) from None
         elif isinstance(node, And | Or | Not | ExprCondPair):
             conditions = node.args[1:] if isinstance(node, ExprCondPair) else node.args
             if any(isinstance(condition, sp.Symbol) for condition in conditions):

@@ -5,7 +5,7 @@ from typing import Any
 
 import sympy as sp
 
-from obsynth.symbolic.declare import expand_names
+from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal
 

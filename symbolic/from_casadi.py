@@ -9,7 +9,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.symbolic.declare import expand_names
+from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.parity import check_parity, sample_box
 from obsynth.symbolic.tape import expand_function, from_tape

@@ -124,7 +124,8 @@ def _compare(
     used = row.free_symbols
     place = {str(s): float(v) for s, v in zip(symbols, point, strict=True) if s in used}
     raise ParityError(
-        f"{label}: the SymPy form is {mpmath.nstr(exact, 17)} and the CasADi form {value!r} at "
+        f"{label}: the SymPy form is {mpmath.nstr(exact, 17) if defined else 'no real number'} "
+        f"and the CasADi form {value!r} at "
         + ", ".join(f"{name} = {v!r}" for name, v in place.items())
         + f"; the row is {row}",
         row=label,
@@ -216,7 +217,9 @@ class _Evaluator:
         if isinstance(condition, Relational):
             left, right = self.visit(condition.lhs)[0], self.visit(condition.rhs)[0]
             return _COMPARE[condition.func](left, right)
-        return bool(condition == sp.true)
+        if condition in (sp.true, sp.false):
+            return bool(condition)
+        raise ParityError(f"the condition {condition} cannot be evaluated", condition=condition)
 
 
 def _function(node: sp.Expr) -> Callable[..., Any]:
@@ -229,4 +232,4 @@ def _function(node: sp.Expr) -> Callable[..., Any]:
 def _constant(node: sp.Expr) -> Any:
     if isinstance(node, sp.Rational):
         return mpmath.mpf(int(node.p)) / int(node.q)
-    return mpmath.mpf(node.evalf(40)._mpf_)
+    return mpmath.mpf(sp.Float(node.evalf(40), 40)._mpf_)

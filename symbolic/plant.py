@@ -9,6 +9,8 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from obsynth.symbolic import declarations
+from obsynth.symbolic.declarations import Names, Symbols
 from obsynth.symbolic.discretise import check_method, next_values, sampling_time
 from obsynth.symbolic.display import plant_html, plant_latex
 from obsynth.symbolic.equations import read_dynamics, read_outputs
@@ -23,7 +25,6 @@ from obsynth.symbolic.text import read_text
 
 __all__ = ["Plant"]
 
-Names = str | Sequence[str]
 Rows = tuple[sp.Expr, ...]
 
 
@@ -43,20 +44,7 @@ class Plant:
     Notes
     -----
     Every declaration takes names as ``sympy.symbols`` does and returns a tuple of real
-    SymPy symbols. Its keywords take one value for all symbols or a list with one each:
-
-    ``range``
-        A pair (lower, upper) in the signal's unit, or a list of pairs.
-    ``bound``
-        b for the range (-b, b).
-    ``nominal``
-        Value at the operating point, inside the range.
-    ``unit``
-        A label; no arithmetic is done with it.
-    ``rate``
-        Faults: the largest change per second, per step in a discrete plant.
-    ``constant``
-        True for what does not change with time.
+    SymPy symbols, for use in ordinary SymPy expressions.
 
     The states are complete once the dynamics stand. Everything else may be added until
     the plant is used (converted to CasADi or discretised).
@@ -88,109 +76,31 @@ class Plant:
 
     # -- declarations --------------------------------------------------------------
 
-    def states(
-        self, names: Names, *, range: Any = None, unit: Any = "", nominal: Any = None
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare states; ``range`` is the box that guarantees are about."""
-        if self._dynamics is not None:
-            raise PlantError("states are declared before the dynamics, one row for each")
-        return self._declare(Role.STATE, names, limits=range, unit=unit, nominal=nominal)
+    states = declarations.states
+    inputs = declarations.inputs
+    unknown_inputs = declarations.unknown_inputs
+    params = declarations.params
+    scheduling = declarations.scheduling
+    disturbances = declarations.disturbances
+    actuator_faults = declarations.actuator_faults
+    sensor_faults = declarations.sensor_faults
+    process_faults = declarations.process_faults
+    faults = declarations.process_faults
 
-    def inputs(
-        self, names: Names, *, range: Any = None, unit: Any = "", nominal: Any = None
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare known inputs; ``nominal`` defines the equilibrium."""
-        return self._declare(Role.INPUT, names, limits=range, unit=unit, nominal=nominal)
+    def declare(self, role: Role, names: Names, **keywords: Any) -> Symbols:
+        """Declare signals of a role; the methods above say which keywords it takes."""
+        self._refuse_in_use("signals")
+        self._cache.clear()
+        if "of" in keywords:
+            outputs = dict(zip(self.output_names, self.output_units, strict=True))
+            return self._table.declare_faults(role, names, outputs=outputs, **keywords)
+        return self._table.declare(role, names, self.output_names, **keywords)
 
-    def unknown_inputs(
-        self, names: Names, *, range: Any = None, unit: Any = ""
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare unknown inputs, which observers decouple; a range is optional."""
-        return self._declare(Role.UNKNOWN_INPUT, names, limits=range, unit=unit)
-
-    def params(
-        self,
-        names: Names,
-        value: Any = None,
-        *,
-        tolerance: Any = None,
-        range: Any = None,
-        unit: Any = "",
-        constant: Any = True,
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare parameters by value, by value and relative tolerance, or by range.
-
-        ``tolerance=0.05`` is 5 % to either side of the value. A parameter with nothing
-        but a value is one of the plant's ``constants``, kept exact; the others are its
-        ``p``, and ``constant=False`` lets them change inside their range.
-        """
-        keywords = {"value": value, "tolerance": tolerance, "unit": unit, "constant": constant}
-        return self._declare(Role.PARAM, names, limits=range, **keywords)
-
-    def scheduling(
-        self,
-        names: Names,
-        *,
-        range: Any = None,
-        unit: Any = "",
-        measured: Any = True,
-        nominal: Any = None,
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare scheduling variables; ``measured=False``: bounded, not known on line."""
-        keywords = {"unit": unit, "measured": measured, "nominal": nominal}
-        return self._declare(Role.SCHEDULING, names, limits=range, **keywords)
-
-    def disturbances(
-        self, names: Names, *, bound: Any = None, range: Any = None, unit: Any = ""
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare disturbances and noise; without bounds they have finite energy only.
-
-        Where the symbols stand in dynamics and outputs makes W1 and W2.
-        """
-        return self._declare(Role.DISTURBANCE, names, bound=bound, limits=range, unit=unit)
-
-    def actuator_faults(
-        self,
-        names: Names,
-        *,
-        of: Any,
-        range: Any = None,
-        rate: Any = None,
-        constant: Any = False,
-        unit: Any = None,
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare actuator faults: each input v in ``of`` becomes v + fault everywhere."""
-        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
-        return self._declare(Role.ACTUATOR_FAULT, names, of=of, **keywords)
-
-    def sensor_faults(
-        self,
-        names: Names,
-        *,
-        of: Any,
-        range: Any = None,
-        rate: Any = None,
-        constant: Any = False,
-        unit: Any = None,
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare sensor faults: each output y named in ``of`` becomes y + fault."""
-        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
-        return self._declare(Role.SENSOR_FAULT, names, of=of, **keywords)
-
-    def process_faults(
-        self,
-        names: Names,
-        *,
-        range: Any = None,
-        rate: Any = None,
-        constant: Any = False,
-        unit: Any = "",
-    ) -> tuple[sp.Symbol, ...]:
-        """Declare faults whose symbols stand in the equations (also called ``faults``)."""
-        keywords = {"limits": range, "rate": rate, "constant": constant, "unit": unit}
-        return self._declare(Role.PROCESS_FAULT, names, **keywords)
-
-    faults = process_faults
+    def add_signals(self, signals: Sequence[Signal]) -> None:
+        """Add signals made elsewhere."""
+        self._refuse_in_use("signals")
+        self._cache.clear()
+        self._table.add(signals, self.output_names)
 
     def dynamics(self, rows: Any, Ts: Any = None) -> None:
         """State the dynamics: time derivatives, or next values where ``Ts`` is given.
@@ -519,20 +429,6 @@ class Plant:
         return self.__dict__ | {"_cache": {}}
 
     # -- inside --------------------------------------------------------------------
-
-    def add_signals(self, signals: Sequence[Signal]) -> None:
-        """Add signals made elsewhere; the declarations above are the usual way."""
-        self._refuse_in_use("signals")
-        self._table.add(signals, self.output_names)
-        self._cache.clear()
-
-    def _declare(self, role: Role, names: Names, **keywords: Any) -> tuple[sp.Symbol, ...]:
-        self._refuse_in_use("signals")
-        self._cache.clear()
-        if "of" in keywords:
-            outputs = dict(zip(self.output_names, self.output_units, strict=True))
-            return self._table.declare_faults(role, names, outputs=outputs, **keywords)
-        return self._table.declare(role, names, self.output_names, **keywords)
 
     def _refuse_in_use(self, what: str) -> None:
         if self._in_use:

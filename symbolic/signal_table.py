@@ -7,7 +7,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.symbolic.declare import exact_number, expand_names, make_signals
+from obsynth.symbolic.arguments import exact_number, expand_names, make_signals
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.faults import check_targets, fault_units, read_targets
 from obsynth.symbolic.signals import KINDS, Role, Signal
@@ -89,7 +89,7 @@ class SignalTable:
         taken : sequence of str
             Names of outputs, which signals cannot have.
         **keywords
-            As ``declare.make_signals`` takes them.
+            As ``arguments.make_signals`` takes them.
 
         Returns
         -------
@@ -113,7 +113,7 @@ class SignalTable:
         outputs : mapping of str to str
             Units of the outputs declared so far, by name.
         **keywords
-            As ``declare.make_signals`` takes them; ``unit=None`` is the unit of the target.
+            As ``arguments.make_signals`` takes them; ``unit=None`` is the unit of the target.
 
         Returns
         -------

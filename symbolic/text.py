@@ -30,7 +30,7 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import ALIASES, BY_NAME
 from obsynth.symbolic.text_writer import write_text
 
-__all__ = ["WORDS", "TextError", "read_text", "write_text"]
+__all__ = ["WORDS", "TextError", "read_text", "undeclared", "write_text"]
 
 WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
 """Words of the language that cannot name a symbol."""
@@ -78,6 +78,19 @@ def read_text(text: str, symbols: Mapping[str, sp.Symbol]) -> sp.Expr:
     return _Reader(text, symbols).read()
 
 
+def undeclared(name: str, declared: Mapping[str, object]) -> str:
+    """Return the message about a symbol that is not declared.
+
+    Examples
+    --------
+    >>> undeclared("h3", {"h1": None, "v": None})
+    'the symbol h3 is not declared (declared: h1, v); did you mean h1?'
+    """
+    close = difflib.get_close_matches(name, declared, n=1, cutoff=0.5)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"the symbol {name} is not declared (declared: {', '.join(declared) or 'none'}){hint}"
+
+
 # -- reading ---------------------------------------------------------------------------
 
 
@@ -101,7 +114,13 @@ class _Reader:
         self.tokens = self._split()
 
     def read(self) -> sp.Expr:
-        result = self._number(self._condition)
+        try:
+            result = self._number(self._condition)
+        except TextError:
+            raise
+        except (TypeError, ValueError, ArithmeticError) as error:
+            # SymPy does not order or compare what is complex.
+            self._fail(f"the expression is not a real function ({error})")
         if self._now.kind != "end":
             self._fail(f"unexpected {self._now.text!r}")
         return result
@@ -278,11 +297,7 @@ class _Reader:
             return sp.pi
         if token.text in self.symbols:
             return self.symbols[token.text]
-        close = difflib.get_close_matches(token.text, self.symbols, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        known = ", ".join(self.symbols) or "none"
-        message = f"the symbol {token.text} is not declared (declared: {known}){hint}"
-        return self._fail(message, token.position)
+        return self._fail(undeclared(token.text, self.symbols), token.position)
 
     def _literal(self, token: _Token) -> sp.Expr:
         if token.text.isdigit():

@@ -112,7 +112,7 @@ def _add_text(node: sp.Add) -> str:
 def _mul_text(node: sp.Mul) -> tuple[str, int]:
     top, bottom = [], []
     negative = False
-    for factor in node.as_ordered_factors():
+    for factor in sorted(node.args, key=sp.default_sort_key):
         if isinstance(factor, sp.Number):
             negative = bool(factor < 0)
             size = abs(factor)
