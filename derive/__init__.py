@@ -5,10 +5,11 @@ from obsynth.derive.decoupling import Decoupling, decouple
 from obsynth.derive.dependence import AffineDependence
 from obsynth.derive.equilibrium import Equilibrium, equilibrium
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
+from obsynth.derive.identity import IdentityProof
 from obsynth.derive.intervals import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.report import Check, StructureReport, analyse
-from obsynth.derive.split import IdentityProof, Split, split
+from obsynth.derive.split import Split, split
 from obsynth.derive.structure import (
     Detectability,
     augmented_pair,

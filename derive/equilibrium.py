@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Equilibrium", "equilibrium", "operating_values"]
+__all__ = ["Equilibrium", "equilibrium", "operating_point", "operating_values"]
 
 Array = NDArray[np.float64]
 _STARTS = 32
@@ -196,3 +196,68 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
         u=inputs,
         symbols=tuple(names[k] for k in wrong),
     )
+
+
+def operating_point(model: Plant, at: Any = None) -> Equilibrium:
+    """Read a point of operation, or find the nominal one.
+
+    Parameters
+    ----------
+    model : Plant
+        The plant.
+    at : Equilibrium or (x, u), optional
+        The point; by default the equilibrium for the nominal inputs. It need not be an
+        equilibrium.
+
+    Returns
+    -------
+    Equilibrium
+        With the residual of the plant's equations at the point.
+
+    Raises
+    ------
+    DerivationError
+        Something that is no point of this plant.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> point = operating_point(quadruple_tank(), ([130, 172, 31, 39], [10, 10]))
+    >>> bool(0.0 < point.residual < 0.01)
+    True
+    """
+    if at is None:
+        return equilibrium(model)
+    if isinstance(at, Equilibrium):
+        point = at
+    else:
+        try:
+            x, u = (np.atleast_1d(np.asarray(part, dtype=float)) for part in at)
+        except (TypeError, ValueError) as error:
+            raise DerivationError(
+                f"at= is an Equilibrium or a pair (x, u); given was {at!r}", given=at
+            ) from error
+        residual = float("nan")
+        point = Equilibrium(
+            x, u, residual, operating_values(model, "p"), operating_values(model, "rho")
+        )
+    for kind, values in (("x", point.x), ("u", point.u)):
+        names = model.names(kind)
+        if values.shape != (len(names),) or not np.isfinite(values).all():
+            raise DerivationError(
+                f"the point of operation needs one finite number for each of {', '.join(names)}; "
+                f"given was {values.tolist()}",
+                symbols=names,
+            )
+    if np.isnan(point.residual):
+        function = model.function()
+        sx = model.sx()
+        zero = {k: np.zeros(getattr(sx, k).numel()) for k in ("d", "f", "w")}
+        value = np.array(
+            function(point.x, point.u, zero["d"], zero["f"], zero["w"], point.p, point.rho)[0]
+        ).ravel()
+        rest = value - point.x if model.Ts is not None else value
+        point = Equilibrium(
+            point.x, point.u, float(np.abs(rest).max(initial=0.0)), point.p, point.rho
+        )
+    return point

@@ -10,58 +10,20 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.derive.equilibrium import Equilibrium, equilibrium, operating_values
+from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.exact import is_zero, rational, round_number, substitute
 from obsynth.derive.factorise import expand_terms, factorise
-from obsynth.derive.linear_parts import LinearPart, constant_columns
+from obsynth.derive.identity import IdentityProof, prove_identity
+from obsynth.derive.linear_parts import constant_columns
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["IdentityProof", "LinearForm", "Split", "split"]
+__all__ = ["LinearForm", "Split", "split"]
 
 Array = NDArray[np.float64]
 LinearForm = Literal["frozen", "terms", "jacobian"]
 _FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
-
-
-@dataclass(frozen=True, eq=False)
-class IdentityProof:
-    """Proof that the parts of a split add up to the plant, row by row.
-
-    The matrices of the identity are exact: A and B are the rational numbers that their doubles
-    are, and g takes up the difference to the plant's own coefficients. D, B_f, W1, C and W2 belong
-    to signals that g must not contain, so they stay as the plant has them, and ``rounding``
-    bounds how far the doubles handed to a design are away.
-
-    Attributes
-    ----------
-    methods : tuple of str
-        How every row of the dynamics, then every row of the outputs, was proved: ``"syntactic"``,
-        ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was found.
-    rounding : dict of str to ndarray
-        Bounds of |exact - double| for D, B_f, W1, C, W2, D_f.
-    """
-
-    methods: tuple[str, ...]
-    rounding: dict[str, Array]
-
-    @property
-    def holds(self) -> bool:
-        """True when every row is proved."""
-        return all(self.methods)
-
-    def __str__(self) -> str:
-        worst = max((float(e.max(initial=0.0)) for e in self.rounding.values()), default=0.0)
-        ways = ", ".join(sorted(set(self.methods) - {""}))
-        missing = [str(k + 1) for k, method in enumerate(self.methods) if not method]
-        rows = f"all {len(self.methods)} rows: {ways}"
-        if missing:
-            rows = f"rows {', '.join(missing)} not proved"
-        return (
-            f"the parts add up to the plant exactly ({rows}); "
-            f"largest rounding of a matrix entry {worst:.2g}"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,44 +145,6 @@ def _symbols(model: Plant, kind: str) -> list[sp.Symbol]:
     return [s.symbol for s in getattr(model, kind)]
 
 
-def _point(model: Plant, at: Any) -> Equilibrium:
-    if at is None:
-        return equilibrium(model)
-    if isinstance(at, Equilibrium):
-        point = at
-    else:
-        try:
-            x, u = (np.atleast_1d(np.asarray(part, dtype=float)) for part in at)
-        except (TypeError, ValueError) as error:
-            raise DerivationError(
-                f"at= is an Equilibrium or a pair (x, u); given was {at!r}", given=at
-            ) from error
-        residual = float("nan")
-        point = Equilibrium(
-            x, u, residual, operating_values(model, "p"), operating_values(model, "rho")
-        )
-    for kind, values in (("x", point.x), ("u", point.u)):
-        names = model.names(kind)
-        if values.shape != (len(names),) or not np.isfinite(values).all():
-            raise DerivationError(
-                f"the point of operation needs one finite number for each of {', '.join(names)}; "
-                f"given was {values.tolist()}",
-                symbols=names,
-            )
-    if np.isnan(point.residual):
-        function = model.function()
-        sx = model.sx()
-        zero = {k: np.zeros(getattr(sx, k).numel()) for k in ("d", "f", "w")}
-        value = np.array(
-            function(point.x, point.u, zero["d"], zero["f"], zero["w"], point.p, point.rho)[0]
-        ).ravel()
-        rest = value - point.x if model.Ts is not None else value
-        point = Equilibrium(
-            point.x, point.u, float(np.abs(rest).max(initial=0.0)), point.p, point.rho
-        )
-    return point
-
-
 def _check_outputs(model: Plant) -> None:
     allowed = {s.symbol for kind in ("x", "w", "f") for s in getattr(model, kind)}
     allowed |= set(model.constant_values)
@@ -301,17 +225,17 @@ def split(
     C = constant_columns(model, model.output, x, "state", output_names)
     W2 = constant_columns(model, model.output, w, "disturbance", output_names)
     D_f = constant_columns(model, model.output, f, "sensor fault", output_names)
-    point = _point(model, at)
+    point = operating_point(model, at)
     values = model.constant_values
     quiet = model.rhs.subs(dict.fromkeys([*d, *f, *w], 0))
     quiet = quiet.applyfunc(lambda e: substitute(e, values))
     A, B = _matrices(model, quiet, point, linear)
-    exact_A, exact_B = A.applyfunc(rational), B.applyfunc(rational)
+    exact_A, exact_B = _exact(A), _exact(B)
     columns_x, columns_u = sp.Matrix(len(x), 1, x), sp.Matrix(len(u), 1, u)
     remainder = quiet - exact_A * columns_x - exact_B * columns_u
     g = sp.ImmutableMatrix(remainder.applyfunc(lambda e: sp.Add(*expand_terms(e))))
     parts = {"D": D, "B_f": B_f, "W1": W1, "C": C, "W2": W2, "D_f": D_f}
-    proof = _prove(model, exact_A, exact_B, g, parts)
+    proof = prove_identity(model, exact_A, exact_B, g, parts)
     if not proof.holds:
         row = proof.methods.index("")
         raise DerivationError(
@@ -319,8 +243,8 @@ def split(
         )
     return Split(
         model=model,
-        A=np.array(A, dtype=float).reshape(A.shape),
-        B=np.array(B, dtype=float).reshape(B.shape),
+        A=A,
+        B=B,
         D=D.value,
         B_f=B_f.value,
         C=C.value,
@@ -334,9 +258,14 @@ def split(
     )
 
 
+def _exact(matrix: Array) -> sp.Matrix:
+    """Return the rational numbers that the doubles of a matrix are."""
+    return sp.Matrix(*matrix.shape, [rational(value) for value in matrix.ravel()])
+
+
 def _matrices(
     model: Plant, rows: sp.Matrix, point: Equilibrium, linear: str
-) -> tuple[sp.Matrix, sp.Matrix]:
+) -> tuple[Array, Array]:
     """Evaluate A and B at the point of operation."""
     x, u = _symbols(model, "x"), _symbols(model, "u")
     numbers = {
@@ -353,7 +282,7 @@ def _matrices(
         form = factorise(rows, x, u)
         symbolic = (form.A, form.B) if linear == "frozen" else (form.linear_A, form.linear_B)
 
-    def at_point(entry: sp.Expr, i: int, j: int, signals: list[sp.Symbol]) -> sp.Float:
+    def at_point(entry: sp.Expr, i: int, j: int, signals: list[sp.Symbol]) -> float:
         value = entry.subs(numbers)
         if not value.is_finite:
             # the quotient t/x of a frozen form at x = 0 is the derivative of the term there
@@ -363,7 +292,7 @@ def _matrices(
                 numbers[signals[j]],
             )
         try:
-            return sp.Float(round_number(value)[0], 17)
+            return round_number(value)[0]
         except DerivationError as error:
             raise DerivationError(
                 f"the coefficient {entry} of {signals[j]} in the row of {x[i]} has no finite value "
@@ -374,35 +303,9 @@ def _matrices(
 
     result = []
     for matrix, signals in zip(symbolic, (x, u), strict=True):
-        filled = sp.zeros(len(x), len(signals))
-        for i in range(filled.rows):
-            for j in range(filled.cols):
-                if matrix[i, j] != 0:
-                    filled[i, j] = at_point(matrix[i, j], i, j, signals)
+        filled = np.zeros((len(x), len(signals)))
+        for i, j in np.ndindex(filled.shape):
+            if matrix[i, j] != 0:
+                filled[i, j] = at_point(matrix[i, j], i, j, signals)
         result.append(filled)
     return result[0], result[1]
-
-
-def _prove(
-    model: Plant, A: sp.Matrix, B: sp.Matrix, g: sp.Matrix, parts: dict[str, LinearPart]
-) -> IdentityProof:
-    """Show that the exact parts add up to the plant's own expressions."""
-    values = model.constant_values
-    column = {k: sp.Matrix(len(_symbols(model, k)), 1, _symbols(model, k)) for k in "xudfw"}
-    dynamics = (
-        A * column["x"]
-        + B * column["u"]
-        + parts["D"].exact * column["d"]
-        + parts["B_f"].exact * column["f"]
-        + parts["W1"].exact * column["w"]
-        + g
-    )
-    outputs = (
-        parts["C"].exact * column["x"]
-        + parts["W2"].exact * column["w"]
-        + parts["D_f"].exact * column["f"]
-    )
-    methods = []
-    for whole, summed in ((model.rhs, dynamics), (model.output, outputs)):
-        methods += [is_zero(substitute(whole[i], values) - summed[i]) for i in range(whole.rows)]
-    return IdentityProof(tuple(methods), {name: part.rounding for name, part in parts.items()})

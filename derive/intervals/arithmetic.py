@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "ONE",
-    "ZERO",
     "Array",
     "Interval",
     "Mask",
@@ -43,12 +41,9 @@ __all__ = [
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Interval = tuple[Array, Array]
-Operation = Callable[..., Interval]
 
 _INF = np.inf
 _EPS = float(np.finfo(float).eps)
-ZERO: Interval = (np.zeros(1), np.zeros(1))
-ONE: Interval = (np.ones(1), np.ones(1))
 
 
 def down(value: Array) -> Array:

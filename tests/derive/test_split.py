@@ -9,6 +9,8 @@ import sympy as sp
 from obsynth.derive import DerivationError, Split, StructureError, equilibrium, split
 from obsynth.derive.exact import enclose_number, is_zero, rational, round_number
 from obsynth.derive.factorise import expand_terms, factorise
+from obsynth.derive.identity import prove_identity
+from obsynth.derive.linear_parts import rounded
 from obsynth.symbolic import Plant
 
 x1, x2, x3, u1 = sp.symbols("x1:4 u1", real=True)
@@ -225,8 +227,6 @@ def test_frozen_form_without_a_limit_is_refused():
 
 
 def test_a_wrong_part_is_not_proved():
-    from obsynth.derive.linear_parts import rounded
-    from obsynth.derive.split import _prove
 
     plant = make(nonlinear)
     parts = split(plant, at=([0.3, -0.2], [1.0]))
@@ -242,12 +242,12 @@ def test_a_wrong_part_is_not_proved():
     A = sp.Matrix(parts.A.tolist()).applyfunc(rational)
     B = sp.Matrix(parts.B.tolist()).applyfunc(rational)
     right = {name: rounded(exact[name]) for name in names}
-    assert _prove(plant, A, B, parts.g, right).holds
+    assert prove_identity(plant, A, B, parts.g, right).holds
     wrong = A.copy()
     wrong[0, 0] += sp.Rational(1, 2**60)
-    assert _prove(plant, wrong, B, parts.g, right).methods[0] == ""
+    assert prove_identity(plant, wrong, B, parts.g, right).methods[0] == ""
     swapped = right | {"W1": rounded(sp.Matrix([sp.Rational(1, 7), 0]))}
-    assert _prove(plant, A, B, parts.g, swapped).methods[:2] == ("", "")
+    assert prove_identity(plant, A, B, parts.g, swapped).methods[:2] == ("", "")
 
 
 def bad_dynamics(extra, row=1):
