@@ -39,7 +39,8 @@ FloatArray = NDArray[np.float64]
 
 # Room for other orders of summation when the bounds are computed again elsewhere.
 SLACK = 2.0**-36
-MOST_STEPS = 3000
+# Products that the tail may cost unless the caller asks for more: some seconds.
+MOST_PRODUCTS = 150_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +133,9 @@ def transient(
         Bounds of ``|zeta_0|`` and ``|f_0 - fhat_0|``. An observer that starts with
         ``z_0 = T xhat_0`` has ``zeta_0 = T (x_0 - xhat_0)``.
     steps : int, optional
-        For how many instants beta is computed; about three time constants of
-        the slowest guaranteed decay by default.
+        For how many instants beta is computed; by default about three time
+        constants of the slowest guaranteed decay, fewer for slow systems, where
+        that would take long (at least 64). More steps make `c` smaller.
     decay : float, optional
         lambda; by default the one with the smallest ``sum c_i / b_i`` times its
         time constant.
@@ -172,7 +174,8 @@ def transient(
     trial = _Trial(system)
     slowest = trial.slowest()
     if steps is None:
-        steps = int(np.clip(np.ceil(3.0 / (1.0 - slowest)), 64, MOST_STEPS))
+        affordable = MOST_PRODUCTS // trial.feedback.size
+        steps = int(np.clip(np.ceil(3.0 / (1.0 - slowest)), 64, max(affordable, 64)))
     if steps < 2:
         raise ObsynthError(f"steps = {steps}: at least 2 are needed", argument="steps")
     beta = _beta(system, start, steps)
