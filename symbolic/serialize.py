@@ -91,7 +91,9 @@ def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
         raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
     plant.add_signals([signal_from_dict(item) for item in read_field(data, "signals", list)])
     step = read_field(data, "Ts", str, None)
-    rows = [str(row) for row in read_field(data, "dynamics", list)]
+    rows = read_field(data, "dynamics", list)
+    if not all(isinstance(row, str) for row in rows):
+        raise PlantError(f"stored plant: dynamics are texts, not {rows!r}", key="dynamics")
     plant.dynamics(rows, Ts=None if step is None else read_text(step, {}))
     outputs = read_field(data, "outputs", list)
     names, units, texts = (

@@ -208,17 +208,27 @@ def expand_function(function: ca.Function) -> ca.Function:
     """
     if function.is_a("SXFunction"):
         return function
+    expanded, reason = _expand(function)
+    if expanded is not None:
+        return expanded
+    culprit = _culprit(function)
+    raise PlantError(
+        f"the MX expression cannot be expanded to SX because of {culprit or 'a part of it'} "
+        f"({reason}); write the equation without it",
+        function=culprit,
+    )
+
+
+def _expand(function: ca.Function) -> tuple[ca.Function | None, str]:
+    """Return the expanded function, or None and the reason."""
     try:
-        return function.expand()
+        expanded = function.expand()
     except RuntimeError as error:
-        culprit = _culprit(function)
         # CasADi's last line says which class refuses.
-        reason = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-        raise PlantError(
-            f"the MX expression cannot be expanded to SX because of {culprit or 'a part of it'} "
-            f"({reason}); give the equation as SX",
-            function=culprit,
-        ) from error
+        return None, str(error).strip().splitlines()[-1].split(": ", 1)[-1]
+    # Calls may survive as opaque nodes of the SX graph.
+    codes = (expanded.instruction_id(k) for k in range(expanded.n_instructions()))
+    return (None, "it stays a call") if ca.OP_CALL in codes else (expanded, "")
 
 
 def _culprit(function: ca.Function) -> str | None:
@@ -228,9 +238,7 @@ def _culprit(function: ca.Function) -> str | None:
         if not node.is_call():
             continue
         called = node.which_function()
-        try:
-            called.expand()
-        except RuntimeError:
+        if _expand(called)[0] is None:
             inner = _culprit(called) if called.is_a("MXFunction") else None
             return inner or f"{called.name()} ({called.class_name()})"
     return None
