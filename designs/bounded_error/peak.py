@@ -21,10 +21,10 @@ from obsynth.designs.bounded_error.step import RuntimeBound
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.certificate import Claim
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.peak_bound import PeakBound, peak_bound, prove_peak
-from obsynth.designs.peak_gain import peak_gain
-from obsynth.designs.peak_system import PeakSystem, peak_system
-from obsynth.designs.peak_transient import Transient, transient
+from obsynth.designs.peak.bound import PeakBound, peak_bound, prove_peak
+from obsynth.designs.peak.gain import peak_gain
+from obsynth.designs.peak.system import PeakSystem, peak_system
+from obsynth.designs.peak.transient import Transient, transient
 
 if TYPE_CHECKING:
     from obsynth.designs.bounded_error.method import BoundedErrorUIO

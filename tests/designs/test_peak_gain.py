@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from obsynth.designs import peak_gain as peak_gain_module
 from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.peak_attained import attained
-from obsynth.designs.peak_bound import peak_bound, prove_peak
-from obsynth.designs.peak_gain import PeakGain, peak_gain
-from obsynth.designs.peak_system import PeakSystem, peak_system, projected_gains
+from obsynth.designs.peak import gain as peak_gain_module
+from obsynth.designs.peak.attained import attained
+from obsynth.designs.peak.bound import peak_bound, prove_peak
+from obsynth.designs.peak.gain import PeakGain, peak_gain
+from obsynth.designs.peak.sums import absolute_sums
+from obsynth.designs.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.symbolic.errors import ObsynthError
 
 REFERENCE = json.loads(
@@ -119,7 +120,7 @@ class TestSearch:
         rng = np.random.default_rng(wanted)
         matrix, inputs = 0.4 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
         outputs = rng.normal(size=(4, 3))
-        fast = peak_gain_module._absolute_sums(matrix, inputs, outputs, wanted)
+        fast = absolute_sums(matrix, inputs, outputs, wanted).total
         steps = 4
         while steps < wanted:
             steps *= 2
@@ -127,6 +128,21 @@ class TestSearch:
             np.abs(outputs @ np.linalg.matrix_power(matrix, k) @ inputs) for k in range(steps)
         )
         np.testing.assert_allclose(fast, direct, rtol=1e-12)
+
+    def test_derivative_of_the_sums(self):
+        rng = np.random.default_rng(7)
+        matrix, inputs = 0.4 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
+        outputs, weights = rng.normal(size=(4, 3)), rng.uniform(size=(4, 2))
+        bars = absolute_sums(matrix, inputs, outputs, 31).derivative(weights)
+        step = 1e-7
+        for which, bar in enumerate(bars):
+            for entry in np.ndindex(bar.shape):
+                ends = []
+                for sign in (1, -1):
+                    data = [matrix.copy(), inputs.copy()]
+                    data[which][entry] += sign * step
+                    ends.append((weights * absolute_sums(*data, outputs, 31).total).sum())
+                assert bar[entry] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5)
 
     def test_rotated_unknown_input(self):
         """T and Pi have no zeros here; the gains keep the form T K Pi, F Pi."""

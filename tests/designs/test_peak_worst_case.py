@@ -13,14 +13,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from obsynth.designs import peak_bound as peak_bound_module
 from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.peak_attained import Attained, attained
-from obsynth.designs.peak_bound import PeakBound, peak_bound
-from obsynth.designs.peak_responses import response
-from obsynth.designs.peak_system import PeakSystem, peak_system, projected_gains
-from obsynth.designs.peak_transient import transient
+from obsynth.designs.peak import bound as peak_bound_module
+from obsynth.designs.peak.attained import Attained, attained
+from obsynth.designs.peak.bound import PeakBound, peak_bound
+from obsynth.designs.peak.responses import response
+from obsynth.designs.peak.system import PeakSystem, peak_system, projected_gains
+from obsynth.designs.peak.transient import transient
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "bounded_error_uio.json"
 WBAR, EPSBAR = np.full(3, 0.1), np.full(2, 0.05)

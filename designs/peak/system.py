@@ -28,8 +28,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.lmi.enclosure import Enclosure
 from obsynth.designs.lmi.exact import ExactMatrix
-from obsynth.designs.peak_channels import Channels, split_channels
-from obsynth.designs.peak_rounding import nearest
+from obsynth.designs.peak.channels import Channels, split_channels
+from obsynth.designs.peak.rounding import nearest
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["PeakSystem", "peak_system", "projected_gains"]

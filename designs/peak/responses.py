@@ -21,7 +21,7 @@ from scipy.linalg import matrix_balance
 
 from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.lmi.enclosure import Enclosure, gamma_bound
-from obsynth.designs.peak_rounding import add_up, product_up, raised
+from obsynth.designs.peak.rounding import add_up, product_up, raised
 
 __all__ = ["PowerSum", "Response", "power_sum", "response"]
 

@@ -1,7 +1,7 @@
 """Gains that minimise the sum of the peak bounds themselves.
 
 The bound is a piecewise smooth function of the gains that is cheap to evaluate,
-so it is minimised directly: BFGS on finite differences, which copes with kinks
+so it is minimised directly: BFGS with its gradient, which copes with kinks
 (A. S. Lewis and M. L. Overton, Nonsmooth optimization via quasi-Newton methods,
 Mathematical Programming 141, 2013), from the given gains and from random
 neighbours of them, since there are many local minima. What is found is rounded
@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.peak_bound import PeakBound, channel_inputs, peak_bound
-from obsynth.designs.peak_small_gain import spectral_radius
-from obsynth.designs.peak_system import PeakSystem, projected_gains
+from obsynth.designs.peak.bound import PeakBound, channel_inputs, peak_bound
+from obsynth.designs.peak.small_gain import spectral_radius
+from obsynth.designs.peak.sums import absolute_sums
+from obsynth.designs.peak.system import PeakSystem, projected_gains
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["PeakGain", "peak_gain"]
@@ -67,8 +68,8 @@ def peak_gain(
     weights: ArrayLike | None = None,
     rounding: ArrayLike | None = None,
     dbar: ArrayLike | None = None,
-    starts: int = 8,
-    evaluations: int = 12_000,
+    starts: int = 4,
+    evaluations: int = 4_000,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> PeakGain:
@@ -105,7 +106,7 @@ def peak_gain(
 
     Examples
     --------
-    >>> from obsynth.designs.peak_system import peak_system
+    >>> from obsynth.designs.peak.system import peak_system
     >>> system = peak_system(
     ...     A=[[0.9]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0, 0.0]], W2=[[0.0, 1.0]], K=[[0.2]],
     ...     F=[[]], constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.05, 0.05]],
@@ -211,7 +212,12 @@ class _Search:
 
     def value(self, point: FloatArray) -> float:
         """Return the weighted sum of the bounds, `INFEASIBLE` or more where there are none."""
+        return self.value_and_gradient(point)[0]
+
+    def value_and_gradient(self, point: FloatArray) -> tuple[float, FloatArray]:
+        """Return the weighted sum of the bounds and its gradient; zero where there is none."""
         self.count += 1
+        nowhere = np.zeros(point.size)
         K, F = self.gains(point)
         gain = np.vstack([K, F])
         matrix = self.open.copy()
@@ -219,20 +225,31 @@ class _Search:
         inputs = self.inputs.copy()
         inputs[:, : self.n_w] -= gain @ self.Pi_W2
         if not np.all(np.isfinite(matrix)):
-            return INFEASIBLE * 10
+            return INFEASIBLE * 10, nowhere
         radius = spectral_radius(matrix)
         if not radius < 1.0:
-            return INFEASIBLE * (1.0 + radius)
+            return INFEASIBLE * (1.0 + radius), nowhere
         wanted = np.log(HORIZON) / np.log(max(radius, 1e-3))
         if wanted > MOST_STEPS:
-            return INFEASIBLE * (1.0 + radius)
-        sums = _absolute_sums(matrix, inputs, self.system.outputs, wanted)
-        n = self.through + sums @ self.sizes
-        G = sums[:, self.n_w : self.n_w + self.n_c] @ self.coupling
+            return INFEASIBLE * (1.0 + radius), nowhere
+        sums = absolute_sums(matrix, inputs, self.system.outputs, wanted)
+        channels = slice(self.n_w, self.n_w + self.n_c)
+        n = self.through + sums.total @ self.sizes
+        G = sums.total[:, channels] @ self.coupling
         rho = spectral_radius(G)
         if not rho < 1.0:
-            return INFEASIBLE * (1.0 + min(rho, 1e6))
-        return float(self.weights @ np.linalg.solve(np.eye(len(n)) - G, n))
+            return INFEASIBLE * (1.0 + min(rho, 1e6)), nowhere
+        b = np.linalg.solve(np.eye(len(n)) - G, n)
+        # d(w'b) = v' (dn + dG b) with v = (I - G)^-T w, and both are linear in the sums
+        v = np.linalg.solve(np.eye(len(n)) - G.T, self.weights)
+        driving = self.sizes.copy()
+        driving[channels] += self.coupling @ b
+        matrix_bar, inputs_bar = sums.derivative(np.outer(v, driving))
+        gain_bar = -matrix_bar[:, : self.n] @ self.system.C.T
+        gain_bar -= inputs_bar[:, : self.n_w] @ self.Pi_W2.T
+        rows = gain_bar @ self.right.T
+        theta_bar = np.vstack([self.left.T @ rows[: self.n], rows[self.n :]])
+        return float(self.weights @ b), (theta_bar * self.scale).ravel()
 
     def neighbour(self, origin: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return a random feasible point, nearer and nearer until there is one."""
@@ -250,7 +267,9 @@ class _Search:
         from scipy.optimize import minimize
 
         with np.errstate(all="ignore"):
-            found = minimize(self.value, point, method="BFGS", options={"maxiter": 200})
+            found = minimize(
+                self.value_and_gradient, point, jac=True, method="BFGS", options={"maxiter": 200}
+            )
         return np.asarray(found.x, dtype=float)
 
     def short_gains(self, point: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -261,32 +280,6 @@ class _Search:
             if self.value(self.coordinates(K, F)) <= limit:
                 return K, F
         return self.gains(point)
-
-
-def _absolute_sums(
-    matrix: FloatArray, inputs: FloatArray, outputs: FloatArray, wanted: float
-) -> FloatArray:
-    """Return ``sum_k |Q A^k B|`` over at least so many steps, in two batches of products.
-
-    A^(j + m i) B is (A^j) (A^(m i) B): the left factors and the right factors
-    are made by doubling, and one product gives all responses. The number of
-    steps is a power of two, so that it is constant under small changes.
-    """
-    doublings = max(int(np.ceil(np.log2(max(wanted, 4.0)))), 2)
-    size = matrix.shape[0]
-    left = outputs[None]
-    square = matrix
-    for _ in range(doublings // 2):
-        left = np.concatenate([left, left @ square])
-        square = square @ square
-    right = inputs[None]
-    for _ in range(doublings - doublings // 2):
-        right = np.concatenate([right, square @ right])
-        square = square @ square
-    product = left.reshape(-1, size) @ right.transpose(1, 0, 2).reshape(size, -1)
-    np.abs(product, out=product)
-    rows = product.reshape(len(left), len(outputs), -1).sum(axis=0)
-    return np.asarray(rows.reshape(len(outputs), len(right), -1).sum(axis=1))
 
 
 def _positive(values: FloatArray) -> FloatArray:

@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.peak_responses import PowerSum, Response, power_sum, response
-from obsynth.designs.peak_rounding import add_up, lowered, product_up, raised
-from obsynth.designs.peak_small_gain import contraction, small_gain_solution, spectral_radius
-from obsynth.designs.peak_system import PeakSystem, peak_system
+from obsynth.designs.peak.responses import PowerSum, Response, power_sum, response
+from obsynth.designs.peak.rounding import add_up, lowered, product_up, raised
+from obsynth.designs.peak.small_gain import contraction, small_gain_solution, spectral_radius
+from obsynth.designs.peak.system import PeakSystem, peak_system
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = [
@@ -171,7 +171,7 @@ def peak_bound(
 
     Examples
     --------
-    >>> from obsynth.designs.peak_system import peak_system
+    >>> from obsynth.designs.peak.system import peak_system
     >>> system = peak_system(
     ...     A=[[0.5]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0]], W2=[[0.0]], K=[[0.0]], F=[[]],
     ...     constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.25, 0.25]],

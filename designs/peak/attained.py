@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.peak_bound import PeakBound
+from obsynth.designs.peak.bound import PeakBound
 
 __all__ = ["Attained", "attained"]
 
@@ -64,8 +64,8 @@ def attained(peak: PeakBound) -> Attained:
 
     Examples
     --------
-    >>> from obsynth.designs.peak_bound import peak_bound
-    >>> from obsynth.designs.peak_system import peak_system
+    >>> from obsynth.designs.peak.bound import peak_bound
+    >>> from obsynth.designs.peak.system import peak_system
     >>> system = peak_system(
     ...     A=[[0.5]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0]], W2=[[0.0]], K=[[0.0]], F=[[]],
     ...     constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.25, 0.25]],

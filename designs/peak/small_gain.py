@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.peak_rounding import TINY, add_up, product_up, raised
+from obsynth.designs.peak.rounding import TINY, add_up, product_up, raised
 
 __all__ = ["contraction", "small_gain_solution", "spectral_radius"]
 
