@@ -1,5 +1,6 @@
 """Scenarios: what happens to a plant, as a value that simulation only runs."""
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -46,7 +47,7 @@ class Scenario:
     f_range : array (n_f, 2), optional
         Box of the initial fault that a design may assume.
     feedback : bool
-        True when ``inputs`` is a function of (k, y).
+        True when ``inputs`` is a function of (k, y); set by itself where it needs both.
 
     Raises
     ------
@@ -75,6 +76,10 @@ class Scenario:
     def __post_init__(self) -> None:
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
             raise PlantError(f"scenario {self.name!r}: steps={self.steps!r} is no positive integer")
+        if callable(self.inputs) and _needed(self.inputs) == 2:
+            object.__setattr__(self, "feedback", True)
+        if self.feedback and not callable(self.inputs):
+            raise PlantError(f"scenario {self.name!r}: a feedback is a function of (k, y)")
         object.__setattr__(self, "x0", self._array("x0", self.x0, (None,)))
         object.__setattr__(self, "guess", self._array("guess", self.guess, self.x0.shape))
         for field in ("inputs", "faults", "unknown_inputs", "scheduling", "disturbances"):
@@ -121,12 +126,17 @@ class Scenario:
                 f"scenario {self.name!r} has {len(self.x0)} initial states, "
                 f"plant {model.name!r} {len(model.x)}"
             )
+        if self.f_range is not None and len(self.f_range) != len(model.f):
+            raise PlantError(
+                f"scenario {self.name!r}: f_range has {len(self.f_range)} rows, plant "
+                f"{model.name!r} {len(model.f)} faults"
+            )
         samples = self.steps + 1
         u = None
         if not self.feedback:
             values = self.inputs
             if callable(values):
-                values = np.array([np.ravel(values(k)) for k in range(samples)], dtype=np.float64)
+                values = self._called("inputs", [values(k) for k in range(samples)])
             u = self._fit("inputs", values, model.names("u"))
         middle = [_middle(s.lower, s.upper, s.nominal) for s in model.rho]
         return {
@@ -150,8 +160,12 @@ class Scenario:
             return rng.uniform(box[:, 0], box[:, 1], (samples, len(box)))
         values = self.disturbances
         if callable(values):
-            values = np.array([np.ravel(values(rng, k)) for k in range(samples)], dtype=np.float64)
+            values = self._called("disturbances", [values(rng, k) for k in range(samples)])
         return self._fit("disturbances", values, model.names("w"))
+
+    def _called(self, field: str, rows: list[ArrayLike]) -> Array:
+        """Return what a function gave, one row per sample."""
+        return self._array(field, [np.ravel(row) for row in rows], (self.steps + 1, None))
 
     def _fit(
         self, field: str, value: Any, names: tuple[str, ...], default: list[float] | None = None
@@ -170,7 +184,13 @@ class Scenario:
         return self._array(field, value, shape)
 
     def _array(self, field: str, value: Any, shape: tuple[int | None, ...]) -> Array:
-        array = np.array(value, dtype=np.float64)
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise PlantError(
+                f"scenario {self.name!r}: {field} is not an array of numbers ({error})",
+                field=field,
+            ) from error
         fits = array.ndim == len(shape) and all(
             want is None or have == want for have, want in zip(array.shape, shape, strict=True)
         )
@@ -184,6 +204,16 @@ class Scenario:
             raise PlantError(f"scenario {self.name!r}: {field} holds non-finite data", field=field)
         array.flags.writeable = False
         return array
+
+
+def _needed(function: Callable[..., Any]) -> int:
+    """Return how many arguments a function cannot do without."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except ValueError:
+        return 1
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in positional and p.default is p.empty for p in parameters)
 
 
 def _middle(lower: float, upper: float, nominal: float | None) -> float:

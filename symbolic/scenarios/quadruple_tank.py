@@ -51,7 +51,7 @@ def quadruple_tank(name: str = "FS1") -> Scenario:
         x0=np.array([130.0, 170.0, 30.0, 40.0]),
         guess=guess,
         inputs=np.column_stack([10.0 + np.sin(k / 50.0), 10.0 + np.cos(k / 80.0)]),
-        faults=np.column_stack([profile, -profile if name == "FS2" else 0.0 * profile]),
+        faults=np.column_stack([profile, 0.0 - profile if name == "FS2" else np.zeros(steps + 1)]),
         unknown_inputs=np.full((steps + 1, 1), 0.1),
         x_range=np.column_stack([guess - 10.0, guess + 10.0]),
         f_range=np.zeros((2, 2)),
@@ -61,4 +61,5 @@ def quadruple_tank(name: str = "FS1") -> Scenario:
 def _profile(k: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return f1 of both scenarios: down to -5 V, long after up to 5 V."""
     cases = [k <= 1000, k <= 1100, k <= 3000, k <= 3200]
-    return np.select(cases, [0.0 * k, 50.0 - 0.05 * k, -5.0 + 0.0 * k, 0.05 * k - 155.0], 5.0)
+    values = [np.zeros_like(k), 50.0 - 0.05 * k, np.full_like(k, -5.0), 0.05 * k - 155.0]
+    return np.select(cases, values, 5.0)
