@@ -1,5 +1,6 @@
 """What it is worth: simulation, coverage, plots, report."""
 
+from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.domain import Domain, StatusCount
 from obsynth.evaluate.errors import ReportError, SimulationError
 from obsynth.evaluate.interface import StepObserver
@@ -19,6 +20,7 @@ __all__ = [
     "Table",
     "Trace",
     "Violation",
+    "coverage_table",
     "plot_errors",
     "plot_run",
     "plot_signal",

@@ -320,7 +320,7 @@ def _settled(run: Run) -> int:
     """Find the first instant from which no interval is much wider than at the end."""
     start = len(run.t) // 100
     for width in run.widths.values():
-        wide = np.flatnonzero(~(width <= 1.2 * width[-1]))
+        wide = np.flatnonzero(~(width <= 1.6 * width[-1]))
         if np.isfinite(width[-1]) and wide.size:
             start = max(start, int(wide[-1]) + 1)
     return min(start, len(run.t) // 2)

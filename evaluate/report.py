@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.equations import constants_html, equations_html, signals_table
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.layout import panels
@@ -238,7 +239,7 @@ def _width_section(
         figure = _new_figure(7.4, 3.0)
         plot_widths(widths, names, units, ax=figure.subplots())
     section.add(_figure_html(figure, "widths", ""))
-    rows = [[label, *(float(v) for v in row), float(sum(row))] for label, row in widths.items()]
+    rows = [[label, *(f"{v:.3f}" for v in row), f"{sum(row):.3f}"] for label, row in widths.items()]
     section.add(Table("Half widths in steady state", ["", *names, "sum"], rows)._repr_html_())
     return section
 
@@ -248,7 +249,7 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
     scenarios = dict.fromkeys(run.scenario for several in runs.values() for run in several)
     if not scenarios:
         return section
-    section.add(_coverage(runs, list(scenarios))._repr_html_())
+    section.add(coverage_table(runs)._repr_html_())
     for i, scenario in enumerate(scenarios):
         section.add(f"<h3>{html.escape(scenario)}</h3>")
         first: dict[str, Run] = {}
@@ -270,32 +271,6 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
             plot_errors(first if len(first) > 1 else next(iter(first.values())), axes=axes)
         section.add(_figure_html(figure, f"err{i}", caption))
     return section
-
-
-def _coverage(runs: Mapping[str, Sequence[Run]], scenarios: Sequence[str]) -> Table:
-    entries = [
-        (scenarios.index(run.scenario), label, run)
-        for label, several in runs.items()
-        for run in several
-    ]
-    names = entries[0][2].estimated
-    rows = [
-        [
-            run.scenario,
-            label,
-            run.seed,
-            *(percent(run.coverage.get(name, float("nan"))) for name in names),
-            run.domain.ok and not run.outside,
-        ]
-        for _, label, run in sorted(entries, key=lambda entry: entry[0])
-    ]
-    return Table(
-        "Coverage",
-        ["scenario", "design", "seed", *names, "assumptions kept"],
-        rows,
-        note="Fraction of all instants, the first included, at which the truth is inside its "
-        "interval; counted at tolerance zero.",
-    )
 
 
 def _facts(run: Run) -> str:

@@ -20,6 +20,8 @@ def text(value: Any, digits: int = 4) -> str:
     ('0.01446', 'yes', '–', '5001', 'h3')
     >>> text(float("inf")), text(-2.5e-13)
     ('∞', '−2.5e−13')
+    >>> text(-0.0)
+    '0'
     """
     if value is None:
         return "–"
@@ -37,7 +39,7 @@ def text(value: Any, digits: int = 4) -> str:
         return "no number"
     if math.isinf(number):
         return "∞" if number > 0 else "−∞"
-    return f"{number:.{digits}g}".replace("-", "−")
+    return f"{number + 0.0:.{digits}g}".replace("-", "−")
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Table:
         return [[text(cell) for cell in row] for row in self.rows]
 
     def numeric(self) -> list[bool]:
-        """Return which columns hold numbers only, and are set flush right."""
+        """Return which columns hold numbers or percentages only, and are set flush right."""
         return [
             bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
             for j in range(len(self.columns))
@@ -133,8 +135,10 @@ class Table:
 def _is_number(cell: Any) -> bool:
     if cell is None:
         return True
-    if isinstance(cell, (bool, str)):
+    if isinstance(cell, bool):
         return False
+    if isinstance(cell, str):
+        cell = cell.removesuffix(" %").replace("−", "-")
     try:
         float(cell)
     except (TypeError, ValueError):

@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from obsynth.designs import Observer as Observer
     from obsynth.designs import load as load
     from obsynth.evaluate import Run as Run
+    from obsynth.evaluate import SimulationError as SimulationError
+    from obsynth.evaluate import Table as Table
+    from obsynth.evaluate import coverage_table as coverage_table
+    from obsynth.evaluate import plot_errors as plot_errors
+    from obsynth.evaluate import plot_run as plot_run
+    from obsynth.evaluate import plot_signal as plot_signal
+    from obsynth.evaluate import plot_widths as plot_widths
     from obsynth.evaluate import report as report
     from obsynth.evaluate import simulate as simulate
     from obsynth.symbolic import ObsynthError as ObsynthError
@@ -51,16 +58,23 @@ __all__ = [
     "PlantError",
     "Run",
     "Scenario",
+    "SimulationError",
     "Split",
     "StructureError",
+    "Table",
     "UnboundedError",
     "__version__",
     "analyse",
+    "coverage_table",
     "equilibrium",
     "generate_c",
     "jacobian_bounds",
     "load",
     "plants",
+    "plot_errors",
+    "plot_run",
+    "plot_signal",
+    "plot_widths",
     "report",
     "scenarios",
     "simulate",
@@ -89,7 +103,18 @@ _ROOMS = {
         "load",
     ),
     "codegen": ("CProject", "generate_c"),
-    "evaluate": ("Run", "report", "simulate"),
+    "evaluate": (
+        "Run",
+        "SimulationError",
+        "Table",
+        "coverage_table",
+        "plot_errors",
+        "plot_run",
+        "plot_signal",
+        "plot_widths",
+        "report",
+        "simulate",
+    ),
 }
 _HOME = {name: f"obsynth.{room}" for room, names in _ROOMS.items() for name in names}
 _MODULES = {name: f"obsynth.symbolic.{name}" for name in ("plants", "scenarios")}

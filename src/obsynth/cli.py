@@ -1,0 +1,180 @@
+"""The command ``obsynth``: run a study from equations to C, prove a saved design again."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from obsynth import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from obsynth.evaluate import Table
+
+__all__ = ["app", "main"]
+
+STUDIES = ("quadruple-tank",)
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="From a plant's equations to a proven fault-estimating observer in C.",
+)
+
+
+def main() -> None:
+    """Run the command line; refusals are sentences on stderr and exit code 1."""
+    # Threads of the linear algebra cost more than they give on matrices of twenty rows; this has
+    # to stand in the environment before NumPy is loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    app()
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"obsynth {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """From a plant's equations to a proven fault-estimating observer in C."""
+
+
+@app.command()
+def run(
+    study: Annotated[str, typer.Argument(help=f"One of: {', '.join(STUDIES)}.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the result; out/STUDY by default.")
+    ] = None,
+    steps: Annotated[int, typer.Option(help="Simulated samples, at most 5000.", min=1)] = 5000,
+    seeds: Annotated[int, typer.Option(help="Noise seeds for each scenario.", min=1)] = 3,
+) -> None:
+    """Derive, design, prove, simulate, write C and report; leave a folder with all of it."""
+    if study not in STUDIES:
+        _refuse(f"there is no study {study!r}; there is {', '.join(STUDIES)}.")
+    folder = Path("out", study) if out is None else out
+    with _refusals():
+        from obsynth.evaluate.folder import check_target
+
+        check_target(folder)
+        start = time.perf_counter()
+        with _progress() as advance:
+            from obsynth.evaluate.studies import quadruple_tank
+
+            found = quadruple_tank(folder, steps=steps, seeds=seeds, progress=advance)
+    console = _console()
+    for table in found.tables():
+        console.print(_rich(table))
+        console.print()
+    seconds = time.perf_counter() - start
+    console.print(f"{folder}/ holds report.html, design.json, design_ellipsoid.json, c/")
+    console.print(f"finished in {seconds:.0f} s")
+    if found.coverage < 1.0:
+        _refuse("a guaranteed interval was violated; see the coverage table.")
+
+
+@app.command()
+def check(
+    design: Annotated[Path, typer.Argument(help="A design saved by obsynth, a JSON file.")],
+) -> None:
+    """Prove a saved design again, from the file alone and without a solver."""
+    if not design.is_file():
+        _refuse(f"there is no file {str(design)!r}.")
+    with _refusals():
+        from obsynth.designs import load
+        from obsynth.evaluate import Table
+
+        with _progress() as advance:
+            advance("reading the design and proving its LMIs", 0.0)
+            observer = load(design)
+            advance("deriving the bounds again and proving every claim", 0.3)
+            certificate = observer.certificate.check()
+            advance("done", 1.0)
+    rows = [[claim.statement, claim.margin, claim.proof] for claim in certificate]
+    title = f"{design.name}: {observer.method} for {observer.model.name}, every claim proved again"
+    console = _console()
+    console.print(_rich(Table(title, ["claim", "margin", "proof"], rows)))
+    console.print(str(observer.guarantee), markup=False, highlight=False)
+
+
+def _console(stderr: bool = False) -> Any:
+    from rich.console import Console
+
+    console = Console(stderr=stderr, highlight=False)
+    # Redirected output has no width of its own; tables should not be folded to 80 columns there.
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=140)
+
+
+def _rich(table: Table) -> Any:
+    """Turn a table into one of Rich's; the note stands below."""
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    shown = RichTable(
+        title=Text(table.title, style="bold"),
+        title_justify="left",
+        caption=Text(table.note) if table.note else None,
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        show_header=any(table.columns),
+    )
+    for head, flush in zip(table.columns, table.numeric(), strict=True):
+        shown.add_column(Text(head), justify="right" if flush else "left", overflow="fold")
+    for i, row in enumerate(table.cells()):
+        style = "bold" if i in table.marked else ""
+        shown.add_row(*(Text(cell) for cell in row), style=style)
+    return shown
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, float], None]]:
+    """Show a bar with the stage and the time, on terminals only."""
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = _console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description:<34}"), BarColumn(28))
+    with Progress(
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda stage, done: bar.update(task, description=stage, completed=done)
+
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Turn refusals into one sentence and an exit code; anything else keeps its traceback."""
+    from obsynth.symbolic.errors import ObsynthError
+
+    try:
+        yield
+    except ObsynthError as error:
+        _refuse(str(error))
+    except OSError as error:
+        _refuse(f"{error.strerror}: {error.filename}")
+
+
+def _refuse(message: str) -> None:
+    print(f"obsynth: {message}", file=sys.stderr)
+    raise typer.Exit(code=1)

@@ -1,0 +1,153 @@
+"""The command: what it prints, its exit codes, and refusals without tracebacks."""
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+import obsynth
+from obsynth.cli import app
+from obsynth.evaluate import Table
+
+runner = CliRunner()
+
+
+def said(result):
+    return " ".join(result.output.split())
+
+
+def test_version():
+    result = runner.invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output == f"obsynth {obsynth.__version__}\n"
+
+
+def test_help_names_the_commands():
+    result = runner.invoke(app, [])
+    assert "run" in result.output
+    assert "check" in result.output
+
+
+def test_an_unknown_study_is_refused_with_the_known_ones():
+    result = runner.invoke(app, ["run", "triple-tank"])
+    assert result.exit_code == 1
+    assert "no study 'triple-tank'; there is quadruple-tank" in said(result)
+
+
+@pytest.fixture
+def canned(monkeypatch):
+    calls = []
+
+    def study(folder, steps, seeds, progress):
+        calls.append((folder, steps, seeds))
+        progress("working", 0.5)
+        table = Table("Bounds", ["entry", "value"], [["m[13]", 0.5]], marked=[0])
+        return SimpleNamespace(tables=lambda: [table], coverage=study.coverage)
+
+    study.coverage = 1.0
+    monkeypatch.setattr("obsynth.evaluate.studies.quadruple_tank", study)
+    return SimpleNamespace(calls=calls, study=study)
+
+
+def test_run_prints_tables_and_what_it_left(canned, tmp_path):
+    out = tmp_path / "result"
+    result = runner.invoke(
+        app, ["run", "quadruple-tank", "--out", str(out), "--steps", "40", "--seeds", "2"]
+    )
+    assert result.exit_code == 0
+    assert canned.calls == [(out, 40, 2)]
+    assert "m[13]" in result.output
+    assert "holds report.html, design.json" in said(result)
+
+
+def test_a_violated_interval_is_a_failure(canned, tmp_path):
+    canned.study.coverage = 0.9998
+    result = runner.invoke(app, ["run", "quadruple-tank", "--out", str(tmp_path / "r")])
+    assert result.exit_code == 1
+    assert "a guaranteed interval was violated" in said(result)
+
+
+def test_a_folder_in_use_is_refused_before_the_work(canned, tmp_path):
+    (tmp_path / "mine.txt").write_text("")
+    result = runner.invoke(app, ["run", "quadruple-tank", "--out", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "did not write (mine.txt)" in said(result)
+    assert canned.calls == []
+    assert "Traceback" not in result.output
+
+
+def test_steps_below_one_are_refused_by_the_parser():
+    result = runner.invoke(app, ["run", "quadruple-tank", "--steps", "0"])
+    assert result.exit_code == 2
+
+
+def test_check_proves_a_design_from_its_file(given_peak, tmp_path):
+    path = tmp_path / "design.json"
+    given_peak.save(path)
+    result = runner.invoke(app, ["check", str(path)])
+    assert result.exit_code == 0
+    text = said(result)
+    assert "every claim proved again" in text
+    assert "Guaranteed:" in text
+    assert "[monitored: status bit 4]" in text
+
+
+def test_check_refuses_a_bound_a_tenth_of_a_per_cent_too_small(given_peak, tmp_path):
+    path = tmp_path / "design.json"
+    given_peak.save(path)
+    record = json.loads(path.read_text())
+    record["bound"]["b"][0] *= 0.999
+    path.write_text(json.dumps(record))
+    result = runner.invoke(app, ["check", str(path)])
+    assert result.exit_code == 1
+    assert "n + G b <= b" in said(result)
+    assert "every claim proved again" not in said(result)
+
+
+def test_check_refuses_what_is_no_design(tmp_path):
+    missing = runner.invoke(app, ["check", str(tmp_path / "no.json")])
+    assert missing.exit_code == 1
+    assert "there is no file" in said(missing)
+    (tmp_path / "text.json").write_text("{not json")
+    broken = runner.invoke(app, ["check", str(tmp_path / "text.json")])
+    assert broken.exit_code == 1
+    assert "is not JSON" in said(broken)
+
+
+def test_the_command_line_itself_loads_quickly_and_without_heavy_libraries():
+    code = (
+        "import sys, obsynth.cli\n"
+        "print(sorted({'casadi', 'sympy', 'numpy', 'matplotlib', 'cvxpy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.long
+def test_the_whole_command_from_outside(tmp_path):
+    """FS1 and FS2, three seeds, both bounds: everything inside, everything left, in a minute."""
+    out = tmp_path / "tank"
+    environment = {**os.environ, "COLUMNS": "140"}
+    command = [sys.executable, "-m", "obsynth", "run", "quadruple-tank", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    text = done.stdout
+    assert text.count("100 %") == 4 * 6
+    assert "0.00903" in text
+    assert "too narrow" in text
+    rows = {line.split()[0]: line.split() for line in text.splitlines() if line.strip()}
+    assert abs(float(rows["ellipsoid"][-2]) - 21.80) < 0.01
+    assert float(rows["peak"][-1]) < 0.14
+    assert (out / "report.html").stat().st_size > 100_000
+    for name in ("design.json", "design_ellipsoid.json"):
+        proof = subprocess.run(
+            [sys.executable, "-m", "obsynth", "check", str(out / name)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert proof.returncode == 0, proof.stderr
