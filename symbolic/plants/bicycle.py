@@ -9,10 +9,10 @@ from obsynth.symbolic.plant import Plant
 
 __all__ = ["bicycle"]
 
-_TYRES = ("pacejka", "fiala", "linear")
+_TYRES = ("pacejka", "linear")
 
 
-def bicycle(tyre: Literal["pacejka", "fiala", "linear"] = "pacejka") -> Plant:
+def bicycle(tyre: Literal["pacejka", "linear"] = "pacejka") -> Plant:
     """Return the single-track model of a passenger car with nonlinear tyres.
 
     Longitudinal speed v_x, lateral speed v_y and yaw rate r of the centre of gravity, steering
@@ -23,11 +23,10 @@ def bicycle(tyre: Literal["pacejka", "fiala", "linear"] = "pacejka") -> Plant:
 
     Parameters
     ----------
-    tyre : {"pacejka", "fiala", "linear"}
-        Side force of an axle with the load F_z and the slope K = 21.92 F_z: Pacejka's formula
+    tyre : {"pacejka", "linear"}
+        Side force of an axle with the load F_z: Pacejka's magic formula
         D sin(C atan(B alpha - E (B alpha - atan(B alpha)))) with D = 1.0489 F_z, C = 1.3507,
-        E = -0.0074722 and B = K/(C D); Fiala's cubic of tan(alpha) that saturates at D; or
-        K alpha.
+        E = -0.0074722 and the slope B C D = K = 21.92 F_z at zero; or K alpha.
 
     Returns
     -------
@@ -45,16 +44,15 @@ def bicycle(tyre: Literal["pacejka", "fiala", "linear"] = "pacejka") -> Plant:
     ----------
     Althoff, Wuersching: CommonRoad: Vehicle models, 2020: Tables 6 and 7, vehicle 2 (BMW 320i)
     with the tyre of the ADAMS handbook, without its shifts, load transfer and combined slip.
-    Pacejka: Tire and Vehicle Dynamics, Chapter 4. Fiala: Seitenkraefte am rollenden Luftreifen,
-    VDI-Zeitschrift 96, 1954.
+    Pacejka: Tire and Vehicle Dynamics, Chapter 4.
 
     Examples
     --------
     >>> car = bicycle()
     >>> car.names("x"), car.names("d")
     (('v_x', 'v_y', 'r', 'delta'), ('d',))
-    >>> bicycle("fiala").rhs[2].has(sp.Max)
-    True
+    >>> car.rhs[3]
+    f2 + v_delta
     """
     if tyre not in _TYRES:
         raise PlantError(f"the bicycle has the tyres {', '.join(_TYRES)}, not {tyre!r}", tyre=tyre)
@@ -75,13 +73,10 @@ def bicycle(tyre: Literal["pacejka", "fiala", "linear"] = "pacejka") -> Plant:
     l_f, l_r = plant.params("l_f l_r", lengths, unit="m")
     (g,) = plant.params("g", R(981, 100), unit="m/s^2")
     (slope,) = plant.params("p_K", R(2192, 100))
-    shape = ()
-    if tyre != "linear":
-        (friction,) = plant.params("p_D", R(10489, 10**4))
-        shape = (friction,)
+    shape: tuple[sp.Symbol, ...] = ()
     if tyre == "pacejka":
-        C, E = plant.params("p_C p_E", [R(13507, 10**4), R(-74722, 10**7)])
-        shape = (friction, C, E)
+        values = [R(10489, 10**4), R(13507, 10**4), R(-74722, 10**7)]
+        shape = plant.params("p_D p_C p_E", values)
     load_f, load_r = m * g * l_r / (l_f + l_r), m * g * l_f / (l_f + l_r)
     side_f = load_f * _side_force(tyre, delta - sp.atan((v_y + l_f * r) / v_x), slope, shape)
     side_r = load_r * _side_force(tyre, -sp.atan((v_y - l_r * r) / v_x), slope, shape)
@@ -103,11 +98,6 @@ def _side_force(
     """Side force divided by the load."""
     if tyre == "linear":
         return slope * slip
-    if tyre == "pacejka":
-        friction, C, E = shape
-        x = slope / (C * friction) * slip
-        return friction * sp.sin(C * sp.atan(x - E * (x - sp.atan(x))))
-    (friction,) = shape
-    # s = 1 is full sliding; the cubic has slope 0 there, so the force is smooth
-    s = sp.Min(1, sp.Max(-1, slope * sp.tan(slip) / (3 * friction)))
-    return friction * (3 * s - 3 * s * sp.Abs(s) + s**3)
+    friction, C, E = shape
+    x = slope / (C * friction) * slip
+    return friction * sp.sin(C * sp.atan(x - E * (x - sp.atan(x))))

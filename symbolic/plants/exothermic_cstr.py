@@ -11,8 +11,8 @@ def exothermic_cstr() -> Plant:
     """Return the jacketed reactor with the first-order exothermic reaction A -> B.
 
     Balances of A and of energy with the Arrhenius rate k0 exp(-E/(R T)) C_A. For the nominal
-    coolant temperature of 300 K there are three steady states, of which the middle one,
-    near C_A = 0.5 mol/L and 350 K, is unstable.
+    coolant temperature of 300 K there are three steady states (C_A, T): (0.877, 324.5), stable,
+    (0.500, 350.0), a saddle, and (0.209, 369.7), unstable as well and within a limit cycle.
 
     Returns
     -------
@@ -28,10 +28,10 @@ def exothermic_cstr() -> Plant:
     Examples
     --------
     >>> plant = exothermic_cstr()
-    >>> plant.rhs[0].subs(plant.constant_values).subs({"C_A": 0, "d": 0})
-    1/60
-    >>> [s.name for s in plant.f]
-    ['f', 's']
+    >>> plant.names("d"), plant.names("f")
+    (('d',), ('f', 's'))
+    >>> sp.diff(plant.rhs[1], plant.u[0].symbol).subs(plant.constant_values)
+    25/717
     """
     R = sp.Rational
     plant = Plant("exothermic CSTR")
