@@ -10,6 +10,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.symbolic.arguments import expand_names
+from obsynth.symbolic.declarations import Names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.parity import check_parity, sample_box
 from obsynth.symbolic.tape import expand_function, from_tape
@@ -17,7 +18,7 @@ from obsynth.symbolic.tape import expand_function, from_tape
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = ["CasadiSystem", "fill_plant"]
+__all__ = ["CasadiSystem", "plant_from_casadi"]
 
 _METHODS = {
     "x": ("states", ("range", "unit", "nominal")),
@@ -125,42 +126,102 @@ class CasadiSystem:
         return [flat[a:b] for a, b in pairwise(np.cumsum([0, *self._sizes]))]
 
 
-def fill_plant(
-    plant: "Plant",
-    columns: Mapping[str, Any],
-    rhs: Any,
+def plant_from_casadi(
+    cls: type["Plant"],
+    /,
+    name: str,
+    *,
+    x: Any,
     y: Any,
-    Ts: Any,
-    options: Mapping[str, Any],
-    names: Mapping[str, Any],
-    output_names: Any,
-) -> None:
-    """Declare in a new plant what CasADi expressions say, and check that it is the same.
+    u: Any = None,
+    d: Any = None,
+    f: Any = None,
+    w: Any = None,
+    p: Any = None,
+    rho: Any = None,
+    xdot: Any = None,
+    xnext: Any = None,
+    Ts: Any = None,
+    range: Any = None,
+    names: Mapping[str, Any] | None = None,
+    output_names: Names | None = None,
+    output_unit: Any = "",
+    **options: Any,
+) -> "Plant":
+    """Make a plant from CasADi expressions, SX or MX.
+
+    The equations are kept in SymPy from then on, compared with the CasADi function
+    at random points of the box. Faults stand in the expressions themselves.
 
     Parameters
     ----------
-    plant : Plant
-        Without signals.
-    columns : mapping of str to SX, MX or a list of them
-        The symbols by kind.
-    rhs, y : SX, MX or a list of them
-    Ts : float or None
-        Sampling time of a discrete plant.
-    options : mapping of str to mapping or None
-        For each keyword of the declarations its values by kind or by signal; a plain
-        value is for the states.
-    names, output_names
-        Names where CasADi's own will not do.
+    x, u, d, f, w, p, rho : SX, MX or a list of them
+        Columns of symbols.
+    xdot, xnext : SX, MX or a list of them
+        Time derivatives, or next values with the sampling time ``Ts`` (1 s if left out).
+    y : SX, MX or a list of them
+        Outputs.
+    range, bound, nominal, unit, rate, constant, measured, value, tolerance : mapping
+        Keywords of the declarations, by kind (``{"x": ..., "u": ...}``) or by signal;
+        a plain value is for the states.
+    names : mapping of str to names, optional
+        By kind, where CasADi's own names will not do.
+    output_names : names, optional
+    output_unit : str or sequence of str
+
+    Returns
+    -------
+    Plant
 
     Raises
     ------
     PlantError
-        Whatever the declarations refuse; an operation without a SymPy form.
+        Symbols that are no symbols, types that are mixed, symbols not listed, MX that cannot
+        be expanded, operations without a SymPy form, and what declarations refuse.
     ParityError
         The SymPy form is not the same function.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic import Plant
+    >>> h, v = ca.SX.sym("h"), ca.SX.sym("v")
+    >>> Plant.from_casadi("tank", x=h, u=v, xdot=v - ca.sqrt(h), y=h, range=(1, 9)).rhs
+    Matrix([[-sqrt(h) + v]])
     """
-    system = CasadiSystem(columns, rhs, y, names)
+    if (xdot is None) == (xnext is None):
+        raise PlantError("from_casadi: give xdot= (continuous) or xnext= (discrete)")
+    if xnext is None and Ts is not None:
+        raise PlantError("from_casadi: Ts= goes with xnext=; discretise a continuous plant")
+    step = None if xnext is None else 1 if Ts is None else Ts
+    columns = {"x": x, "u": u, "d": d, "f": f, "w": w, "p": p, "rho": rho}
+    rhs = xdot if xnext is None else xnext
+    plant = cls(name)
+    options["range"] = range
+    system = CasadiSystem(columns, rhs, y, names or {})
+    _declare(plant, system, options)
+    signals = {signal.name: signal for signal in plant.signals}
+    ordered = [signals[name] for named in system.names.values() for name in named]
+    rows = system.expressions({signal.name: signal.symbol for signal in ordered})
+    plant.dynamics(rows[: system.rows], Ts=step)
+    plant.outputs(rows[system.rows :], names=output_names, unit=output_unit)
+    box = np.array([(s.lower, s.upper) for s in ordered])
+    centre = np.array([0.0 if s.nominal is None else s.nominal for s in ordered])
+    points = sample_box(box, around=centre)
+    symbols = [s.symbol for s in ordered]
+    check_parity(rows, symbols, system.values, points, system.labels)
+    return plant
+
+
+def _declare(plant: "Plant", system: CasadiSystem, options: Mapping[str, Any]) -> None:
+    """Declare the signals with the keywords that are theirs."""
     by_word = {word: _by_kind(word, option, system) for word, option in options.items()}
+    known = {word for _, allowed in _METHODS.values() for word in allowed}
+    unknown = sorted(set(options) - known)
+    if unknown:
+        raise PlantError(
+            f"from_casadi: {unknown[0]}= is no keyword; signals take {', '.join(sorted(known))}",
+            keyword=unknown[0],
+        )
     for kind, named in system.names.items():
         method, allowed = _METHODS[kind]
         keywords = {word: by_kind[kind] for word, by_kind in by_word.items() if kind in by_kind}
@@ -173,16 +234,6 @@ def fill_plant(
                 keyword=wrong[0],
             )
         getattr(plant, method)(named, **keywords)
-    signals = {signal.name: signal for signal in plant.signals}
-    ordered = [signals[name] for named in system.names.values() for name in named]
-    rows = system.expressions({signal.name: signal.symbol for signal in ordered})
-    plant.dynamics(rows[: system.rows], Ts=Ts)
-    plant.outputs(rows[system.rows :], names=output_names)
-    box = np.array([(s.lower, s.upper) for s in ordered])
-    centre = np.array([0.0 if s.nominal is None else s.nominal for s in ordered])
-    points = sample_box(box, around=centre)
-    symbols = [s.symbol for s in ordered]
-    check_parity(rows, symbols, system.values, points, system.labels)
 
 
 def _by_kind(word: str, option: Any, system: CasadiSystem) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from obsynth.symbolic.display import plant_html, plant_latex
 from obsynth.symbolic.equations import read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.faults import check_targets, insert_faults
-from obsynth.symbolic.from_casadi import fill_plant
+from obsynth.symbolic.from_casadi import plant_from_casadi
 from obsynth.symbolic.serialize import fill_from_dict, plant_to_dict, read_field
 from obsynth.symbolic.signal_table import SignalTable
 from obsynth.symbolic.signals import KINDS, Role, Signal
@@ -338,64 +338,7 @@ class Plant:
         self._in_use = result._in_use = True
         return result
 
-    @classmethod
-    def from_casadi(
-        cls,
-        name: str,
-        *,
-        x: Any,
-        y: Any,
-        u: Any = None,
-        d: Any = None,
-        f: Any = None,
-        w: Any = None,
-        p: Any = None,
-        rho: Any = None,
-        xdot: Any = None,
-        xnext: Any = None,
-        Ts: Any = None,
-        range: Any = None,
-        names: Mapping[str, Any] | None = None,
-        output_names: Names | None = None,
-        **options: Any,
-    ) -> "Plant":
-        """Make a plant from CasADi expressions, SX or MX.
-
-        The equations are kept in SymPy from then on, compared with the CasADi function
-        at random points of the box. Faults stand in the expressions themselves.
-
-        Parameters
-        ----------
-        x, u, d, f, w, p, rho : SX, MX or a list of them
-            Columns of symbols.
-        xdot, xnext : SX, MX or a list of them
-            Time derivatives, or next values with the sampling time ``Ts`` (1 s if left out).
-        y : SX, MX or a list of them
-            Outputs.
-        range, bound, nominal, unit, rate, constant, measured, value, tolerance : mapping
-            Keywords of the declarations, by kind (``{"x": ..., "u": ...}``) or by signal;
-            a plain value is for the states.
-        names : mapping of str to names, optional
-            By kind, where CasADi's own names will not do.
-        output_names : names, optional
-
-        Examples
-        --------
-        >>> h, v = ca.SX.sym("h"), ca.SX.sym("v")
-        >>> Plant.from_casadi("tank", x=h, u=v, xdot=v - ca.sqrt(h), y=h, range=(1, 9)).rhs
-        Matrix([[-sqrt(h) + v]])
-        """
-        if (xdot is None) == (xnext is None):
-            raise PlantError("from_casadi: give xdot= (continuous) or xnext= (discrete)")
-        if xnext is None and Ts is not None:
-            raise PlantError("from_casadi: Ts= goes with xnext=; discretise a continuous plant")
-        step = None if xnext is None else 1 if Ts is None else Ts
-        columns = {"x": x, "u": u, "d": d, "f": f, "w": w, "p": p, "rho": rho}
-        rhs = xdot if xnext is None else xnext
-        plant = cls(name)
-        options["range"] = range
-        fill_plant(plant, columns, rhs, y, step, options, names or {}, output_names)
-        return plant
+    from_casadi = classmethod(plant_from_casadi)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the complete plant as JSON-able data, expressions as text."""

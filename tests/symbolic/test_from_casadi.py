@@ -39,11 +39,13 @@ def test_the_tank_written_in_casadi_is_the_tank(kind):
         nominal={"u": 10},
         unit={"x": "cm", "v_0": "V"},
         rate={"f": 0.05},
+        output_unit="cm",
     )
     reference = quadruple_tank()
     assert plant.names("x") == ("h_0", "h_1", "h_2", "h_3")
     assert [s.unit for s in plant.u] == ["V", ""]
     assert [s.rate for s in plant.f] == [0.05, 0.05]
+    assert plant.output_units == ("cm",) * 3
     assert all(signal.nominal == 10 for signal in plant.u)
     np.testing.assert_array_equal(plant.box("x"), reference.box("x"))
     np.testing.assert_array_equal(plant.box("w"), reference.box("w"))
@@ -176,7 +178,7 @@ REFUSALS = {
     "names of nobody": ({"x": X, "xdot": X, "y": X, "names": {"u": "v"}}, "names= has 'u'"),
     "too many names": ({"x": X, "xdot": X, "y": X, "names": {"x": "a b"}}, "2 names for 1"),
     "rate of a state": ({"x": X, "xdot": X, "y": X, "rate": {"x": 1}}, "rate= means nothing for x"),
-    "unknown keyword": ({"x": X, "xdot": X, "y": X, "colour": {"x": 1}}, "colour= means nothing"),
+    "unknown keyword": ({"x": X, "xdot": X, "y": X, "colour": {"x": 1}}, "colour= is no keyword"),
     "name twice": ({"x": X, "u": ca.SX.sym("x"), "xdot": X, "y": X}, "taken by the state x"),
     "remainder": ({"x": X, "xdot": X, "y": ca.remainder(X, 2)}, "outputs row 1: .*remainder"),
     "fmod": ({"x": [X, Y], "xdot": [X, 1 + ca.fmod(X, Y)], "y": X}, "dynamics row 2: .*fmod"),
