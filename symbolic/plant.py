@@ -17,7 +17,7 @@ from obsynth.symbolic.equations import read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.faults import check_targets, insert_faults
 from obsynth.symbolic.from_casadi import plant_from_casadi
-from obsynth.symbolic.serialize import fill_from_dict, plant_to_dict, read_field
+from obsynth.symbolic.serialize import check_format, fill_from_dict, plant_to_dict, read_field
 from obsynth.symbolic.signal_table import SignalTable
 from obsynth.symbolic.signals import KINDS, Role, Signal
 from obsynth.symbolic.sxmodel import SxModel, build_sx
@@ -347,7 +347,8 @@ class Plant:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Plant":
         """Read a plant from what :meth:`to_dict` returned; nothing is evaluated."""
-        if isinstance(data, Mapping) and "continuous" in data:
+        check_format(data)
+        if "continuous" in data:
             discretise = read_field(data, "discretise", dict)
             step = read_text(read_field(discretise, "Ts", str), {})
             original = cls.from_dict(read_field(data, "continuous", dict))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FORMAT",
+    "check_format",
     "fill_from_dict",
     "plant_to_dict",
     "read_field",
@@ -56,18 +57,32 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
             "discretise": {"method": plant.discretisation, "Ts": step},
             "continuous": plant_to_dict(original),
         }
-    dynamics, outputs = plant.equations
+    dynamics, outputs = ([_row_text(row, plant) for row in rows] for rows in plant.equations)
     return {
         "format": FORMAT,
         "name": plant.name,
         "Ts": step,
         "signals": [signal_to_dict(signal) for signal in plant.signals],
-        "dynamics": [write_text(row) for row in dynamics],
+        "dynamics": dynamics,
         "outputs": [
-            {"name": name, "unit": unit, "expression": write_text(row)}
-            for name, unit, row in zip(plant.output_names, plant.output_units, outputs, strict=True)
+            {"name": name, "unit": unit, "expression": text}
+            for name, unit, text in zip(
+                plant.output_names, plant.output_units, outputs, strict=True
+            )
         ],
     }
+
+
+def check_format(data: Mapping[str, Any]) -> None:
+    """Refuse data of another format.
+
+    Examples
+    --------
+    >>> check_format({"format": FORMAT})
+    """
+    stored = read_field(data, "format", str)
+    if stored != FORMAT:
+        raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
 
 
 def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
@@ -83,12 +98,8 @@ def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
     Raises
     ------
     PlantError
-        Another format, a field that is missing or not of its type, and whatever the
-        declarations refuse.
+        A field that is missing or not of its type, and whatever the declarations refuse.
     """
-    stored = read_field(data, "format", str)
-    if stored != FORMAT:
-        raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
     plant.add_signals([signal_from_dict(item) for item in read_field(data, "signals", list)])
     step = read_field(data, "Ts", str, None)
     rows = read_field(data, "dynamics", list)
@@ -100,6 +111,14 @@ def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
         [read_field(item, key, str) for item in outputs] for key in ("name", "unit", "expression")
     )
     plant.outputs(texts, names=names, unit=units)
+
+
+def _row_text(row: sp.Expr, plant: "Plant") -> str:
+    """Write a row, and make sure here and now that it can be read again."""
+    text = write_text(row)
+    if read_text(text, {signal.name: signal.symbol for signal in plant.signals}) != row:
+        raise PlantError(f"the expression {row} does not survive being written as {text!r}")
+    return text
 
 
 def signal_to_dict(signal: Signal) -> dict[str, Any]:

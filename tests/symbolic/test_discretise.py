@@ -23,18 +23,49 @@ def plant_with_everything():
     return plant
 
 
+def is_euler(model, h):
+    """Say whether dynamics, D, W1 and rates carry the step, and the outputs do not."""
+    x, u, d, w1, w2, f, g, s = sp.symbols("x u d w1 w2 f g s", real=True)
+    by_hand = x + h * (-3 * x + 2 * (u + f) + 5 * d + 7 * w1 + g)
+    rates = [float(rate * h) for rate in (0.3, 2.0, 1.0)]
+    return (
+        sp.expand(model.rhs[0] - by_hand) == 0
+        and model.output == sp.Matrix([x + 11 * w2 + s])
+        and [signal.rate for signal in model.f] == pytest.approx(rates, rel=1e-15)
+    )
+
+
 @pytest.mark.parametrize("step", [0.5, sp.Rational(1, 10), 2])
 def test_euler_scales_dynamics_and_rates_but_no_output(step):
     model = plant_with_everything().discretise("euler", step)
-    h = sp.nsimplify(step)
-    x, u, d, w1, w2, f, g, s = sp.symbols("x u d w1 w2 f g s", real=True)
-    assert sp.expand(model.rhs[0] - (x + h * (-3 * x + 2 * (u + f) + 5 * d + 7 * w1 + g))) == 0
-    assert model.output == sp.Matrix([x + 11 * w2 + s])
-    assert [signal.rate for signal in model.f] == pytest.approx([0.3 * h, 2.0 * h, 1.0 * h], abs=0)
+    assert is_euler(model, sp.nsimplify(step))
     assert model.Ts == float(step)
     assert model.discretisation == "euler"
     assert model.continuous is not None
     assert [signal.rate for signal in model.continuous.f] == [0.3, 2.0, 1.0]
+
+
+def scaled(symbol, row):
+    return row.subs(symbol, symbol * sp.Rational(1, 2))
+
+
+MUTANTS = {
+    "W2 scaled": lambda m: m._outputs.update(
+        y1=scaled(sp.Symbol("w2", real=True), m._outputs["y1"])
+    ),
+    "D scaled twice": lambda m: setattr(
+        m, "_dynamics", (scaled(sp.Symbol("d", real=True), m.equations[0][0] + 0),)
+    ),
+    "rates per second": lambda m: setattr(m, "_table", m.continuous._table),
+    "step forgotten": lambda m: setattr(m, "_dynamics", m.continuous.equations[0]),
+}
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_planted_errors_are_seen(mutant):
+    model = plant_with_everything().discretise("euler", 0.5)
+    MUTANTS[mutant](model)
+    assert not is_euler(model, sp.Rational(1, 2))
 
 
 def test_rk4_of_a_linear_equation_is_its_taylor_polynomial():

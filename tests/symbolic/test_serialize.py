@@ -1,5 +1,6 @@
 """Plants as JSON and back."""
 
+import builtins
 import copy
 import json
 
@@ -7,8 +8,9 @@ import pytest
 import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sympy.parsing import sympy_parser
 
-from obsynth.symbolic import Plant, PlantError, Role, Signal
+from obsynth.symbolic import Plant, PlantError, Role, Signal, serialize
 from obsynth.symbolic.plants import quadruple_tank
 from obsynth.symbolic.serialize import signal_from_dict, signal_to_dict
 
@@ -135,6 +137,34 @@ def test_a_discretised_plant_needs_its_method():
     data["discretise"]["method"] = "magic"
     with pytest.raises(PlantError, match="'magic' is unknown"):
         Plant.from_dict(data)
+
+
+def test_a_discretised_plant_of_another_format_is_refused():
+    data = PLANTS["tank euler"]().to_dict()
+    data["format"] = "obsynth plant 2"
+    with pytest.raises(PlantError, match="the format is"):
+        Plant.from_dict(data)
+
+
+def test_reading_evaluates_nothing(monkeypatch):
+    stored = json.loads(json.dumps(rich().to_dict()))
+
+    def forbidden(*_args, **_keywords):
+        raise AssertionError("text was handed to an evaluator")
+
+    monkeypatch.setattr(builtins, "eval", forbidden)
+    monkeypatch.setattr(sympy_parser, "parse_expr", forbidden)
+    monkeypatch.setattr(sympy_parser, "eval_expr", forbidden)
+    assert Plant.from_dict(stored).to_dict() == stored
+    with pytest.raises(AssertionError, match="evaluator"):
+        sp.sympify("x + 1")
+
+
+def test_what_could_not_be_read_again_is_not_stored(monkeypatch):
+    plant = discrete()
+    monkeypatch.setattr(serialize, "write_text", lambda row: "0.25*x")
+    with pytest.raises(PlantError, match="does not survive"):
+        plant.to_dict()
 
 
 def test_an_incomplete_plant_is_not_stored():
