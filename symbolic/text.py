@@ -36,7 +36,7 @@ WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piec
 """Words of the language that cannot name a symbol."""
 
 _TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?)"
+    r"\s*(?:(?P<number>(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
     r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>]))"
 )
@@ -162,6 +162,12 @@ class _Reader:
             f"{message}, at position {where} of {shown!r}", position=where, text=self.text
         )
 
+    def _deeper(self) -> None:
+        # Python's own stack would end in an error without a position.
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self._fail(f"more than {_DEEPEST} levels of signs, powers and parentheses")
+
     def _number(self, rule: Any) -> sp.Expr:
         position = self._now.position
         result = rule()
@@ -177,9 +183,7 @@ class _Reader:
         return result
 
     def _condition(self) -> sp.Basic:
-        self.depth += 1
-        if self.depth > _DEEPEST:
-            self._fail(f"more than {_DEEPEST} levels of parentheses")
+        self._deeper()
         result = self._joined("or", Or, lambda: self._joined("and", And, self._negation))
         self.depth -= 1
         return result
@@ -198,7 +202,10 @@ class _Reader:
 
     def _negation(self) -> sp.Basic:
         if self._take("not"):
-            return Not(self._truth(self._negation))
+            self._deeper()
+            inner = self._truth(self._negation)
+            self.depth -= 1
+            return Not(inner)
         position = self._now.position
         left = self._sum()
         operator = self._take(*_COMPARE)
@@ -244,9 +251,7 @@ class _Reader:
         return self._finite(sp.Mul(*factors), position)
 
     def _factor(self) -> sp.Basic:
-        self.depth += 1
-        if self.depth > _DEEPEST:
-            self._fail(f"more than {_DEEPEST} levels of signs, powers and parentheses")
+        self._deeper()
         if sign := self._take("-", "+"):
             inner = self._number(self._factor)
             result = -inner if sign.text == "-" else inner
