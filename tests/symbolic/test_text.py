@@ -99,7 +99,7 @@ def test_errors_say_where(text, position, words):
 
 
 @pytest.mark.parametrize(
-    "text", ["(" * 5000 + "x" + ")" * 5000, "-" * 5000 + "x", "2**" * 5000 + "x"]
+    "text", ["(" * 5000 + "x" + ")" * 5000, "-" * 5000 + "x", "2**" * 5000 + "x", "not " * 5000]
 )
 def test_depth_is_limited(text):
     with pytest.raises(TextError, match="levels"):
