@@ -33,7 +33,13 @@ from obsynth.designs.lmi.reductions import (
     extreme_points,
     split_common,
 )
-from obsynth.designs.lmi.relaxation import relax_sum
+from obsynth.designs.lmi.relaxation import (
+    RowMultipliers,
+    UncertainRow,
+    corner_block,
+    relax_sum,
+    row_multipliers,
+)
 from obsynth.designs.lmi.retry import solve_with_retries
 from obsynth.designs.lmi.search import (
     Bisection,
@@ -62,12 +68,15 @@ __all__ = [
     "MarginSolution",
     "Problem",
     "ProofResult",
+    "RowMultipliers",
     "Search",
     "Solution",
     "SplitFamily",
+    "UncertainRow",
     "bisect_feasible",
     "block",
     "constant",
+    "corner_block",
     "diagonal",
     "distinct_members",
     "extreme_points",
@@ -78,6 +87,7 @@ __all__ = [
     "prove_family",
     "prove_positive_definite",
     "relax_sum",
+    "row_multipliers",
     "scalar",
     "search_line",
     "smallest_changes",

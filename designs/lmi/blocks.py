@@ -61,7 +61,7 @@ def block(rows: Sequence[Sequence[Any]]) -> Any:
         lifted = [[Enclosure.of(cell) for cell in row] for row in filled]
         return Enclosure(
             _dense_block([[cell.mid for cell in row] for row in lifted]),
-            _dense_block([[cell.rad for cell in row] for row in lifted]),
+            _radius_block([[cell.rad for cell in row] for row in lifted]),
         )
     if kind is ExactMatrix:
         return ExactMatrix.from_blocks([[ExactMatrix.of(cell) for cell in row] for row in filled])
@@ -144,6 +144,18 @@ def _dense_block(cells: Sequence[Sequence[Any]]) -> Any:
     return np.block(
         [[np.broadcast_to(cell, members + cell.shape[-2:]) for cell in row] for row in cells]
     )
+
+
+def _radius_block(cells: Sequence[Sequence[Any]]) -> Any:
+    """Block of radii; one that is common to all vertices stays a view."""
+    members = np.broadcast_shapes(*(cell.shape[:-2] for row in cells for cell in row))
+    common = [[_common(cell) for cell in row] for row in cells]
+    small = _dense_block(common)
+    return np.broadcast_to(small, members + small.shape[-2:])
+
+
+def _common(radius: Any) -> Any:
+    return radius[0] if radius.ndim == 3 and radius.strides[0] == 0 else radius
 
 
 def _affine_block(cells: Sequence[Sequence[Any]]) -> Affine:

@@ -59,7 +59,7 @@ class ProofResult:
 
 
 def prove_positive_definite(
-    mid: ArrayLike | Enclosure, rad: ArrayLike = 0.0, *, sharp: bool = True
+    mid: ArrayLike | Enclosure, rad: ArrayLike = 0.0, *, floor: float = 0.0, sharp: bool = True
 ) -> ProofResult:
     """Prove that every symmetric matrix within ``rad`` of ``mid`` is positive definite.
 
@@ -69,6 +69,8 @@ def prove_positive_definite(
         Midpoints, or the enclosure itself.
     rad : array_like, broadcasts to the shape of mid
         Radii, entry by entry.
+    floor : float
+        Prove that every eigenvalue is above this, not only above zero; not negative.
     sharp : bool
         Also search for the largest margin (eigenvalues and a second factorisation, about ten
         times the work); without it the margin is positive but arbitrarily pessimistic.
@@ -99,28 +101,33 @@ def prove_positive_definite(
     radii = np.broadcast_to(matrices.rad, stack.shape)
     chunk = max(1, _CHUNK_ENTRIES // (n * n))
     pieces = [
-        _prove(stack[start : start + chunk], radii[start : start + chunk], start, sharp)
+        _prove(stack[start : start + chunk], radii[start : start + chunk], start, floor, sharp)
         for start in range(0, len(stack), chunk)
     ]
     lower, unscaled = np.concatenate(pieces, axis=1) if pieces else np.zeros((2, 0))
     proved = lower > 0
+    # One step down covers the rounding of the sum.
+    bound = np.nextafter(floor + unscaled, -np.inf) if floor else unscaled
     return ProofResult(
         proved=proved,
-        margin=np.where(proved, unscaled, -np.inf),
+        margin=np.where(proved, bound, -np.inf),
         relative=np.where(proved, lower, -np.inf),
     )
 
 
-def _prove(mid: Matrix, rad: Matrix, first: int, sharp: bool) -> Matrix:
+def _prove(mid: Matrix, rad: Matrix, first: int, floor: float, sharp: bool) -> Matrix:
     """Lower bounds of the smallest eigenvalues, scaled and unscaled, as two rows."""
     n = mid.shape[-1]
     with np.errstate(all="ignore"):
         centre, spread, scale = _scaled(mid, rad, first)
+        if floor:
+            # Taking the floor from A takes floor D^-2 from the scaled matrix.
+            np.einsum("bii->bi", centre)[:] -= floor / (scale * scale)
         finite = np.isfinite(centre.sum(axis=(1, 2))) & np.isfinite(spread)
         if not finite.all():
             centre = np.where(finite[:, None, None], centre, 0.0)
         trace = np.abs(np.diagonal(centre, axis1=1, axis2=2)).sum(axis=1)
-        needed = spread + (2.0 * gamma_bound(n + 4)) * (trace + n) + 4 * _UNDERFLOW
+        needed = spread + (2.0 * gamma_bound(n + 8)) * (trace + n) + 4 * _UNDERFLOW
         lower = _factorise(centre, np.where(finite, needed, np.inf), spread)
         if sharp and finite.any():
             estimate = np.full(len(centre), -np.inf)
@@ -163,16 +170,19 @@ def _scaled(mid: Matrix, rad: Matrix, first: int) -> tuple[Matrix, Matrix, Matri
 
 def _norm_bound(rad: Matrix, factor: Matrix) -> NDArray[np.float64]:
     """Upper bound of the spectral norm of any symmetric matrix within the scaled radius."""
-    n = rad.shape[-1]
+    count, n = rad.shape[0], rad.shape[-1]
     if rad.strides[0] == 0 and not rad[:1].any():
-        return np.zeros(len(rad))
+        return np.zeros(count)
+    if rad.strides[0] == 0:
+        # One radius for all vertices: the largest factors serve them all.
+        rad, factor = rad[:1], factor.max(axis=0, keepdims=True)
     scaled = rad * factor
     sums = np.minimum(
         scaled.sum(axis=2).max(axis=1),
         np.sqrt((scaled * scaled).sum(axis=(1, 2)) + n * n * _SMALLEST),
     )
-    bound: Matrix = sums * (1.0 + 2 * gamma_bound(n * n + 8)) + _UNDERFLOW
-    return bound
+    bound = sums * (1.0 + 2 * gamma_bound(n * n + 8)) + _UNDERFLOW
+    return np.broadcast_to(bound, count)
 
 
 def _factorise(centre: Matrix, shift: Matrix, spread: Matrix) -> Matrix:
@@ -192,7 +202,8 @@ def _factorise(centre: Matrix, shift: Matrix, spread: Matrix) -> Matrix:
         complete &= column[0] > 0
         column /= np.sqrt(column[0])
     # R'R = fl(B - c I) + E with |E|_2 <= g / (1 - g) trace (theorem 10.3, rows of R bounded
-    # by the diagonal), and the diagonal of B - c I itself was rounded once.
-    loss = gamma_bound(n + 4) * trace * (1.0 + 1e-6) + 2 * UNIT_ROUNDOFF * largest
+    # by the diagonal), and the diagonal of B - c I itself was rounded once or, with a floor, twice.
+    rounded = 4 * UNIT_ROUNDOFF * (largest + np.abs(shift))
+    loss = gamma_bound(n + 4) * trace * (1.0 + 1e-6) + rounded
     lower = (shift - loss - spread) - 8 * UNIT_ROUNDOFF * (np.abs(shift) + loss + spread)
     return np.where(complete & np.isfinite(lower), lower - _UNDERFLOW, -np.inf)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.errors import CertificateError
-from obsynth.designs.lmi.definite import ProofResult, prove_positive_definite
+from obsynth.designs.lmi.definite import prove_positive_definite
 from obsynth.designs.lmi.enclosure import Enclosure
 from obsynth.designs.lmi.exact import ExactMatrix, is_positive_definite
 
@@ -17,8 +17,8 @@ __all__ = ["FamilyProof", "prove_family"]
 
 IntArray = NDArray[np.intp]
 
-# Entries of the blocks formed at a time.
-_CHUNK_ENTRIES = 2**19
+# Entries of the blocks formed at a time, so that the work arrays stay in the cache.
+_CHUNK_ENTRIES = 2**16
 
 # The margin of this many vertices tells what to expect of all.
 _SAMPLE = 256
@@ -122,7 +122,8 @@ def prove_family(
     if len(sample) < count:
         for start in range(0, count, step):
             part = np.arange(start, min(start + step, count))
-            below = part[~_above(enclosed(part), floor).proved]
+            result = prove_positive_definite(enclosed(part), floor=floor, sharp=False)
+            below = part[~result.proved]
             if len(below):
                 low.append(below)
                 margins.append(prove_positive_definite(enclosed(below)).margin)
@@ -147,10 +148,3 @@ def prove_family(
         worst=tuple(worst),
         exact=tuple(confirmed),
     )
-
-
-def _above(matrices: Enclosure, floor: float) -> ProofResult:
-    if floor <= 0:
-        return prove_positive_definite(matrices, sharp=False)
-    lowered = matrices - Enclosure.of(floor) * np.eye(matrices.shape[-1])
-    return prove_positive_definite(lowered, sharp=False)

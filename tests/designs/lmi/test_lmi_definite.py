@@ -182,3 +182,17 @@ def test_a_solution_on_the_boundary_is_accepted_only_where_it_is_true():
 def test_worst_first():
     result = prove_positive_definite(np.stack([np.eye(2), 0.5 * np.eye(2) + 0.4, np.eye(2)]))
     assert result.worst(1).tolist() == [1]
+
+
+def test_a_floor_is_proved_as_a_lower_bound():
+    rng = np.random.default_rng(6)
+    roots = rng.normal(size=(20, 5, 8))
+    matrices = roots @ np.swapaxes(roots, 1, 2) * np.logspace(-6, 6, 20)[:, None, None]
+    matrices = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
+    for matrix in matrices:
+        least = np.linalg.eigvalsh(matrix)[0]
+        above = prove_positive_definite(matrix, floor=0.999 * least)
+        assert above.all_proved and 0.999 * least <= above.margin[0] <= least
+        assert not prove_positive_definite(matrix, floor=1.001 * least).all_proved
+        exact = matrix - np.diag(np.full(5, above.margin[0]))
+        assert is_positive_definite(exact)

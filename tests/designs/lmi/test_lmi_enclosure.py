@@ -91,3 +91,18 @@ def test_underflow_is_enclosed():
     tiny = Enclosure.of([[2.0**-600]])
     assert inside(ExactMatrix.of([[2.0**-600]]) @ ExactMatrix.of([[2.0**-600]]), tiny @ tiny)
     assert inside(ExactMatrix.of([[2.0**-600]]) * ExactMatrix.of([[2.0**-600]]), tiny * tiny)
+
+
+def test_a_combination_of_directions_contains_the_exact_one():
+    rng = np.random.default_rng(3)
+    centre, directions = wide(rng, (3, 3)), wide(rng, (4, 3, 3))
+    weights = np.sign(rng.normal(size=(8, 4))) * np.array([1.0, 0.1, 3.0, 0.7])
+    family = Enclosure.combine(Enclosure.of(centre, 1e-9), Enclosure.of(directions, 1e-10), weights)
+    assert family.rad.strides[0] == 0
+    for k in range(8):
+        for end in (-1, 1):
+            exact = ExactMatrix.of(centre) + end * ExactMatrix.of(np.full((3, 3), 1e-9))
+            for weight, direction in zip(weights[k], directions, strict=True):
+                radius = ExactMatrix.of(np.full((3, 3), 1e-10)) * float(end * np.sign(weight))
+                exact = exact + float(weight) * (ExactMatrix.of(direction) + radius)
+            assert inside(exact, family.member(k))

@@ -9,11 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.designs.lmi import (
+    Enclosure,
     Problem,
+    RowMultipliers,
+    UncertainRow,
+    corner_block,
     distinct_members,
     extreme_points,
     full,
     relax_sum,
+    row_multipliers,
     split_common,
     symmetric,
     symmetric_block,
@@ -176,3 +181,65 @@ def test_the_relaxation_implies_every_vertex_and_groups_make_it_sharper(seed):
     forgetful = relaxed([[0]])
     value = decay(P, H, vertices, C, W).value(forgetful.values)
     assert np.linalg.eigvalsh(value).min() < -1e-4
+
+
+def chain_rows(rows, size):
+    return [UncertainRow(i, columns, size * signs(len(columns))) for i, columns in rows.items()]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_row_multipliers_imply_every_vertex(seed):
+    A, _, C, W = data(seed)
+    size, rows = 0.08, {0: (0, 1), 1: (1, 2), 3: (3,)}
+    places = [(i, j) for i, columns in rows.items() for j in columns]
+    vertices = np.repeat(A[None], 2 ** len(places), axis=0)
+    for k, (i, j) in enumerate(places):
+        vertices[:, i, j] += size * signs(len(places))[:, k]
+
+    def relaxed(uncertain):
+        def add(problem, P, H):
+            m = row_multipliers(problem, "m", uncertain, (4, 4))
+            X = P @ A - H @ C
+            rows_of = [[0.9 * P - m.Q], [-m.S.T, m.R], [0, 0, np.eye(3)], [X, P @ m.rows, P @ W, P]]
+            problem.add("decay", symmetric_block(rows_of) >> 0)
+
+        return optimum(add)
+
+    def whole(problem, P, H):
+        problem.add("family", decay(P, H, vertices, C, W) >> 0)
+
+    exact, by_row = optimum(whole), relaxed(chain_rows(rows, size))
+    assert exact.objective * (1 - 1e-6) <= by_row.objective < 1.5 * exact.objective
+    P, H = symmetric("P", 4), full("H", 4, 2)
+    value = decay(P, H, vertices, C, W).value(by_row.values)
+    assert np.linalg.eigvalsh(value).min() > -1e-6
+    # Corners that leave out a row, or are too small, do not imply all vertices.
+    for wrong in (chain_rows({0: (0, 1)}, size), chain_rows(rows, 0.2 * size)):
+        value = decay(P, H, vertices, C, W).value(relaxed(wrong).values)
+        assert np.linalg.eigvalsh(value).min() < -1e-4
+
+
+def test_multipliers_are_assembled_alike_in_every_arithmetic():
+    uncertain = chain_rows({0: (0, 1), 2: (2,)}, 0.1)
+    problem = Problem("assemble")
+    m = row_multipliers(problem, "m", uncertain, (3, 3))
+    rng = np.random.default_rng(0)
+    values = {
+        name: 0.5 * (x + x.T) if x.shape[0] == x.shape[1] else x
+        for name, v in problem.variables.items()
+        for x in [rng.normal(size=v.shape)]
+    }
+    enclosed = RowMultipliers.assemble(
+        uncertain, {n: Enclosure.of(v) for n, v in values.items()}, "m", (3, 3), Enclosure.of
+    )
+    for mine, other in ((m.Q, enclosed.Q), (m.S, enclosed.S), (m.R, enclosed.R)):
+        assert np.allclose(mine.value(values), other.mid, rtol=1e-14)
+    corner = problem.blocks["m.0"].expression.value(values)
+    parts = [Enclosure.of(values[f"m.{part}0"]) for part in "QSR"]
+    again = corner_block(*parts, Enclosure.of(uncertain[0].vertices))
+    assert again.contains(corner) and again.rad.max() < 1e-14
+
+
+def test_corners_have_to_fit_their_columns():
+    with pytest.raises(ObsynthError, match="row 1"):
+        row_multipliers(Problem("p"), "m", [UncertainRow(1, (0, 1), np.zeros((2, 3)))], (2, 2))
