@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,13 +10,33 @@ from obsynth.derive.intervals.arithmetic import Array, Mask, up
 from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.program import Program
 
-__all__ = ["Problem", "RowRanges", "Rows", "enclose_rows", "mean_value_terms", "shrink"]
+__all__ = ["Problem", "RowRanges", "Rows", "Source", "enclose_rows", "mean_value_terms", "shrink"]
 
 Indices = NDArray[np.int64]
 
 # Cost of one operation on a batch, in microseconds: a fixed part and a part per box. Their ratio
 # decides whether a sweep runs the shared program once or the parts of it one by one.
 _COST_FIXED, _COST_PER_BOX = 12.0, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """CasADi expressions behind a program.
+
+    Attributes
+    ----------
+    column : casadi.SX, shape (m, 1)
+        The expressions.
+    variables, extra : casadi.SX
+        Symbols of the box and of the constants.
+    constant_box : list of (float, float)
+        Enclosures of the constants.
+    """
+
+    column: ca.SX
+    variables: ca.SX
+    extra: ca.SX
+    constant_box: list[tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +55,8 @@ class Problem:
         Whether an expression is affine in a variable with the others held.
     lower, upper : ndarray, shape (v,)
         The box.
+    source : Source or None
+        Where it comes from, for those who need more derivatives or other variables.
     """
 
     program: Program
@@ -42,6 +65,7 @@ class Problem:
     affine: Mask
     lower: Array
     upper: Array
+    source: Source | None = None
 
 
 @dataclass(frozen=True, eq=False)

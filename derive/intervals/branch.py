@@ -5,8 +5,14 @@ smallest one. A row of the batch is a box that belongs to one goal. In every swe
 by the natural extension and by the mean-value form, shrunk to a facet in every variable in which
 the expression is monotone, used to look for a better attained value, and then closed or split. A
 variable that enters affinely is split into its two facets, never in the middle.
+
+What is still open after a few sweeps is looked at to second order: gradients get sharper, a
+variable in which the goal is convex is split into its facets as well, and a box over which the goal
+is concave is settled at once by the tangent at its top, however many boxes around the largest
+value the first order would need.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +21,29 @@ from numpy.typing import NDArray
 from obsynth.derive.intervals.arithmetic import Array, Mask, up
 from obsynth.derive.intervals.batch import (
     Problem,
+    RowRanges,
     Rows,
     enclose_rows,
     mean_value_terms,
     shrink,
 )
+from obsynth.derive.intervals.curvature import (
+    Curvatures,
+    Hessians,
+    is_concave,
+    sharpened_slopes,
+    taylor_spread,
+)
 from obsynth.derive.intervals.progress import Patience
+from obsynth.derive.intervals.summit import concave_bounds
 
 __all__ = ["Budget", "Outcome", "maximise"]
 
 _CHUNK = 8192
+# Second derivatives are worth their price only where the first few sweeps leave something open;
+# their matrices limit the size of a chunk.
+_FIRST_ORDER_SWEEPS = 5
+_MATRIX_NUMBERS = 1_000_000
 # One small box without a bound settles its goal: follow a few rows down to it, not all of them.
 _SINGULAR_ROWS = 8
 _SINGULAR_WIDTH = 2.0**-20
@@ -90,10 +109,13 @@ class _Search:
         self.noise = np.zeros(goals)
         self.singular: dict[int, tuple[Array, Array]] = {}
         self.boxes = self.sweeps = 0
+        source = problem.source
+        self.curvatures = None if source is None else Curvatures(source, problem.program)
 
-    def initial(self) -> Rows:
+    def initial(self, expressions: Sequence[int] | None) -> Rows:
         problem = self.problem
-        goal = np.arange(len(self.best))
+        some = np.arange(len(problem.gradient)) if expressions is None else np.array(expressions)
+        goal = (2 * some[:, None] + np.arange(2)).ravel()
         relevant = problem.relevant[goal // 2].T
         return Rows(
             goal,
@@ -104,9 +126,9 @@ class _Search:
 
     # -- attained values ---------------------------------------------------------
 
-    def record(self, rows: Rows) -> Array:
+    def record(self, rows: Rows, slopes: bool = False) -> RowRanges:
         """Evaluate at points (boxes without width), remember the best of every goal."""
-        found = enclose_rows(self.problem, rows, slopes=False)
+        found = enclose_rows(self.problem, rows, slopes=slopes)
         usable = np.isfinite(found.lower) & np.isfinite(found.upper)
         # at a tie or a jump the width is the hull of several values, not what rounding costs
         smooth = usable & ~found.rough
@@ -116,7 +138,7 @@ class _Search:
         better = order[found.lower[order] > self.best[rows.goal[order]]]
         self.points[rows.goal[better]] = rows.lower[:, better].T
         self.best[rows.goal[better]] = found.lower[better]
-        return found.upper
+        return found
 
     def sample(self, goals: NDArray[np.int64]) -> None:
         """Try points of a fixed pattern and corners of the box for unsettled goals."""
@@ -143,22 +165,70 @@ class _Search:
         self.boxes += rows.count
         self.sweeps += 1
         found = enclose_rows(self.problem, rows, slopes=True)
-        lower, upper = shrink(rows, found.slope_lower, found.slope_upper)
+        slopes = found.slope_lower, found.slope_upper
+        hessians = self.hessians(rows, found.rough)
+        if hessians is not None:
+            middle = np.clip(0.5 * (rows.lower + rows.upper), rows.lower, rows.upper)
+            there = self.record(Rows(rows.goal, middle, middle, rows.bound), slopes=True)
+            ends = there.slope_lower, there.slope_upper
+            slopes = sharpened_slopes(rows.lower, rows.upper, middle, ends, slopes, hessians)
+        lower, upper = shrink(rows, *slopes)
         centre = np.clip(0.5 * (lower + upper), lower, upper)
         bound = np.fmin(rows.bound, found.upper)
-        at_centre = self.record(Rows(rows.goal, centre, centre, bound))
-        terms = mean_value_terms(lower, upper, centre, found.slope_lower, found.slope_upper)
+        at_centre = self.record(Rows(rows.goal, centre, centre, bound), hessians is not None)
+        terms = mean_value_terms(lower, upper, centre, *slopes)
         with np.errstate(invalid="ignore", over="ignore"):
             # the sum of v nonnegative terms is off by less than v units in the last place
             spread = up(terms.sum(axis=0) * (1.0 + (len(lower) + 2) * 2.3e-16))
-            bound = np.fmin(bound, up(at_centre + spread))
-        width = (upper - lower) / self.root_width[:, None]
-        for k in np.flatnonzero(~np.isfinite(bound) & (width.max(axis=0) < _SINGULAR_WIDTH)):
-            self.singular.setdefault(int(rows.goal[k]), (rows.lower[:, k], rows.upper[:, k]))
+            bound = np.fmin(bound, up(at_centre.upper + spread))
         rest = Rows(rows.goal, lower, upper, bound)
+        convex = None
+        if hessians is not None:
+            rest = self.second_order(rest, centre, at_centre, hessians)
+            convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
+        width = (upper - lower) / self.root_width[:, None]
+        endless = ~np.isfinite(rest.bound) & (width.max(axis=0) < _SINGULAR_WIDTH)
+        for k in np.flatnonzero(endless):
+            self.singular.setdefault(int(rows.goal[k]), (rows.lower[:, k], rows.upper[:, k]))
         is_point = np.asarray((upper <= lower).all(axis=0))
         keep = self.close(rest, is_point)
-        return self.split(rest.take(keep), terms[:, keep], width[:, keep])
+        facets = self.problem.affine[rest.goal // 2].T
+        facets = facets if convex is None else facets | convex
+        return self.split(rest.take(keep), terms[:, keep], width[:, keep], facets[:, keep])
+
+    def hessians(self, rows: Rows, rough: Mask) -> Hessians | None:
+        """Second derivatives over rows, from the sweep on from which they are used."""
+        if self.curvatures is None or self.sweeps <= _FIRST_ORDER_SWEEPS:
+            return None
+        found = self.curvatures.enclose(rows.goal, rows.lower, rows.upper)
+        return Hessians(found.lower, found.upper, found.usable & ~rough)
+
+    def second_order(
+        self, rows: Rows, centre: Array, at_centre: RowRanges, hessians: Hessians
+    ) -> Rows:
+        """Lower the bounds of rows by what their second derivatives prove."""
+        ends = at_centre.slope_lower, at_centre.slope_upper
+        rise = taylor_spread(rows.lower, rows.upper, centre, ends, hessians)
+        bound = np.fmin(rows.bound, up(at_centre.upper + rise))
+        free = rows.upper > rows.lower
+        bends = np.einsum("nii->in", hessians.upper)
+        wanted = (bound > self.best[rows.goal] + self.tolerance()[rows.goal]) & hessians.usable
+        wanted &= free.any(axis=0) & (~free | (bends < 0.0)).all(axis=0)
+        index = np.flatnonzero(wanted)
+        index = index[is_concave(hessians.take(index), free[:, index])]
+        if len(index):
+            slope = 0.5 * (ends[0][:, index] + ends[1][:, index])
+            bound[index] = np.fmin(
+                bound[index],
+                concave_bounds(
+                    rows.take(index),
+                    hessians.take(index),
+                    centre[:, index],
+                    slope,
+                    lambda some: self.record(some, slopes=True),
+                ),
+            )
+        return Rows(rows.goal, rows.lower, rows.upper, bound)
 
     def close(self, rows: Rows, settled: Mask | None = None) -> Mask:
         """Close rows that cannot improve their goal; tell which ones stay open."""
@@ -169,7 +239,7 @@ class _Search:
         np.maximum.at(self.closed, rows.goal[done & ~given_up], rows.bound[done & ~given_up])
         return np.asarray(~(done | given_up))
 
-    def split(self, rows: Rows, terms: Array, width: Array) -> Rows:
+    def split(self, rows: Rows, terms: Array, width: Array, to_facets: Mask) -> Rows:
         """Cut every row in two where its mean-value form loses most."""
         if rows.count == 0:
             return rows
@@ -178,7 +248,7 @@ class _Search:
         axis = np.argmax(np.where(rows.upper > rows.lower, score, -1.0), axis=0)
         columns = np.arange(rows.count)
         lo, hi = rows.lower[axis, columns], rows.upper[axis, columns]
-        facets = self.problem.affine[rows.goal // 2, axis] & usable
+        facets = to_facets[axis, columns] & usable
         middle = np.clip(0.5 * (lo + hi), lo, hi)
         upper, lower = rows.upper.copy(), rows.lower.copy()
         upper[axis, columns] = np.where(facets, lo, middle)
@@ -199,14 +269,18 @@ class _Search:
                 index = np.flatnonzero(singular & (rows.goal == goal))
                 now[index[np.argsort(size[index], kind="stable")[:_SINGULAR_ROWS]]] = True
         index = np.flatnonzero(now)
-        if len(index) > _CHUNK:
-            excess = (rows.bound - self.best[rows.goal])[index]
+        chunk = _CHUNK
+        if self.sweeps >= _FIRST_ORDER_SWEEPS:
+            chunk = min(chunk, max(256, _MATRIX_NUMBERS // len(rows.lower) ** 2))
+        if len(index) > chunk:
+            # in units of what each goal is asked for, or the goal of largest size gets everything
+            excess = ((rows.bound - self.best[rows.goal]) / self.tolerance()[rows.goal])[index]
             now = np.zeros(rows.count, dtype=bool)
-            now[index[np.argsort(-excess, kind="stable")[:_CHUNK]]] = True
+            now[index[np.argsort(-excess, kind="stable")[:chunk]]] = True
         return now
 
-    def run(self) -> Outcome:
-        rows, budget = self.without_limits(self.initial()), self.budget
+    def run(self, expressions: Sequence[int] | None) -> Outcome:
+        rows, budget = self.without_limits(self.initial(expressions)), self.budget
         with Patience() as patience:
             while rows.count and self.boxes < budget.boxes and self.sweeps < budget.sweeps:
                 now = self.choose(rows)
@@ -247,7 +321,9 @@ class _Search:
         return rows.take(~endless)
 
 
-def maximise(problem: Problem, rtol: float, budget: Budget) -> Outcome:
+def maximise(
+    problem: Problem, rtol: float, budget: Budget, expressions: Sequence[int] | None = None
+) -> Outcome:
     """Bound every expression of a problem from both sides.
 
     Parameters
@@ -258,10 +334,12 @@ def maximise(problem: Problem, rtol: float, budget: Budget) -> Outcome:
         Wanted gap between guaranteed and attained range, relative to the attained width.
     budget : Budget
         Where to stop; what is left open then keeps its valid, looser bound.
+    expressions : sequence of int, optional
+        Which expressions; all by default. Nothing is known about the others afterwards.
 
     Returns
     -------
     Outcome
         Bounds, attained values and points per goal.
     """
-    return _Search(problem, rtol, budget).run()
+    return _Search(problem, rtol, budget).run(expressions)

@@ -5,17 +5,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.arithmetic import Array
 from obsynth.derive.intervals.batch import Problem
-from obsynth.derive.intervals.branch import Budget, Outcome, maximise
+from obsynth.derive.intervals.branch import Budget, Outcome
 from obsynth.derive.intervals.evaluate import first_failure
-from obsynth.derive.intervals.program import Program
-from obsynth.derive.intervals.rules import JUMPS
+from obsynth.derive.intervals.problem import make_problem
+from obsynth.derive.intervals.stages import staged
 
 __all__ = ["EFFORTS", "Failure", "Ranges", "Status", "bound_ranges", "make_problem"]
 
@@ -108,82 +107,6 @@ class Ranges:
         ]
 
 
-def make_problem(
-    expressions: Any,
-    variables: Any,
-    box: ArrayLike,
-    constants: Any = None,
-    constant_box: Sequence[tuple[float, float]] = (),
-) -> Problem:
-    """Program of expressions and their gradients, ready for `maximise`.
-
-    Parameters
-    ----------
-    expressions : casadi.SX
-        m expressions, as a dense column.
-    variables : casadi.SX
-        v symbols, as a column.
-    box : array_like, shape (v, 2)
-        Their ranges.
-    constants : casadi.SX, optional
-        Further symbols, whose enclosures stand in ``constant_box``.
-    constant_box : sequence of (float, float)
-        One enclosure per constant.
-
-    Returns
-    -------
-    Problem
-        With the structural sparsity of the gradient.
-
-    Raises
-    ------
-    DerivationError
-        Free symbols, shapes that do not match, bounds out of order.
-    """
-    box = np.asarray(box, dtype=float)
-    column = ca.densify(ca.vec(ca.SX(expressions)))
-    variables = ca.vec(ca.SX(variables))
-    m, v = column.numel(), variables.numel()
-    if box.shape != (v, 2) or np.isnan(box).any() or (box[:, 0] > box[:, 1]).any():
-        raise DerivationError(
-            f"the box needs one (lower, upper) pair in this order for each of the {v} variables, "
-            f"shape ({v}, 2); given was {box.tolist()}",
-            box=box,
-        )
-    extra = ca.SX(0, 1) if constants is None else ca.vec(ca.SX(constants))
-    if extra.numel() != len(constant_box):
-        raise DerivationError(
-            f"{extra.numel()} constants came with {len(constant_box)} enclosures",
-            constants=extra.numel(),
-            enclosures=len(constant_box),
-        )
-    jacobian = ca.jacobian(column, variables)
-    rows, columns = jacobian.sparsity().get_triplet()
-    slopes = ca.SX(jacobian.nz[:]) if rows else ca.SX(0, 1)
-    try:
-        function = ca.Function("ranges", [variables, extra], [column, slopes])
-    except RuntimeError as error:
-        known = {str(s) for s in ca.symvar(ca.vertcat(variables, extra))}
-        free = sorted({str(s) for s in ca.symvar(column)} - known)
-        raise DerivationError(
-            f"the expressions contain the symbols {', '.join(free)}, which have no range here",
-            symbols=tuple(free),
-        ) from error
-    program = Program.from_casadi(function, {1: list(constant_box)})
-    gradient = np.full((m, v), -1, dtype=np.int64)
-    relevant, affine = np.zeros((m, v), dtype=bool), np.zeros((m, v), dtype=bool)
-    for k, (e, j) in enumerate(zip(rows, columns, strict=True)):
-        gradient[e, j] = m + k
-    for e in range(m):
-        relevant[e, list(program.support(e))] = True
-        if any(program.nodes[k].op in JUMPS for k in program.breaks(e)):
-            continue
-        for j in np.flatnonzero(relevant[e]).tolist():
-            position = int(gradient[e, j])
-            affine[e, j] = position >= 0 and j not in program.support(position)
-    return Problem(program, gradient, relevant, affine, box[:, 0].copy(), box[:, 1].copy())
-
-
 def bound_ranges(
     expressions: Any,
     variables: Any,
@@ -237,7 +160,7 @@ def bound_ranges(
     if not 0.0 <= rtol < 1.0:
         raise DerivationError(f"rtol has to lie in [0, 1); given was {rtol}", rtol=rtol)
     problem = make_problem(expressions, variables, box, constants, constant_box)
-    return _ranges(problem, maximise(problem, rtol, EFFORTS[effort]))
+    return _ranges(problem, staged(problem, rtol, EFFORTS[effort]))
 
 
 def _ranges(problem: Problem, outcome: Outcome) -> Ranges:

@@ -1,0 +1,68 @@
+"""Bounds of concave goals: climb to the top of the box, then trust the tangent there."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from obsynth.derive.intervals.arithmetic import Array, Mask, up
+from obsynth.derive.intervals.batch import RowRanges, Rows
+from obsynth.derive.intervals.curvature import Hessians, tangent_rise
+
+__all__ = ["concave_bounds"]
+
+_STEPS = 4
+
+
+def _newton(rows: Rows, hessians: Hessians, at: Array, slope: Array) -> Array:
+    """One step of Newton's method inside the boxes, along the variables that may still move."""
+    pressed = ((at <= rows.lower) & (slope < 0.0)) | ((at >= rows.upper) & (slope > 0.0))
+    still: Mask = (pressed | (rows.upper <= rows.lower)).T
+    matrix = 0.5 * (hessians.lower + hessians.upper)
+    matrix[still[:, :, None] | still[:, None, :]] = 0.0
+    diagonal = np.einsum("nii->ni", matrix)
+    diagonal[still] = -1.0
+    diagonal[...] = np.where(diagonal < 0.0, diagonal, -1.0)
+    try:
+        step = np.linalg.solve(matrix, -np.where(still, 0.0, slope.T)[:, :, None])[:, :, 0].T
+    except np.linalg.LinAlgError:
+        return at
+    moved = at + np.where(np.isfinite(step), step, 0.0)
+    return np.clip(moved, rows.lower, rows.upper)
+
+
+def concave_bounds(
+    rows: Rows,
+    hessians: Hessians,
+    start: Array,
+    slope: Array,
+    evaluate: Callable[[Rows], RowRanges],
+) -> Array:
+    """Bound goals that are concave over their boxes.
+
+    A concave f lies below every tangent, f(x) <= f(c) + f'(c) (x - c). Whatever c is, the bound
+    holds; at the top of the box it is the largest value, up to rounding.
+
+    Parameters
+    ----------
+    rows : Rows
+        Boxes over which the goals are concave in every variable that has width.
+    hessians : Hessians
+        Second derivatives, for the direction of the steps only.
+    start, slope : ndarray, shape (v, N)
+        A point of every box and the gradient there.
+    evaluate : callable
+        Values and gradients at points (rows without width).
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Upper bounds.
+    """
+    at, bound = start, np.full(rows.count, np.inf)
+    for _ in range(_STEPS):
+        at = _newton(rows, hessians, at, slope)
+        found = evaluate(Rows(rows.goal, at, at, bound))
+        ends = found.slope_lower, found.slope_upper
+        bound = np.fmin(bound, up(found.upper + tangent_rise(rows.lower, rows.upper, at, ends)))
+        slope = 0.5 * (ends[0] + ends[1])
+    return bound
