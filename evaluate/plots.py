@@ -335,9 +335,9 @@ def _windows(run: Run, trace: Trace) -> list[Window]:
     usual = 1.5 * float(np.nanquantile(error[n // 2 :], 0.99))
     strays = np.flatnonzero(~(error[: n // 4] <= usual))
     # The transient ends before the first long stretch without a stray error.
-    ends = strays[np.diff(strays, append=n) > 50] if strays.size else np.array([0])
-    settled = int(ends[0]) + 1
-    stop = min(max(2 * settled, 20), n // 4)
+    ends = strays[np.diff(strays, append=n) > min(50, n // 10)]
+    settled = int(ends[0]) + 1 if ends.size else 1
+    stop = min(max(2 * settled, 20), n // 10)
     length = max(n // 50, 20)
     moved = np.flatnonzero(np.abs(np.diff(run.f, axis=0)).max(axis=1, initial=0.0) > 0)
     centre = int(moved[len(moved) // 4]) if moved.size else n // 2

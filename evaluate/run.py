@@ -301,9 +301,7 @@ class Run:
                 ]
             )
         since = f", rms from k = {from_step}" if from_step else ""
-        title = (
-            f"{self.scenario}, seed {self.seed}: {self.method} over {len(self.t)} instants{since}"
-        )
+        title = f"{self.scenario}, seed {self.seed}, {len(self.t)} instants{since}"
         columns = ["signal", "inside", "rms error", "half width at k = 0", "at the end"]
         return Table(title, columns, rows, note="; ".join(str(v) for v in self.violations))
 

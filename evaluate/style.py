@@ -1,6 +1,7 @@
 """Colours and settings of all plots: readable in print, by the colour-blind, and in the dark."""
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 __all__ = ["BARS", "ESTIMATE", "INK", "INTERVAL", "INTERVAL_FILL", "SOFT", "style"]
@@ -44,9 +45,18 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-def style() -> AbstractContextManager[None]:
-    """Return matplotlib's context in which all plots of obsynth are drawn."""
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw in the settings of obsynth's plots; only these settings are put back afterwards.
+
+    ``matplotlib.rc_context`` would also put back what pyplot sets when it is first imported
+    inside, and notebooks would show no further figure.
+    """
     import matplotlib as mpl
 
-    context: AbstractContextManager[None] = mpl.rc_context(_SETTINGS)
-    return context
+    before = {key: mpl.rcParams[key] for key in _SETTINGS}
+    mpl.rcParams.update(_SETTINGS)
+    try:
+        yield
+    finally:
+        mpl.rcParams.update(before)

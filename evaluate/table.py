@@ -112,7 +112,11 @@ class Table:
         return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
 
     def _repr_html_(self) -> str:
-        right = [' class="number"' if flush else "" for flush in self.numeric()]
+        # Notebooks set every cell flush right unless the cell itself says otherwise.
+        right = [
+            ' class="number" style="text-align:right"' if flush else ' style="text-align:left"'
+            for flush in self.numeric()
+        ]
         head = "".join(
             f'<th scope="col"{kind}>{html.escape(column)}</th>'
             for column, kind in zip(self.columns, right, strict=True)
@@ -126,8 +130,9 @@ class Table:
                 f'<tr class="marked">{cells}</tr>' if i in self.marked else f"<tr>{cells}</tr>"
             )
         note = f'<p class="note">{html.escape(self.note)}</p>' if self.note else ""
+        title = f'<caption style="text-align:left">{html.escape(self.title)}</caption>'
         return (
-            f'<div class="table"><table><caption>{html.escape(self.title)}</caption>'
+            f'<div class="table"><table>{title}'
             f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{note}</div>"
         )
 

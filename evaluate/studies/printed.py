@@ -161,7 +161,7 @@ def errata_table(parts: "Split", bounds: "JacobianBounds", refusals: Refusals, r
         Of one of the paper's scenarios, for its first state and measurement.
     """
     E = -parts.D @ np.linalg.pinv(parts.C @ parts.D)
-    e0 = ", ".join(f"{v:.1f}" for v in run.x[0] - (PRINTED_Z0 - E @ run.y[0]))
+    e0 = ", ".join(f"{v:.1f}".replace("-", "−") for v in run.x[0] - (PRINTED_Z0 - E @ run.y[0]))
     corner = 100 * float(np.sum(parts.model.box("w")[:, 1] ** 2))
     n, m = parts.A.shape[0], parts.C.shape[0]
     low = float(bounds.max[0, 2])

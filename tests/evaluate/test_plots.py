@@ -92,6 +92,18 @@ def test_the_settings_of_the_user_stay_untouched(toy_run):
     assert dict(mpl.rcParams) == before
 
 
+def test_what_pyplot_sets_on_its_first_import_is_kept():
+    import matplotlib as mpl
+
+    from obsynth.evaluate.style import style
+
+    interactive = mpl.rcParams["interactive"]
+    with style():
+        mpl.rcParams["interactive"] = not interactive
+    assert mpl.rcParams["interactive"] is not interactive
+    mpl.rcParams["interactive"] = interactive
+
+
 def test_thinning_keeps_every_extreme_and_the_order():
     rng = np.random.default_rng(0)
     t = np.arange(20_000.0)
@@ -106,6 +118,17 @@ def test_thinning_keeps_every_extreme_and_the_order():
         assert few[part].max() == values[start : start + 200].max()
     short = thin(t[:50], values[:50])
     np.testing.assert_array_equal(short[1], values[:50])
+
+
+@pytest.mark.parametrize("steps", [1, 2, 38, 39, 45, 99])
+def test_short_runs_are_drawn_too(toy, steps):
+    from obsynth.evaluate import simulate
+
+    scenario = toy.scenario(steps=steps, x0=[0.9, 0.4])
+    run = simulate(toy.plant, toy.observer(toy.plant), scenario)
+    assert len(plot_signal(run, "a")) == (3 if steps >= 39 else 1)
+    assert len(plot_errors(run)) == 3
+    assert len(run.plot()) == 3
 
 
 def test_long_runs_are_drawn_with_few_points(toy):

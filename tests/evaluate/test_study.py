@@ -80,7 +80,7 @@ def test_tables_and_page_say_what_the_paper_prints_and_what_holds(study):
     assert "e-17" not in text
     assert "http:" not in page
     assert "https:" not in page
-    for expected in ("What the paper prints", "E W1 is no product", "e_0 = (5.0, 5.0, -"):
+    for expected in ("What the paper prints", "E W1 is no product", "e_0 = (5.0, 5.0, −24.9, 5.0)"):
         assert expected in page, expected
 
 

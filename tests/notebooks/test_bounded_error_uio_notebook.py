@@ -1,0 +1,102 @@
+"""The notebook runs from top to bottom and arrives at the paper's numbers."""
+
+import json
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+PATH = Path(__file__).parents[2] / "notebooks" / "bounded_error_uio.ipynb"
+
+# Run after the last cell of the notebook, in its kernel.
+PROBE = """
+import json
+
+print(json.dumps({
+    "equilibrium": list(parts.at.x),
+    "m13": [bounds.min[0, 2], bounds.max[0, 2]],
+    "vertices": [bounds.naive_vertex_count, len(bounds.vertices())],
+    "largest_gamma": refusals[1].largest_gamma,
+    "signs": [point.q1 >= 0, point.q2 >= 0],
+    "sums": {label: float(observer.half_widths.sum()) for label, observer in designs.items()},
+    "ellipsoid": list(ellipsoid.half_widths),
+    "coverage": [min(run.coverage.values()) for several in runs.values() for run in several],
+    "rms": list(fs1.rms(from_step=1000).values()),
+    "assumptions": [run.domain.ok and not run.outside for r in runs.values() for run in r],
+    "outside": len(real.outside),
+    "valid": certificate.valid,
+    "vectors": project.comparison.vectors if project.comparison else None,
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory):
+    notebook = nbformat.read(PATH, as_version=4)
+    notebook.cells.append(nbformat.v4.new_code_cell(PROBE))
+    folder = tmp_path_factory.mktemp("notebook")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        patch.setenv("TMPDIR", str(folder))
+        client = NotebookClient(
+            notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": folder}}
+        )
+        client.execute()
+    return notebook
+
+
+@pytest.fixture(scope="module")
+def found(executed):
+    (output,) = [o for o in executed.cells[-1].outputs if o.output_type == "stream"]
+    return json.loads(output.text)
+
+
+def test_only_sources_are_committed():
+    notebook = nbformat.read(PATH, as_version=4)
+    nbformat.validate(notebook)
+    assert all(not cell.get("outputs") for cell in notebook.cells)
+    assert all(cell.get("execution_count") is None for cell in notebook.cells)
+    assert notebook.cells[0].cell_type == "markdown"
+
+
+def test_plant_and_derived_forms(found, reference):
+    assert found["equilibrium"] == pytest.approx(reference["model"]["xeq"], rel=1e-9)
+    low, high = reference["model"]["Jmin"][0][2], reference["model"]["Jmax"][0][2]
+    assert found["m13"] == pytest.approx([low, high], rel=1e-9)
+    assert found["vertices"] == [64, 16]
+
+
+def test_the_printed_form_is_refused_with_its_reason(found):
+    assert found["largest_gamma"] == pytest.approx(0.00903, rel=2e-3)
+    assert found["signs"] == [True, True]
+
+
+def test_half_widths(found, reference):
+    assert found["ellipsoid"] == pytest.approx(reference["base"]["z"], rel=0.005)
+    assert found["sums"]["(51), repaired"] == pytest.approx(24.32, rel=0.005)
+    assert found["sums"]["peak"] / found["sums"]["(51), repaired"] <= 0.14
+
+
+def test_every_state_and_fault_is_inside_at_every_instant(found, reference):
+    assert found["coverage"] == [1.0] * 12
+    assert found["assumptions"] == [True] * 12
+    assert found["rms"] == pytest.approx(reference["sim"]["FS1"]["rms"], rel=0.1)
+    assert found["outside"] == 1
+
+
+def test_the_design_is_proved_again_and_the_c_code_compared(found):
+    assert found["valid"] is True
+    assert found["vectors"] in (None, 10_000)
+
+
+def test_figures_and_tables_are_shown(executed):
+    pictures = [
+        sum("image/png" in output.get("data", {}) for output in cell.get("outputs", ()))
+        for cell in executed.cells
+    ]
+    # the bars, six figures of FS1 with zooms, the grid of FS2, the errors
+    assert [count for count in pictures if count] == [1, 6, 1, 1]
+    page = json.dumps([cell.get("outputs", []) for cell in executed.cells], ensure_ascii=False)
+    for expected in ("too narrow", "both depend on h3 only", "E W1 is no product", "typedef"):
+        assert expected in page, expected
