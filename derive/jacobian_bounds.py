@@ -312,13 +312,16 @@ def _assemble(entries: _Entries, ranges: Ranges, shape: tuple[int, int]) -> Jaco
             n for n, s in zip(entries.names, entries.symbols, strict=True) if expression.has(s)
         )
         low, high = float(ranges.lower[k]), float(ranges.upper[k])
+        reached = float(ranges.attained_lower[k]), float(ranges.attained_upper[k])
+        gap = float(ranges.gap[k])
         if not supports[place]:
+            # a number, not below its lower bound and not above its upper one: both are passed
             low, high = enclose_number(expression)
+            reached, gap = (high, low), 2.0 * (high - low)
         bounds[place] = (low, high)
         filled["min"][place], filled["max"][place] = low, high
-        filled["attained_min"][place] = ranges.attained_lower[k]
-        filled["attained_max"][place] = ranges.attained_upper[k]
-        filled["gap"][place] = ranges.gap[k]
+        filled["attained_min"][place], filled["attained_max"][place] = reached
+        filled["gap"][place] = gap
         where[place][0], where[place][1] = ranges.points_lower[k], ranges.points_upper[k]
         status[place] = judged[k]
     basis, dependences = find_dependences(
