@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.designs import InfeasibleDesign, Observer
 from obsynth.evaluate.run import Run
-from obsynth.evaluate.table import Table
+from obsynth.evaluate.table import Table, text
 
 if TYPE_CHECKING:
     from obsynth.codegen import CProject
@@ -58,16 +58,17 @@ def bounds_table(bounds: "JacobianBounds") -> Table:
                 f"m{i}{j}",
                 f"[{low:.4f}, {high:.4f}]".replace("-", "−"),
                 f"[{found[0]:.6f}, {found[1]:.6f}]".replace("-", "−"),
-                float(bounds.gap[i - 1, j - 1]),
+                text(bounds.gap[i - 1, j - 1], 2),
                 "too narrow" if wrong else "rounded",
             ]
         )
     return Table(
         "Jacobian of g over the box",
-        ["entry", "printed", "derived, guaranteed", "gap to attained", "printed is"],
+        ["entry", "printed", "derived", "gap", "printed is"],
         rows,
-        note="The printed bounds agree with forward differences of 1 cm, which do not reach the "
-        "ends of the box where h3 or h4 is 5 cm.",
+        note="The derived bounds are guaranteed, and attained within the gap. The printed ones "
+        "agree with forward differences of 1 cm, which do not reach the ends of the box where h3 or h4 "
+        "is 5 cm.",
         marked=marked,
     )
 
