@@ -50,7 +50,9 @@ def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.E
     sympy.Expr
         Free of the symbols and of floating-point numbers.
     """
-    result = sp.sympify(expression).subs(dict(values))
+    result = sp.sympify(expression)
+    if present := {s: values[s] for s in result.free_symbols if s in values}:
+        result = result.subs(present)
     floats = {number: rational(float(number)) for number in result.atoms(sp.Float)}
     return result.xreplace(floats) if floats else result
 

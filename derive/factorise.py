@@ -1,11 +1,28 @@
 """Quasi-linear forms f(x, u) = A(x, u) x + B(x, u) u + r by a rule for every term."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import sympy as sp
 
-__all__ = ["Factorisation", "expand_terms", "factorise"]
+__all__ = ["Divisor", "Factorisation", "divisors", "expand_terms", "factorise"]
+
+
+@dataclass(frozen=True, eq=False)
+class Divisor:
+    """A homogeneous linear form by which a term is divided.
+
+    Attributes
+    ----------
+    form : sympy.Expr
+        The form: one signal, or a combination of several.
+    weights : tuple of (int, sympy.Expr)
+        Position of every signal among states, then inputs, and its coefficient in the form. The
+        term is (term / form) times the sum of weight times signal.
+    """
+
+    form: sp.Expr
+    weights: tuple[tuple[int, sp.Expr], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +89,7 @@ def expand_terms(expression: sp.Expr) -> list[sp.Expr]:
     return [term.xreplace(back) for term in sp.Add.make_args(expanded) if term != 0]
 
 
-def _divisors(term: sp.Expr, symbols: Sequence[sp.Symbol]) -> list[int]:
+def _factors(term: sp.Expr, symbols: Sequence[sp.Symbol]) -> list[int]:
     """List the indices of symbols that the term contains as a factor."""
     found = set()
     for factor in sp.Mul.make_args(term):
@@ -88,9 +105,7 @@ def _vanishes(term: sp.Expr, symbol: sp.Symbol) -> bool:
     return bool(value == 0)
 
 
-def _linear_form(
-    term: sp.Expr, states: Sequence[sp.Symbol]
-) -> tuple[list[tuple[int, sp.Expr]], sp.Expr] | None:
+def _linear_form(term: sp.Expr, states: Sequence[sp.Symbol]) -> Divisor | None:
     """Find the homogeneous linear form through which alone a term depends on the states."""
     present = [k for k, s in enumerate(states) if term.has(s)]
     for atom in sorted(term.atoms(sp.Function, sp.Pow), key=sp.default_sort_key):
@@ -108,8 +123,54 @@ def _linear_form(
             rest = form - slope * states[first]
             replaced = sp.simplify(term.subs(states[first], (z - rest) / slope))
             if not replaced.has(*states) and _vanishes(replaced, z):
-                return coefficients, form
+                return Divisor(form, tuple(coefficients))
     return None
+
+
+def divisors(
+    term: sp.Expr, own: int, states: Sequence[sp.Symbol], inputs: Sequence[sp.Symbol]
+) -> Iterator[Divisor]:
+    """List what a term can be divided by without a new singularity, the preferred one first.
+
+    Parameters
+    ----------
+    term : sympy.Expr
+        A term that depends on states or inputs.
+    own : int
+        Index of the state whose row it stands in; -1 for none.
+    states, inputs : sequence of sympy.Symbol
+        x and u.
+
+    Yields
+    ------
+    Divisor
+        States that are factors (the row's own state before others); inputs that are factors; the
+        state in which a term of one state vanishes; the linear form with which a term vanishes.
+
+    Examples
+    --------
+    >>> x, y, u = sp.symbols("x y u", real=True)
+    >>> [d.form for d in divisors(x * y * u, 1, [x, y], [u])]
+    [y, x, u]
+    >>> [d.form for d in divisors(sp.sin(x - y), 0, [x, y], [u])]
+    [x - y]
+    """
+    one = sp.Integer(1)
+    factors = _factors(term, states)
+    for j in sorted(factors, key=lambda k: k != own):
+        yield Divisor(states[j], ((j, one),))
+    taken = _factors(term, inputs)
+    for j in taken:
+        yield Divisor(inputs[j], ((len(states) + j, one),))
+    if factors or taken:
+        return
+    present = [k for k, s in enumerate(states) if term.has(s)]
+    if len(present) == 1 and _vanishes(term, states[present[0]]):
+        yield Divisor(states[present[0]], ((present[0], one),))
+        return
+    found = _linear_form(term, states) if len(present) > 1 else None
+    if found is not None:
+        yield found
 
 
 def factorise(
@@ -117,10 +178,11 @@ def factorise(
 ) -> Factorisation:
     """Write every row as A(x, u) x + B(x, u) u + offset.
 
-    The rules, term by term, first match: a state that is a factor (the row's own state before
-    others); an input that is a factor; a term in one state that vanishes where the state does,
-    divided by that state (sqrt(h) = (sqrt(h)/h) h); a term that depends on the states through one
-    homogeneous linear form and vanishes with it (two columns for phi(x1 - x3)); otherwise offset.
+    Every term goes to the first of its `divisors`: a state that is a factor (the row's own state
+    before others); an input that is a factor; the state in which it vanishes, for a term in one
+    state (sqrt(h) = (sqrt(h)/h) h); the homogeneous linear form through which alone it depends on
+    the states (two columns for phi(x1 - x3)); otherwise to the offset. `quasi_lpv` weighs all
+    choices against each other.
 
     Parameters
     ----------
@@ -142,36 +204,20 @@ def factorise(
     (Matrix([[1 - 1/sqrt(h)]]), Matrix([[2]]))
     """
     n, n_u = len(states), len(inputs)
-    A, B = sp.zeros(n, n), sp.zeros(n, n_u)
-    linear_A, linear_B, offset = sp.zeros(n, n), sp.zeros(n, n_u), sp.zeros(n, 1)
+    columns, linear = sp.zeros(n, n + n_u), sp.zeros(n, n + n_u)
+    offset = sp.zeros(n, 1)
     signals = [*states, *inputs]
     for i, row in enumerate(rows):
         for term in expand_terms(row):
-            if not term.has(*signals):
+            divisor = None
+            if term.has(*signals):
+                divisor = next(divisors(term, i, states, inputs), None)
+            if divisor is None:
                 offset[i] += term
                 continue
-            columns = _divisors(term, states)
-            if columns:
-                j = i if i in columns else columns[0]
-                A[i, j] += term / states[j]
-                if not (term / states[j]).has(*signals):
-                    linear_A[i, j] += term / states[j]
-                continue
-            columns = _divisors(term, inputs)
-            if columns:
-                B[i, columns[0]] += term / inputs[columns[0]]
-                if not (term / inputs[columns[0]]).has(*signals):
-                    linear_B[i, columns[0]] += term / inputs[columns[0]]
-                continue
-            present = [k for k, s in enumerate(states) if term.has(s)]
-            if len(present) == 1 and _vanishes(term, states[present[0]]):
-                A[i, present[0]] += term / states[present[0]]
-                continue
-            found = _linear_form(term, states) if len(present) > 1 else None
-            if found is None:
-                offset[i] += term
-                continue
-            coefficients, form = found
-            for k, coefficient in coefficients:
-                A[i, k] += coefficient * term / form
-    return Factorisation(A, B, offset, linear_A, linear_B)
+            for j, weight in divisor.weights:
+                coefficient = weight * term / divisor.form
+                columns[i, j] += coefficient
+                if divisor.form == signals[j] and not coefficient.has(*signals):
+                    linear[i, j] += coefficient
+    return Factorisation(columns[:, :n], columns[:, n:], offset, linear[:, :n], linear[:, n:])

@@ -1,0 +1,62 @@
+"""The proof of identities, and what it says when there is none."""
+
+import pytest
+import sympy as sp
+
+from obsynth.derive import zero_test
+from obsynth.derive.zero_test import NUMERIC, FormProof, prove_zero
+
+x, y = sp.symbols("x y", real=True)
+
+
+@pytest.mark.parametrize(
+    ("expression", "method"),
+    [
+        (x - x, "syntactic"),
+        ((x + 1) ** 2 - x**2 - 2 * x - 1, "expand"),
+        (x * sp.sinc(x) - sp.sin(x), "expand"),
+        (1 / (x * y) - 1 / y / x, "syntactic"),
+        (1 / (1 + x) - 1 + x / (1 + x), "cancel"),
+        (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, "simplify"),
+        (sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), "simplify"),
+    ],
+)
+def test_identities_are_proved(expression, method):
+    assert prove_zero(expression, {x: (0.5, 2.0), y: (0.5, 2.0)}) == method
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        x - y,
+        sp.Integer(1),
+        sp.sqrt(x**2) - x,
+        sp.cos(x) - 1 + x**2 / 2,
+        sp.Rational(1, 10**40) * x,
+        sp.sin(x) - sp.sin(x + sp.Rational(1, 10**40)),
+    ],
+)
+def test_what_is_not_zero_is_not_proved(expression):
+    assert prove_zero(expression, {x: (-1.0, 1.0), y: (-1.0, 1.0)}) == ""
+
+
+def test_signs_come_from_the_box():
+    difference = sp.sqrt(x**2 * y) - x * sp.sqrt(y)
+    assert prove_zero(difference, {x: (1.0, 2.0), y: (1.0, 2.0)}) in ("expand", "simplify")
+    assert prove_zero(difference, {x: (-2.0, -1.0), y: (1.0, 2.0)}) == ""
+
+
+def test_numbers_are_said_to_be_numbers(monkeypatch):
+    monkeypatch.setattr(zero_test, "_LARGEST_CANCEL", 0)
+    monkeypatch.setattr(zero_test, "_LARGEST_SIMPLIFY", 0)
+    assert prove_zero(sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, {}) == NUMERIC
+    proof = FormProof(("x", "y1"), ("expand", NUMERIC))
+    assert not proof.holds
+    assert proof.numeric_rows == ("y1",)
+    assert "numerically zero at 60 digits in the rows of y1" in str(proof)
+
+
+def test_points_outside_a_domain_say_nothing():
+    # no real value anywhere in the box: nothing was compared, so nothing is proved
+    assert prove_zero(sp.log(-1 - x**2) - sp.log(-2 - x**2), {x: (0.0, 1.0)}) == ""
+    assert prove_zero(sp.Max(x, y) - sp.Max(y, x + sp.Rational(1, 10**30)), {}) == ""
