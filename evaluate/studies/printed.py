@@ -67,8 +67,8 @@ def bounds_table(bounds: "JacobianBounds") -> Table:
         ["entry", "printed", "derived", "gap", "printed is"],
         rows,
         note="The derived bounds are guaranteed, and attained within the gap. The printed ones "
-        "agree with forward differences of 1 cm, which do not reach the ends of the box where h3 or h4 "
-        "is 5 cm.",
+        "agree with forward differences of 1 cm, which do not reach the ends of the box where h3 "
+        "or h4 is 5 cm.",
         marked=marked,
     )
 
