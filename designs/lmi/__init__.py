@@ -7,6 +7,7 @@ independent check by :func:`is_positive_definite`.
 """
 
 from obsynth.designs.lmi.blocks import block, he, symmetric_block
+from obsynth.designs.lmi.caps import cap_condition, cap_gain
 from obsynth.designs.lmi.definite import ProofResult, prove_positive_definite
 from obsynth.designs.lmi.enclosure import Enclosure
 from obsynth.designs.lmi.exact import ExactMatrix, is_positive_definite
@@ -75,6 +76,8 @@ __all__ = [
     "UncertainRow",
     "bisect_feasible",
     "block",
+    "cap_condition",
+    "cap_gain",
     "constant",
     "corner_block",
     "diagonal",

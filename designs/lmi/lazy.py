@@ -55,7 +55,7 @@ def solve_lazily(
     *,
     start: Mapping[str, IntArray] | None = None,
     add: int = 6,
-    floor: float | Callable[[Solution], float] = 0.0,
+    floor: float | Callable[[Problem, Solution], float] = 0.0,
     solve: Callable[[Problem], Solution] = solve_with_retries,
 ) -> LazySolution:
     """Solve a problem whose families have many vertices.
@@ -70,7 +70,7 @@ def solve_lazily(
         Vertices to begin with.
     add : int
         Vertices added per family and round.
-    floor : float, or callable that takes a Solution
+    floor : float, or callable that takes the problem as stated and its solution
         Smallest eigenvalue accepted at a vertex; a little below zero where the problem asks
         for no margin, since solvers end on the boundary.
     solve : callable
@@ -108,7 +108,7 @@ def solve_lazily(
     for count in range(1, _ROUNDS + 1):
         stated = _with_vertices(problem, families, chosen)
         solution = solve(stated)
-        least = floor(solution) if callable(floor) else floor
+        least = floor(stated, solution) if callable(floor) else floor
         fresh = {
             name: _to_add(family, solution, chosen[name], least, add)
             for name, family in every.items()

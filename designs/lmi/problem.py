@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -76,6 +76,7 @@ class Problem:
         self._variables: dict[str, Variable] = {}
         self.objective: Affine = constant(0.0)
         self.maximising = False
+        self._criterion: Callable[[Mapping[str, Any]], float] | None = None
 
     @property
     def blocks(self) -> Mapping[str, Block]:
@@ -160,6 +161,9 @@ class Problem:
         Z = symmetric("inverse.Z", factor.shape[1])
         self._add(Block("inverse", "psd", symmetric_block([[Z], [factor, P]]), strict=False))
         self.minimise(trace(Z))
+        self._criterion = lambda values: np.trace(
+            factor.T @ np.linalg.solve(P.value(values), factor)
+        )
 
     def maximise_lambda_min(self, P: Affine) -> None:
         """Maximise the smallest eigenvalue of a symmetric expression."""
@@ -167,6 +171,7 @@ class Problem:
         floor = P - least * np.eye(P.shape[0])
         self._add(Block("lambda_min", "psd", floor, strict=False))
         self.maximise(least)
+        self._criterion = lambda values: np.linalg.eigvalsh(P.value(values))[0]
 
     def maximise_log_det(self, P: Affine) -> None:
         """Maximise log det of a symmetric expression, with one exponential cone per row.
@@ -185,11 +190,19 @@ class Problem:
         rows = [[t[i, 0], np.ones((1, 1)), D[i, i]] for i in range(n)]
         self._add(Block("log_det.exponential", "exponential", block(rows), strict=False))
         self.maximise(np.ones((1, n)) @ t)
+        self._criterion = lambda values: np.linalg.slogdet(P.value(values))[1]
+
+    def evaluate(self, values: Mapping[str, Any]) -> float:
+        """Objective of given values; of trace(P^-1) and the like at P, whatever the auxiliary."""
+        if self._criterion is not None:
+            return float(self._criterion(values))
+        return float(self.objective.value(values).item())
 
     def members(self, chosen: Mapping[str, Iterable[int]]) -> Problem:
         """Copy the problem with some vertices of the named families only."""
         copy = Problem(self.name)
         copy.objective, copy.maximising = self.objective, self.maximising
+        copy._criterion = self._criterion
         copy._variables = dict(self._variables)
         copy._blocks = dict(self._blocks)
         for name, vertices in chosen.items():
@@ -290,4 +303,5 @@ class Problem:
                 f"{self.name}: an objective of shape {objective.shape}; take its trace"
             )
         self._learn(objective, "objective")
+        self._criterion = None
         self.objective, self.maximising = objective, maximising

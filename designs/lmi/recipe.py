@@ -34,11 +34,14 @@ _MARGIN = "margin.t"
 _LEAST_MARGIN = 1e-9
 
 # An answer that the solver does not call solved serves if it is within this of the optimum and
-# keeps half the margin: whether it is feasible is decided by the proof, not by the solver.
+# violates nothing by more than a back-off repairs: the proof decides, not the solver.
 _GAP = 1e-4
 
-# Shares of the phase 1 point that are mixed in, one after the other, until the proof holds.
-_BACK_OFF = (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+# The largest share of the phase 1 point that is mixed in.
+_BACK_OFF = 0.3
+
+# The largest violation of a solver's answer, as a share of the margin, that a back-off repairs.
+_REPAIRABLE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,15 +256,16 @@ def solve_with_margin(
     second = _phase_two(problem, families, kept, margin)
     outer = second.solution.values
     proof: Any = None
-    for share in _BACK_OFF:
+    for share in _shares(_lowest(second.problem, second.solution) + kept, margin.value):
         values = {
-            name: (1.0 - share) * outer[name] + share * inner[name] for name in problem.variables
+            name: (1.0 - share) * outer[name] + share * inner[name]
+            for name in second.problem.variables
         }
         proof = prove(values)
         if proof.all_proved:
             return MarginSolution(
                 values=values,
-                objective=float(problem.objective.value(values).item()),
+                objective=problem.evaluate(values),
                 margin=margin,
                 kept=kept,
                 back_off=share,
@@ -271,18 +275,29 @@ def solve_with_margin(
             )
     raise CertificateError(
         f"{problem.name}: solved with margin {margin.value:.3g}, but not proved",
-        [f"even {100 * _BACK_OFF[-1]:.0f} % of the way back to the point of largest margin"],
+        [f"even {100 * _BACK_OFF:.0f} % of the way back to the point of largest margin"],
         margin=margin.value,
         proof=proof,
     )
+
+
+def _shares(lowest: float, margin: float) -> list[float]:
+    """Shares of the phase 1 point to try, from what the violation calls for upwards."""
+    violation = max(-lowest, 0.0)
+    share = max(1.1 * violation / (margin + violation), 1e-8)
+    shares = [] if violation else [0.0]
+    while share < _BACK_OFF:
+        shares.append(share)
+        share *= 3.0
+    return [*shares, _BACK_OFF]
 
 
 def _phase_one(problem: Problem) -> Solution:
     return solve_with_retries(problem, good_enough=lambda s: _measured(problem, s) > _LEAST_MARGIN)
 
 
-def _nearly_optimal(problem: Problem, solution: Solution, kept: float) -> bool:
-    return solution.gap < _GAP and _lowest(problem, solution) > -0.5 * kept
+def _nearly_optimal(problem: Problem, solution: Solution, margin: float) -> bool:
+    return solution.gap < _GAP and _lowest(problem, solution) > -_REPAIRABLE * margin
 
 
 def _measured(problem: Problem, solution: Solution) -> float:
@@ -300,7 +315,7 @@ def _lowest(problem: Problem, solution: Solution) -> float:
     return lowest
 
 
-def _phase_one_floor(solution: Solution) -> float:
+def _phase_one_floor(problem: Problem, solution: Solution) -> float:
     """Half the margin may be lost at vertices that are not stated; without one, stop."""
     least = float(solution.values[_MARGIN].item())
     return -0.5 * least if least > _LEAST_MARGIN else -np.inf
@@ -320,9 +335,10 @@ def _phase_two(
             problem.tightened(kept),
             tight,
             start=margin.found.chosen,
-            floor=-0.5 * kept,
+            # No vertex is left much worse than the solver leaves those it knows.
+            floor=lambda stated, solution: min(-2.0 * kept, 1.5 * _lowest(stated, solution)),
             solve=lambda stated: solve_with_retries(
-                stated, good_enough=lambda solution: _nearly_optimal(stated, solution, kept)
+                stated, good_enough=lambda s: _nearly_optimal(stated, s, margin.value)
             ),
         )
     except InfeasibleDesign as trouble:

@@ -80,7 +80,8 @@ def extreme_points(points: ArrayLike) -> Extremes:
     >>> extreme_points([[0.0], [1.0], [0.5], [1.0]]).kept.tolist()
     [0, 1]
     """
-    array = np.asarray(points, dtype=float)
+    # Adding zero makes one zero of the two, so that equal rows have equal bytes.
+    array = np.asarray(points, dtype=float) + 0.0
     if array.ndim != 2 or not np.isfinite(array).all():
         raise ObsynthError(f"points of shape {array.shape}: finite rows (N, k) are needed")
     _, first, inverse = np.unique(array, axis=0, return_index=True, return_inverse=True)
@@ -89,9 +90,10 @@ def extreme_points(points: ArrayLike) -> Extremes:
         if first[group] != row:
             weights[row] = {int(first[group]): Fraction(1)}
     alive = sorted(int(i) for i in first)
-    for row in list(alive):
+    certain = _certainly_extreme(array, alive)
+    for row in [i for i in alive if i not in certain]:
         others = [i for i in alive if i != row]
-        combination = _convex_combination(array, row, others)
+        combination = _midpoint(array, row, others) or _convex_combination(array, row, others)
         if combination is not None:
             weights[row] = combination
             alive = others
@@ -220,6 +222,30 @@ def present_entries(family: Affine) -> NDArray[np.bool_]:
         found = entries.row[entries.data != 0] % (n * n)
         present[found % n, found // n] = True
     return np.asarray(present | present.T)
+
+
+def _certainly_extreme(points: NDArray[np.float64], rows: list[int]) -> set[int]:
+    """Rows that alone maximise some direction, so that they need no closer look."""
+    directions = np.random.default_rng(0).normal(size=(points.shape[1], 64 * points.shape[1]))
+    heights = points[rows] @ directions
+    return {rows[int(k)] for k in np.unique(heights.argmax(axis=0))}
+
+
+def _midpoint(
+    points: NDArray[np.float64], row: int, others: list[int]
+) -> dict[int, Fraction] | None:
+    """Two other rows with a given row exactly in the middle, as grids have them."""
+    known = {points[i].tobytes(): i for i in others}
+    mirrored = 2.0 * points[row] - points[others] + 0.0
+    for first, mirror in zip(others, mirrored, strict=True):
+        second = known.get(mirror.tobytes())
+        if second is not None and all(
+            Fraction(a) + Fraction(b) == 2 * Fraction(c)
+            for a, b, c in zip(points[first], points[second], points[row], strict=True)
+        ):
+            half = Fraction(1, 2)
+            return {first: half, second: half}
+    return None
 
 
 def _convex_combination(

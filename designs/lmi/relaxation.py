@@ -49,14 +49,20 @@ class UncertainRow:
     corners: Matrix
 
     @property
+    def unit(self) -> float:
+        """Power of two near the largest entry: s is measured in it, so that scales agree."""
+        largest = float(np.abs(self.corners).max())
+        return float(2.0 ** np.round(np.log2(largest))) if largest else 1.0
+
+    @property
     def vertices(self) -> Matrix:
-        """Corners as a family of rows, (N, 1, len(columns)), for :func:`corner_block`."""
-        return self.corners[:, None, :]
+        """Corners in the unit, as a family of rows (N, 1, c) for :func:`corner_block`."""
+        return self.corners[:, None, :] / self.unit
 
 
 @dataclass(frozen=True, eq=False)
 class RowMultipliers:
-    """Multipliers that stand for ``s = M x`` with M anywhere in its box.
+    """Multipliers that stand for ``rows s = M x`` with M anywhere in its box.
 
     For every M with rows between their corners, ``[x; s]' [Q, S; S', -R] [x; s] >= 0``.
 
@@ -65,7 +71,7 @@ class RowMultipliers:
     Q, S, R : matrices of shape (n, n), (n, k), (k, k)
         In any arithmetic; k is the number of uncertain rows.
     rows : ndarray, shape (n_rows, k)
-        Puts s into the rows that are uncertain.
+        Puts s into the rows that are uncertain, times the unit of each.
     """
 
     Q: Any
@@ -95,7 +101,9 @@ class RowMultipliers:
             [values[f"{name}.R{uncertain[i].row}"] if i == j else 0 for j in range(count)]
             for i in range(count)
         ]
-        rows = np.eye(n_rows)[:, [item.row for item in uncertain]]
+        rows = np.zeros((n_rows, count))
+        for k, item in enumerate(uncertain):
+            rows[item.row, k] = item.unit
         return cls(Q, block([columns]), block(diagonal), rows)
 
 
@@ -104,7 +112,7 @@ def row_multipliers(
 ) -> RowMultipliers:
     """Multipliers for an uncertain matrix M, row by row (full-block S-procedure).
 
-    An inequality in ``x`` and ``s = M x`` holds for every M if it holds for all x and s with
+    An inequality in ``x`` and ``rows s = M x`` holds for every M if it holds for all x and s with
     ``[x; s]' [Q, S; S', -R] [x; s]`` subtracted, where the multipliers of every row r satisfy
     ``Q + S m' + m S' - R m m' >= 0`` at the corners m of that row: two to the number of
     uncertain entries *of one row* small inequalities, in place of two to their number in all.
@@ -165,7 +173,7 @@ def corner_block(Q: Any, S: Any, R: Any, vertices: Any) -> Any:
     ----------
     Q, S, R : matrices of shape (c, c), (c, 1), (1, 1)
     vertices : matrix, shape (N, 1, c) or (1, c)
-        Corners of the row.
+        :attr:`UncertainRow.vertices`.
     """
     columns = np.swapaxes(vertices, -1, -2) if isinstance(vertices, np.ndarray) else vertices.T
     return Q + he(S @ vertices) - R * (columns @ vertices)

@@ -99,6 +99,8 @@ def test_the_direct_path_and_cvxpy_agree(kind):
 def test_the_objective_is_what_its_name_says(kind, measure):
     solution = random_problem(kind).solve()
     assert solution.objective == pytest.approx(measure(solution["P"]), rel=1e-5)
+    values = solution.values
+    assert random_problem(kind).evaluate(values) == pytest.approx(measure(values["P"]), rel=1e-12)
 
 
 def test_constraints_hold_and_duals_have_the_shape_of_their_blocks():

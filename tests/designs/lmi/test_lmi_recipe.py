@@ -152,7 +152,7 @@ def test_back_off_leads_to_the_proof_and_failure_is_no_design(monkeypatch):
 
     found = solve_with_margin(problem, prove=strict)
     assert found.back_off > 0 and len(calls) > 1
-    monkeypatch.setattr(recipe, "_BACK_OFF", (0.0, 1e-7))
+    monkeypatch.setattr(recipe, "_BACK_OFF", 1e-7)
     with pytest.raises(CertificateError, match="not proved"):
         solve_with_margin(problem, prove=strict)
 
