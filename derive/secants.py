@@ -96,7 +96,7 @@ def secant(expression: sp.Expr, variable: sp.Symbol) -> sp.Expr | None:
 
 
 def quotients(expression: sp.Expr) -> sp.Expr:
-    """Write sinc, phi1, tanhc and sign as the quotients that they are away from zero.
+    """Write sinc, phi1, tanhc and sign as the quotients that they are away from zero, acos by asin.
 
     Parameters
     ----------
@@ -119,6 +119,7 @@ def quotients(expression: sp.Expr) -> sp.Expr:
         .replace(phi1, lambda a: (sp.exp(a) - 1) / a)
         .replace(tanhc, lambda a: sp.tanh(a) / a)
         .replace(sp.sign, lambda a: a / sp.Abs(a))
+        .replace(sp.acos, lambda a: sp.pi / 2 - sp.asin(a))
     )
 
 

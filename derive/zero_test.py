@@ -20,6 +20,7 @@ _POINTS = 6
 _TRIES = 40
 # Beyond this size cancel and simplify take minutes, and numbers are the better evidence.
 _LARGEST_CANCEL = 3000
+_LARGEST_EXPONENTIAL = 1000
 _LARGEST_SIMPLIFY = 600
 _GRID = 10**6
 
@@ -82,7 +83,7 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
     --------
     >>> x = sp.Symbol("x", real=True)
     >>> prove_zero(sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), {})
-    'simplify'
+    'cancel'
     >>> prove_zero(sp.sqrt(x) - x, {x: (1, 2)})
     ''
     """
@@ -99,6 +100,7 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
         return "expand"
     for name, attempt, limit in (
         ("cancel", sp.cancel, _LARGEST_CANCEL),
+        ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL),
         ("simplify", sp.simplify, _LARGEST_SIMPLIFY),
     ):
         if signed.count_ops() > limit:
@@ -109,6 +111,15 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
         except (sp.PolynomialError, NotImplementedError):
             continue
     return NUMERIC
+
+
+def _cancel_exponentials(expression: sp.Expr) -> sp.Expr:
+    """Cancel after writing trigonometric and hyperbolic functions as exponentials of single terms.
+
+    Addition theorems are then identities between monomials.
+    """
+    written = sp.expand_log(expression).rewrite(sp.exp)
+    return sp.cancel(sp.expand(written, trig=False))
 
 
 def _with_signs(expression: sp.Expr, box: Box) -> sp.Expr:

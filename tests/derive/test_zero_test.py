@@ -17,8 +17,11 @@ x, y = sp.symbols("x y", real=True)
         (x * sp.sinc(x) - sp.sin(x), "expand"),
         (1 / (x * y) - 1 / y / x, "syntactic"),
         (1 / (1 + x) - 1 + x / (1 + x), "cancel"),
-        (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, "simplify"),
-        (sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), "simplify"),
+        (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, "cancel"),
+        (sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), "cancel"),
+        (sp.tanh(x - y) * (1 - sp.tanh(x) * sp.tanh(y)) - sp.tanh(x) + sp.tanh(y), "cancel"),
+        (sp.log(x * y) - sp.log(x) - sp.log(y), "expand"),
+        (sp.asin(x / 9) - sp.atan(x / sp.sqrt(81 - x**2)), NUMERIC),
     ],
 )
 def test_identities_are_proved(expression, method):
@@ -48,6 +51,7 @@ def test_signs_come_from_the_box():
 
 def test_numbers_are_said_to_be_numbers(monkeypatch):
     monkeypatch.setattr(zero_test, "_LARGEST_CANCEL", 0)
+    monkeypatch.setattr(zero_test, "_LARGEST_EXPONENTIAL", 0)
     monkeypatch.setattr(zero_test, "_LARGEST_SIMPLIFY", 0)
     assert prove_zero(sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, {}) == NUMERIC
     proof = FormProof(("x", "y1"), ("expand", NUMERIC))
