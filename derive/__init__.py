@@ -8,6 +8,8 @@ from obsynth.derive.errors import DerivationError, StructureError, UnboundedErro
 from obsynth.derive.identity import IdentityProof
 from obsynth.derive.intervals import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.qpv import QPV, QPVVertices, qpv
+from obsynth.derive.quasi_lpv import CentredForm, IntervalForm, PolytopicForm, QuasiLPV, quasi_lpv
 from obsynth.derive.report import Check, StructureReport, analyse
 from obsynth.derive.split import Split, split
 from obsynth.derive.structure import (
@@ -18,15 +20,21 @@ from obsynth.derive.structure import (
 )
 
 __all__ = [
+    "QPV",
     "AffineDependence",
     "AffineFamily",
+    "CentredForm",
     "Check",
     "Decoupling",
     "DerivationError",
     "Detectability",
     "Equilibrium",
     "IdentityProof",
+    "IntervalForm",
     "JacobianBounds",
+    "PolytopicForm",
+    "QPVVertices",
+    "QuasiLPV",
     "Ranges",
     "Split",
     "Status",
@@ -40,6 +48,8 @@ __all__ = [
     "detectability",
     "equilibrium",
     "jacobian_bounds",
+    "qpv",
+    "quasi_lpv",
     "split",
     "unknown_input_condition",
 ]
