@@ -24,6 +24,9 @@ from obsynth.designs.lmi.solution import Solution
 
 __all__ = ["Binding", "MarginBound", "binding_blocks", "bound_margin"]
 
+# Blocks with less than this share of the dual weight get the multiplier zero.
+_NEGLIGIBLE = 1e-10
+
 
 @dataclass(frozen=True)
 class Binding:
@@ -45,7 +48,7 @@ class MarginBound:
     Parameters
     ----------
     multipliers : mapping of str to ndarray
-        Z_i by block, exactly positive definite (psd) or not negative; doubles.
+        Z_i by block, exactly positive definite or zero (psd), or not negative; doubles.
     offset, slope : Fraction
         Every design whose free entries are below s in size has a margin of at most
         ``offset + slope s``.
@@ -127,13 +130,15 @@ def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBou
     The coefficients are those of the problem as assembled from doubles.
     """
     multipliers = {}
+    traces = [np.trace(z, axis1=-2, axis2=-1).sum() for z in _matrix_duals(problem, solution)]
+    weight = _NEGLIGIBLE * float(sum(traces))
     for name, item in problem.blocks.items():
         dual = solution.duals.get(name)
         if dual is None or not np.isfinite(dual).all() or item.cone == "exponential":
             return None
         if item.cone == "psd":
             stack = dual.reshape(-1, *dual.shape[-2:])
-            multipliers[name] = np.stack([_definite(z) for z in stack]).reshape(dual.shape)
+            multipliers[name] = np.stack([_definite(z, weight) for z in stack]).reshape(dual.shape)
         else:
             multipliers[name] = dual if item.cone == "zero" else np.maximum(dual, 0.0)
     constant, residuals = Fraction(0), dict.fromkeys(_unknowns(problem), Fraction(0))
@@ -142,22 +147,29 @@ def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBou
         constant += offset
         for key, slope in slopes.items():
             residuals[key] += slope
-    weight = -residuals.pop((margin, 0))
-    if weight <= 0:
+    total = -residuals.pop((margin, 0))
+    if total <= 0:
         return None
     return MarginBound(
         multipliers=multipliers,
-        offset=constant / weight,
-        slope=sum((abs(r) for r in residuals.values()), Fraction(0)) / weight,
+        offset=constant / total,
+        slope=sum((abs(r) for r in residuals.values()), Fraction(0)) / total,
     )
+
+
+def _matrix_duals(problem: Problem, solution: Solution) -> list[NDArray[np.float64]]:
+    names = [name for name, item in problem.blocks.items() if item.cone == "psd"]
+    return [solution.duals[name] for name in names if name in solution.duals]
 
 
 def _unknowns(problem: Problem) -> list[tuple[str, int]]:
     return [(name, k) for name, v in problem.variables.items() for k in range(v.size)]
 
 
-def _definite(dual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smallest shift tried that makes a dual matrix exactly positive definite."""
+def _definite(dual: NDArray[np.float64], negligible: float) -> NDArray[np.float64]:
+    """Shift a dual matrix until it is exactly positive definite, or drop it."""
+    if not float(np.trace(dual)) > negligible:
+        return np.zeros_like(dual)
     middle = 0.5 * (dual + dual.T)
     eye = np.eye(len(middle))
     size = float(np.abs(middle).max()) or 1e-300
