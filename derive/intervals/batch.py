@@ -100,6 +100,12 @@ class Rows:
             np.concatenate([self.bound, other.bound]),
         )
 
+    def put(self, which: Indices, other: "Rows") -> "Rows":
+        """Return these rows with some of them replaced."""
+        lower, upper, bound = self.lower.copy(), self.upper.copy(), self.bound.copy()
+        lower[:, which], upper[:, which], bound[which] = other.lower, other.upper, other.bound
+        return Rows(self.goal, lower, upper, bound)
+
     @property
     def count(self) -> int:
         """Number of rows."""

@@ -29,7 +29,6 @@ from obsynth.derive.intervals.batch import (
 )
 from obsynth.derive.intervals.curvature import (
     Curvatures,
-    Hessians,
     is_concave,
     sharpened_slopes,
     taylor_spread,
@@ -43,6 +42,8 @@ _CHUNK = 8192
 # Second derivatives are worth their price only where the first few sweeps leave something open;
 # their matrices limit the size of a chunk.
 _FIRST_ORDER_SWEEPS = 5
+# A sweep over a few boxes costs as much as one over some hundreds.
+_SMALL_BATCH = 400
 _MATRIX_NUMBERS = 1_000_000
 # One small box without a bound settles its goal: follow a few rows down to it, not all of them.
 _SINGULAR_ROWS = 8
@@ -166,73 +167,79 @@ class _Search:
         self.sweeps += 1
         found = enclose_rows(self.problem, rows, slopes=True)
         slopes = found.slope_lower, found.slope_upper
-        hessians = self.hessians(rows, found.rough)
-        if hessians is not None:
-            middle = np.clip(0.5 * (rows.lower + rows.upper), rows.lower, rows.upper)
-            there = self.record(Rows(rows.goal, middle, middle, rows.bound), slopes=True)
-            ends = there.slope_lower, there.slope_upper
-            slopes = sharpened_slopes(rows.lower, rows.upper, middle, ends, slopes, hessians)
-        lower, upper = shrink(rows, *slopes)
-        centre = np.clip(0.5 * (lower + upper), lower, upper)
-        bound = np.fmin(rows.bound, found.upper)
-        at_centre = self.record(Rows(rows.goal, centre, centre, bound), hessians is not None)
-        terms = mean_value_terms(lower, upper, centre, *slopes)
-        with np.errstate(invalid="ignore", over="ignore"):
-            # the sum of v nonnegative terms is off by less than v units in the last place
-            spread = up(terms.sum(axis=0) * (1.0 + (len(lower) + 2) * 2.3e-16))
-            bound = np.fmin(bound, up(at_centre.upper + spread))
-        rest = Rows(rows.goal, lower, upper, bound)
-        convex = None
-        if hessians is not None:
-            rest = self.second_order(rest, centre, at_centre, hessians)
-            convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
-        width = (upper - lower) / self.root_width[:, None]
+        rest, terms = self.first_order(rows, found.upper, slopes)
+        facets = self.problem.affine[rest.goal // 2].T.copy()
+        curvatures = self.curvatures if self.sweeps > _FIRST_ORDER_SWEEPS else None
+        if curvatures is not None:
+            index = np.flatnonzero(self.is_open(rest) & ~found.rough)
+            if len(index):
+                some = slopes[0][:, index], slopes[1][:, index]
+                better, terms[:, index], convex = self.second_order(
+                    rest.take(index), some, curvatures
+                )
+                facets[:, index] |= convex
+                rest = rest.put(index, better)
+        width = (rest.upper - rest.lower) / self.root_width[:, None]
         endless = ~np.isfinite(rest.bound) & (width.max(axis=0) < _SINGULAR_WIDTH)
         for k in np.flatnonzero(endless):
             self.singular.setdefault(int(rows.goal[k]), (rows.lower[:, k], rows.upper[:, k]))
-        is_point = np.asarray((upper <= lower).all(axis=0))
+        is_point = np.asarray((rest.upper <= rest.lower).all(axis=0))
         keep = self.close(rest, is_point)
-        facets = self.problem.affine[rest.goal // 2].T
-        facets = facets if convex is None else facets | convex
         return self.split(rest.take(keep), terms[:, keep], width[:, keep], facets[:, keep])
 
-    def hessians(self, rows: Rows, rough: Mask) -> Hessians | None:
-        """Second derivatives over rows, from the sweep on from which they are used."""
-        if self.curvatures is None or self.sweeps <= _FIRST_ORDER_SWEEPS:
-            return None
-        found = self.curvatures.enclose(rows.goal, rows.lower, rows.upper)
-        return Hessians(found.lower, found.upper, found.usable & ~rough)
+    def first_order(
+        self, rows: Rows, natural: Array, slopes: tuple[Array, Array]
+    ) -> tuple[Rows, Array]:
+        """Shrink rows to facets and bound them by values and gradients."""
+        lower, upper = shrink(rows, *slopes)
+        centre = np.clip(0.5 * (lower + upper), lower, upper)
+        bound = np.fmin(rows.bound, natural)
+        at_centre = self.record(Rows(rows.goal, centre, centre, bound))
+        terms = mean_value_terms(lower, upper, centre, *slopes)
+        bound = np.fmin(bound, _mean_value_bound(at_centre.upper, terms))
+        return Rows(rows.goal, lower, upper, bound), terms
 
     def second_order(
-        self, rows: Rows, centre: Array, at_centre: RowRanges, hessians: Hessians
-    ) -> Rows:
-        """Lower the bounds of rows by what their second derivatives prove."""
-        ends = at_centre.slope_lower, at_centre.slope_upper
-        rise = taylor_spread(rows.lower, rows.upper, centre, ends, hessians)
-        bound = np.fmin(rows.bound, up(at_centre.upper + rise))
-        free = rows.upper > rows.lower
-        bends = np.einsum("nii->in", hessians.upper)
-        wanted = (bound > self.best[rows.goal] + self.tolerance()[rows.goal]) & hessians.usable
-        wanted &= free.any(axis=0) & (~free | (bends < 0.0)).all(axis=0)
-        index = np.flatnonzero(wanted)
+        self, rows: Rows, slopes: tuple[Array, Array], curvatures: Curvatures
+    ) -> tuple[Rows, Array, Mask]:
+        """Shrink and bound rows by second derivatives; tell in which variables goals bend up."""
+        hessians = curvatures.enclose(rows.goal, rows.lower, rows.upper)
+        centre = np.clip(0.5 * (rows.lower + rows.upper), rows.lower, rows.upper)
+        at = self.record(Rows(rows.goal, centre, centre, rows.bound), slopes=True)
+        ends = at.slope_lower, at.slope_upper
+        slopes = sharpened_slopes(rows.lower, rows.upper, centre, ends, slopes, hessians)
+        lower, upper = shrink(rows, *slopes)
+        if (lower != rows.lower).any() or (upper != rows.upper).any():
+            centre = np.clip(0.5 * (lower + upper), lower, upper)
+            at = self.record(Rows(rows.goal, centre, centre, rows.bound), slopes=True)
+            ends = at.slope_lower, at.slope_upper
+        terms = mean_value_terms(lower, upper, centre, *slopes)
+        bound = np.fmin(rows.bound, _mean_value_bound(at.upper, terms))
+        bound = np.fmin(bound, up(at.upper + taylor_spread(lower, upper, centre, ends, hessians)))
+        rows = Rows(rows.goal, lower, upper, bound)
+        free = upper > lower
+        bends_down = (~free | (np.einsum("nii->in", hessians.upper) < 0.0)).all(axis=0)
+        index = np.flatnonzero(self.is_open(rows) & bends_down & free.any(axis=0))
         index = index[is_concave(hessians.take(index), free[:, index])]
         if len(index):
-            slope = 0.5 * (ends[0][:, index] + ends[1][:, index])
-            bound[index] = np.fmin(
-                bound[index],
-                concave_bounds(
-                    rows.take(index),
-                    hessians.take(index),
-                    centre[:, index],
-                    slope,
-                    lambda some: self.record(some, slopes=True),
-                ),
+            top = concave_bounds(
+                rows.take(index),
+                hessians.take(index),
+                centre[:, index],
+                0.5 * (ends[0][:, index] + ends[1][:, index]),
+                lambda some: self.record(some, slopes=True),
             )
-        return Rows(rows.goal, rows.lower, rows.upper, bound)
+            bound[index] = np.fmin(bound[index], top)
+        convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
+        return rows, terms, convex
+
+    def is_open(self, rows: Rows) -> Mask:
+        """Where a row may still hold more than the best value of its goal."""
+        return np.asarray(rows.bound > self.best[rows.goal] + self.tolerance()[rows.goal])
 
     def close(self, rows: Rows, settled: Mask | None = None) -> Mask:
         """Close rows that cannot improve their goal; tell which ones stay open."""
-        done = rows.bound <= self.best[rows.goal] + self.tolerance()[rows.goal]
+        done = ~self.is_open(rows)
         if settled is not None:
             done |= settled
         given_up = np.isin(rows.goal, list(self.singular))
@@ -240,9 +247,19 @@ class _Search:
         return np.asarray(~(done | given_up))
 
     def split(self, rows: Rows, terms: Array, width: Array, to_facets: Mask) -> Rows:
-        """Cut every row in two where its mean-value form loses most."""
+        """Cut every row in two where its mean-value form loses most, a small batch in four."""
         if rows.count == 0:
             return rows
+        rows, terms, width = self.cut(rows, terms, width, to_facets)
+        if rows.count <= _SMALL_BATCH:
+            twice = np.concatenate([to_facets, to_facets], axis=1)
+            rows, terms, width = self.cut(rows, terms, width, twice)
+        return rows
+
+    def cut(
+        self, rows: Rows, terms: Array, width: Array, to_facets: Mask
+    ) -> tuple[Rows, Array, Array]:
+        """Cut rows in two; tell what is left of the terms and widths the cut went by."""
         usable = np.isfinite(terms).all(axis=0) & np.isfinite(rows.bound)
         score = np.where(usable, terms, width)
         axis = np.argmax(np.where(rows.upper > rows.lower, score, -1.0), axis=0)
@@ -254,7 +271,12 @@ class _Search:
         upper[axis, columns] = np.where(facets, lo, middle)
         lower[axis, columns] = np.where(facets, hi, middle)
         first = Rows(rows.goal, rows.lower, upper, rows.bound)
-        return first.join(Rows(rows.goal, lower, rows.upper, rows.bound))
+        both = first.join(Rows(rows.goal, lower, rows.upper, rows.bound))
+        left = np.ones_like(width)
+        left[axis, columns] = np.where(facets, 0.0, 0.5)
+        with np.errstate(invalid="ignore"):
+            terms, width = terms * left, width * left
+        return both, np.concatenate([terms, terms], axis=1), np.concatenate([width, width], axis=1)
 
     # -- the loop ----------------------------------------------------------------
 
@@ -319,6 +341,13 @@ class _Search:
                 else:
                     self.singular[goal] = (some.lower[:, k], some.upper[:, k])
         return rows.take(~endless)
+
+
+def _mean_value_bound(at_centre: Array, terms: Array) -> Array:
+    with np.errstate(invalid="ignore", over="ignore"):
+        # the sum of v nonnegative terms is off by less than v units in the last place
+        spread = up(terms.sum(axis=0) * (1.0 + (len(terms) + 2) * 2.3e-16))
+        return up(at_centre + spread)
 
 
 def maximise(
