@@ -13,7 +13,8 @@ from obsynth.derive.continuity import refuse_jumps
 from obsynth.derive.dependence import AffineDependence, entry_name, find_dependences
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.exact import enclose_number, rational, substitute
-from obsynth.derive.intervals import Ranges, Status, bound_ranges
+from obsynth.derive.intervals import Quotients, Ranges, Status, bound_ranges
+from obsynth.derive.intervals.removable import remove_singularities
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
@@ -122,13 +123,19 @@ class _Entries:
     constant_box: list[tuple[float, float]]
     symbolic: dict[tuple[int, int], sp.Expr]
     symbols: list[sp.Symbol]
+    quotients: Quotients | None
 
 
 def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
     kind = {"states": "x", "inputs": "u"}[wrt]
     sx = model.sx(constants="symbol")
     columns = getattr(sx, kind)
-    jacobian = ca.jacobian(sx.rhs, columns)
+    values_of = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
+    rhs = sx.rhs
+    if part is not None:
+        noise = ca.vertcat(sx.d, sx.f, sx.w)
+        rhs = ca.substitute(rhs, noise, ca.SX.zeros(noise.numel()))
+    jacobian, quotients = _differentiated(model, rhs, columns, values_of)
     linear = None if part is None else (part.A if kind == "x" else part.B)
     wrt_symbols = [s.symbol for s in getattr(model, kind)]
     symbolic = (
@@ -160,10 +167,8 @@ def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
             values.append(value)
             expressions[(i, j)] = exact
     column = ca.vertcat(*values) if values else ca.SX(0, 1)
-    if part is not None:
-        noise = ca.vertcat(sx.d, sx.f, sx.w)
-        column = ca.substitute(column, noise, ca.SX.zeros(noise.numel()))
-    needed = {str(s) for s in ca.symvar(column)}
+    inner = [] if quotients is None else [q.argument for q in quotients.members]
+    needed = {str(s) for s in ca.symvar(ca.vertcat(column, *inner))}
     names: list[str] = []
     symbols: list[sp.Symbol] = []
     parts: list[ca.SX] = []
@@ -175,7 +180,6 @@ def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
                 symbols.append(signal.symbol)
                 parts.append(element)
                 boxes.append((signal.lower, signal.upper))
-    values_of = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
     return _Entries(
         places,
         column,
@@ -186,7 +190,21 @@ def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
         [*values_of, *shifts],
         expressions,
         symbols,
+        quotients,
     )
+
+
+def _differentiated(
+    model: Plant, rhs: ca.SX, columns: ca.SX, constants: list[tuple[float, float]]
+) -> tuple[ca.SX, Quotients | None]:
+    """Jacobian, through quotients with removable singularities where there are some."""
+    sx = model.sx(constants="symbol")
+    variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
+    box = np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
+    found = remove_singularities(ca.densify(rhs), variables, sx.c, box, constants)
+    if found is None:
+        return ca.jacobian(rhs, columns), None
+    return found[1].jacobian(found[0], columns), found[1]
 
 
 def _sample(entries: _Entries) -> dict[tuple[int, int], Array]:
@@ -196,7 +214,10 @@ def _sample(entries: _Entries) -> dict[tuple[int, int], Array]:
     upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)
     points = lower + rng.random((_SAMPLES, len(lower))) * (upper - lower)
     middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
-    function = ca.Function("sample", [entries.variables, entries.constants], [entries.values])
+    values = entries.values
+    if entries.quotients is not None:
+        values = entries.quotients.closed(values)
+    function = ca.Function("sample", [entries.variables, entries.constants], [values])
     result = np.array(function(points.T, np.tile(middle[:, None], (1, _SAMPLES))))
     # points outside the domain of some entry say nothing about dependences
     usable = np.isfinite(result).all(axis=0)
@@ -290,6 +311,7 @@ def jacobian_bounds(
         entries.constant_box,
         rtol=rtol,
         effort=effort,
+        quotients=entries.quotients,
     )
     function = "dg" if part is not None else "df"
     _refuse(entries, ranges, f"{function}/d{'x' if wrt == 'states' else 'u'}")

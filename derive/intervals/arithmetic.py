@@ -25,6 +25,7 @@ __all__ = [
     "down",
     "hull",
     "maximum",
+    "meet",
     "minimum",
     "multiply",
     "negate",
@@ -36,6 +37,7 @@ __all__ = [
     "twice",
     "up",
     "widen",
+    "with_zero",
 ]
 
 Array = NDArray[np.float64]
@@ -238,3 +240,13 @@ def minimum(a: Interval, b: Interval) -> Interval:
 def maximum(a: Interval, b: Interval) -> Interval:
     """Return max(a, b), exact."""
     return np.maximum(a[0], b[0]), np.maximum(a[1], b[1])
+
+
+def meet(a: Interval, b: Interval) -> Interval:
+    """Return what two enclosures of the same value have in common; one may be unknown."""
+    return np.fmax(a[0], b[0]), np.fmin(a[1], b[1])
+
+
+def with_zero(a: Interval) -> Interval:
+    """Return the smallest interval that holds a and zero."""
+    return np.minimum(a[0], 0.0), np.maximum(a[1], 0.0)

@@ -29,7 +29,8 @@ __all__ = [
 
 Indices = NDArray[np.int64]
 
-# Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch.
+# Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
+# quotients with a removable singularity it knows nothing at the singularity.
 _NOT_SMOOTH = frozenset(
     {
         "absolute",
@@ -45,6 +46,7 @@ _NOT_SMOOTH = frozenset(
         "less_equal",
         "logical_not",
         "maximum",
+        "meet",
         "minimum",
         "remainder",
         "select",

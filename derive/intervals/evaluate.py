@@ -155,9 +155,8 @@ def first_failure(program: Program, lower: Array, upper: Array, output: int) -> 
     str
         A phrase such as "a division by an interval that contains zero".
     """
-    order = program.live([output])
-    values = _run(program, lower[:, None], upper[:, None], order)
-    for index in order:
+    values = _run(program, lower[:, None], upper[:, None], program.live([output]))
+    for index in program.decisive(output):
         node = program.nodes[index]
         finite = bool(
             np.all(np.isfinite(values[index][0])) and np.all(np.isfinite(values[index][1]))

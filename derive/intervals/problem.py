@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.batch import Problem, Source
 from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.quotients import Quotients
+from obsynth.derive.intervals.removable import remove_singularities
 from obsynth.derive.intervals.rules import JUMPS
 
 __all__ = ["make_problem"]
@@ -21,6 +23,7 @@ def make_problem(
     box: ArrayLike,
     constants: Any = None,
     constant_box: Sequence[tuple[float, float]] = (),
+    quotients: Quotients | None = None,
 ) -> Problem:
     """Program of expressions and their gradients, ready for `maximise`.
 
@@ -36,6 +39,9 @@ def make_problem(
         Further symbols, whose enclosures stand in ``constant_box``.
     constant_box : sequence of (float, float)
         One enclosure per constant.
+    quotients : Quotients, optional
+        What further symbols in the expressions stand for. Without it, quotients with removable
+        singularities are looked for.
 
     Returns
     -------
@@ -64,19 +70,28 @@ def make_problem(
             constants=extra.numel(),
             enclosures=len(constant_box),
         )
-    jacobian = ca.jacobian(column, variables)
-    rows, columns = jacobian.sparsity().get_triplet()
-    slopes = ca.SX(jacobian.nz[:]) if rows else ca.SX(0, 1)
-    try:
-        function = ca.Function("ranges", [variables, extra], [column, slopes])
-    except RuntimeError as error:
-        known = {str(s) for s in ca.symvar(ca.vertcat(variables, extra))}
-        free = sorted({str(s) for s in ca.symvar(column)} - known)
+    given = ca.SX(0, 1) if quotients is None else quotients.column
+    inputs = [variables, extra, given]
+    free = sorted(map(str, ca.Function("f", inputs, [column], {"allow_free": True}).free_sx()))
+    if free:
         raise DerivationError(
             f"the expressions contain the symbols {', '.join(free)}, which have no range here",
             symbols=tuple(free),
-        ) from error
-    program = Program.from_casadi(function, {1: list(constant_box)})
+        )
+    source = None
+    if quotients is None:
+        source = Source(column, variables, extra, list(constant_box))
+        found = remove_singularities(column, variables, extra, box, constant_box)
+        column, quotients = (column, Quotients()) if found is None else found
+    jacobian = quotients.jacobian(column, variables)
+    rows, columns = jacobian.sparsity().get_triplet()
+    slopes = ca.SX(jacobian.nz[:]) if rows else ca.SX(0, 1)
+    function = ca.Function("ranges", [variables, extra, quotients.column], [column, slopes])
+    program = Program(n_variables=v)
+    nodes = [program.variable(j) for j in range(v)]
+    fixed = [program.number(*pair) for pair in constant_box]
+    inside = quotients.insert(program, (variables, nodes), (extra, fixed))
+    program.outputs = program.insert(function, [nodes, fixed, inside])
     gradient = np.full((m, v), -1, dtype=np.int64)
     relevant, affine = np.zeros((m, v), dtype=bool), np.zeros((m, v), dtype=bool)
     for k, (e, j) in enumerate(zip(rows, columns, strict=True)):
@@ -88,6 +103,5 @@ def make_problem(
         for j in np.flatnonzero(relevant[e]).tolist():
             position = int(gradient[e, j])
             affine[e, j] = position >= 0 and j not in program.support(position)
-    source = Source(column, variables, extra, list(constant_box))
     lower, upper = box[:, 0].copy(), box[:, 1].copy()
     return Problem(program, gradient, relevant, affine, lower, upper, source)

@@ -119,27 +119,51 @@ class Program(Graph):
         ['input', 'power_int', 'twice']
         """
         given = dict(constants or {})
-        first: dict[int, int] = {}
-        count = 0
+        arguments: list[list[int]] = []
+        program = cls()
         for index in range(function.n_in()):
-            if index not in given:
-                first[index] = count
-                count += function.numel_in(index)
-        program = cls(n_variables=count)
+            if index in given:
+                arguments.append([program.number(*pair) for pair in given[index]])
+                continue
+            count = function.numel_in(index)
+            first, program.n_variables = program.n_variables, program.n_variables + count
+            arguments.append([program.variable(first + k) for k in range(count)])
+        program.outputs = program.insert(function, arguments)
+        return program
+
+    def variable(self, number: int) -> int:
+        """Return the node of a box variable."""
+        return self.append(Node("input", (), number))
+
+    def insert(self, function: ca.Function, arguments: Sequence[Sequence[int]]) -> list[int]:
+        """Add what an SX function computes from nodes.
+
+        Parameters
+        ----------
+        function : casadi.Function
+            SX function with dense inputs.
+        arguments : sequence of sequence of int
+            For every input, the nodes of its elements.
+
+        Returns
+        -------
+        list of int
+            One node per nonzero of the outputs.
+
+        Raises
+        ------
+        DerivationError
+            An operation without a range rule, by name.
+        """
         work: dict[int, int] = {}
         results: dict[tuple[int, int], int] = {}
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
             out, args = function.instruction_output(k), function.instruction_input(k)
             if code == ca.OP_CONST:
-                work[out[0]] = program.number(*constant_interval(function.instruction_constant(k)))
+                work[out[0]] = self.number(*constant_interval(function.instruction_constant(k)))
             elif code == ca.OP_INPUT:
-                which, element = args
-                if which in given:
-                    work[out[0]] = program.number(*given[which][element])
-                else:
-                    node = Node("input", (), first[which] + element)
-                    work[out[0]] = program.append(node)
+                work[out[0]] = arguments[args[0]][args[1]]
             elif code == ca.OP_OUTPUT:
                 results[(out[0], out[1])] = work[args[0]]
             else:
@@ -152,14 +176,13 @@ class Program(Graph):
                     )
                 operands = [work[a] for a in args]
                 work[out[0]] = (
-                    REWRITES[name](program, operands)
+                    REWRITES[name](self, operands)
                     if name in REWRITES
-                    else program.plain(name, operands)
+                    else self.plain(name, operands)
                 )
-        for index in range(function.n_out()):
-            for element in range(function.nnz_out(index)):
-                program.outputs.append(results[(index, element)])
-        return program
+        return [
+            results[(i, j)] for i in range(function.n_out()) for j in range(function.nnz_out(i))
+        ]
 
     def live(self, outputs: Sequence[int]) -> list[int]:
         """List the nodes needed for some outputs, in order; remembered between calls.
@@ -202,11 +225,33 @@ class Program(Graph):
         """
         if output not in self._breaks:
             self._breaks[output] = [
-                k
-                for k in self.live([output])
-                if k not in self.constants and self.nodes[k].op in PARTIAL | JUMPS
+                k for k in self.decisive(output) if self.nodes[k].op in PARTIAL | JUMPS
             ]
         return self._breaks[output]
+
+    def decisive(self, output: int) -> list[int]:
+        """List the nodes under an output without which it has no range, in order.
+
+        Parameters
+        ----------
+        output : int
+            Position in ``self.outputs``.
+
+        Returns
+        -------
+        list of int
+            Node numbers, without constants and without the first operand of every ``meet``,
+            which may be undefined where the second one is not.
+        """
+        needed: set[int] = set()
+        stack = [self.outputs[output]]
+        while stack:
+            index = stack.pop()
+            if index not in needed and index not in self.constants:
+                needed.add(index)
+                node = self.nodes[index]
+                stack.extend(node.args[1:] if node.op == "meet" else node.args)
+        return sorted(needed)
 
     def support(self, output: int) -> tuple[int, ...]:
         """List the variables on which an output depends.

@@ -14,6 +14,7 @@ from obsynth.derive.intervals.batch import Problem
 from obsynth.derive.intervals.branch import Budget, Outcome
 from obsynth.derive.intervals.evaluate import first_failure
 from obsynth.derive.intervals.problem import make_problem
+from obsynth.derive.intervals.quotients import Quotients
 from obsynth.derive.intervals.stages import staged
 
 __all__ = ["EFFORTS", "Failure", "Ranges", "Status", "bound_ranges", "make_problem"]
@@ -115,6 +116,7 @@ def bound_ranges(
     constant_box: Sequence[tuple[float, float]] = (),
     rtol: float = 1e-6,
     effort: str = "normal",
+    quotients: Quotients | None = None,
 ) -> Ranges:
     """Enclose the ranges of CasADi SX expressions over a box.
 
@@ -134,6 +136,10 @@ def bound_ranges(
         Wanted gap relative to the width of the attained range.
     effort : {"fast", "normal", "tight"}
         How many boxes may be spent.
+    quotients : Quotients, optional
+        What further symbols in the expressions stand for, where they come from the derivatives of
+        something with removable singularities. Such singularities in the expressions themselves
+        are found without it.
 
     Returns
     -------
@@ -159,7 +165,7 @@ def bound_ranges(
         )
     if not 0.0 <= rtol < 1.0:
         raise DerivationError(f"rtol has to lie in [0, 1); given was {rtol}", rtol=rtol)
-    problem = make_problem(expressions, variables, box, constants, constant_box)
+    problem = make_problem(expressions, variables, box, constants, constant_box, quotients)
     return _ranges(problem, staged(problem, rtol, EFFORTS[effort]))
 
 

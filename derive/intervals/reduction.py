@@ -61,6 +61,16 @@ class SxGraph:
     variables, extra : casadi.SX
         Symbols; only ``variables`` count as variables.
 
+    Attributes
+    ----------
+    nodes : list of (int, tuple of int, number)
+        CasADi's operation, operands (always earlier nodes) and, for constants, the value, for
+        inputs, which input and element.
+    roots : dict of int to int
+        Node of every expression.
+    supports : list of frozenset of int
+        Variables of every node.
+
     Examples
     --------
     >>> x = ca.SX.sym("x", 3)
@@ -72,7 +82,7 @@ class SxGraph:
     def __init__(self, column: ca.SX, variables: ca.SX, extra: ca.SX) -> None:
         self._symbols = (variables, extra)
         function = ca.Function("graph", [variables, extra], [column])
-        self._nodes: list[_Key] = []
+        self.nodes: list[_Key] = []
         known: dict[_Key, int] = {}
         work: dict[int, int] = {}
         self.roots: dict[int, int] = {}
@@ -91,11 +101,11 @@ class SxGraph:
                 args = tuple(work[a] for a in operands)
                 key = (code, tuple(sorted(args)) if code in _COMMUTATIVE else args, None)
             if key not in known:
-                known[key] = len(self._nodes)
-                self._nodes.append(key)
+                known[key] = len(self.nodes)
+                self.nodes.append(key)
             work[out[0]] = known[key]
         self.supports: list[frozenset[int]] = []
-        for _, args, value in self._nodes:
+        for _, args, value in self.nodes:
             own = frozenset[int]()
             if isinstance(value, tuple) and value[0] == 0:
                 own = frozenset([value[1]])
@@ -108,14 +118,14 @@ class SxGraph:
             index = stack.pop()
             if index not in found:
                 found.add(index)
-                stack.extend(self._nodes[index][1])
+                stack.extend(self.nodes[index][1])
         return sorted(found, reverse=True)
 
     def _dominators(self, root: int, live: list[int]) -> dict[int, int]:
         """Nearest node through which all paths from a node to the root lead."""
         users: dict[int, list[int]] = {index: [] for index in live}
         for index in live:
-            for argument in self._nodes[index][1]:
+            for argument in self.nodes[index][1]:
                 users[argument].append(index)
         nearest, depth = {root: root}, {root: 0}
         # users have larger numbers than what they use, so they are done first
@@ -150,7 +160,7 @@ class SxGraph:
         nearest = self._dominators(root, live)
         above: dict[int, list[int]] = {}
         for index in live:
-            if self._nodes[index][0] == ca.OP_INPUT and self.supports[index]:
+            if self.nodes[index][0] == ca.OP_INPUT and self.supports[index]:
                 chain = [index]
                 while chain[-1] != root:
                     chain.append(nearest[chain[-1]])
@@ -185,7 +195,7 @@ class SxGraph:
         for node in reversed(self._live(index)):
             if node in values:
                 continue
-            code, args, value = self._nodes[node]
+            code, args, value = self.nodes[node]
             if isinstance(value, float):
                 values[node] = ca.SX(value)
             elif isinstance(value, tuple):

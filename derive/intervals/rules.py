@@ -93,6 +93,8 @@ RULES: dict[str, Callable[..., Interval]] = {
     "absolute": ar.absolute,
     "minimum": ar.minimum,
     "maximum": ar.maximum,
+    "meet": ar.meet,
+    "with_zero": ar.with_zero,
     "exp": fn.increasing(np.exp, 0.0),
     "expm1": fn.increasing(np.expm1, -1.0),
     "log": fn.increasing(np.log, domain=(0.0, np.inf)),
