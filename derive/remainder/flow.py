@@ -1,0 +1,162 @@
+"""A box that no solution leaves within one step."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals.batch import Problem
+from obsynth.derive.intervals.branch import maximise
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.ranges import EFFORTS, make_problem
+from obsynth.derive.remainder.system import System
+
+__all__ = ["FlowError", "flow_box", "flow_tubes"]
+
+Array = NDArray[np.float64]
+_ATTEMPTS = 40
+_RTOL = 1e-2
+
+
+class FlowError(DerivationError):
+    """No box could be found that the solutions do not leave within a step."""
+
+
+def flow_box(dynamics: System, step: float) -> tuple[Array, Array]:
+    """Enclose all solutions over one step that start in the box.
+
+    A candidate box Y holds them when, for every state and both sides, Y reaches further out than
+    the rate on the slab between the box and Y can carry within a step: a solution that left Y
+    first through the upper face of state i would have spent the time since it last was at the
+    upper face of the box inside that slab, and would not have come far enough. Only rates on the
+    slabs count, so that a box into which the flow points hardly grows.
+
+    Parameters
+    ----------
+    dynamics : System
+        The plant with its box.
+    step : float
+        Length of the step, an upper bound of it.
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (n,)
+        The enclosure.
+
+    Raises
+    ------
+    FlowError
+        The rates are unbounded next to the box or grow faster than the candidate does.
+
+    Examples
+    --------
+    >>> from obsynth.derive.remainder.system import system
+    >>> from obsynth.symbolic import Plant
+    >>> plant = Plant("growth")
+    >>> (x,) = plant.states("x", range=(1, 2))
+    >>> plant.dynamics([x]); plant.outputs([x])
+    ('y1',)
+    >>> lower, upper = flow_box(system(plant), 0.1)
+    >>> bool(lower[0] < 1.0), bool(2 * np.exp(0.1) < upper[0] < 2.25)
+    (True, True)
+    """
+    n = len(dynamics.names)
+    low, high = dynamics.lower[:n], dynamics.upper[:n]
+    rows = [_problem(dynamics, i) for i in range(n)]
+    margin = 1e-9 * np.maximum(high - low, np.maximum(np.abs(low), np.abs(high))) + 1e-300
+    bottom, top = low - margin, high + margin
+    for attempt in range(_ATTEMPTS):
+        fall = np.array([_rate(rows[i], dynamics, bottom, top, i, -1) for i in range(n)])
+        rise = np.array([_rate(rows[i], dynamics, bottom, top, i, +1) for i in range(n)])
+        wrong = ~(np.isfinite(fall) & np.isfinite(rise))
+        if wrong.any():
+            raise _failure(dynamics, int(np.argmax(wrong)), bottom, top, step)
+        below = np.nextafter(low - np.nextafter(step * fall, np.inf), -np.inf)
+        above = np.nextafter(high + np.nextafter(step * rise, np.inf), np.inf)
+        holds = (below > bottom) & (above < top)
+        if holds.all():
+            # what the slabs of a box that holds allow is an enclosure itself
+            return below, above
+        growth = 1.05 + 0.1 * attempt
+        bottom = np.where(below > bottom, bottom, low - growth * step * fall - margin)
+        top = np.where(above < top, top, high + growth * step * rise + margin)
+    raise _failure(dynamics, int(np.argmin(holds)), bottom, top, step)
+
+
+def _problem(dynamics: System, row: int) -> Problem:
+    columns = ca.vertcat(dynamics.x, dynamics.v)
+    box = np.column_stack([dynamics.lower, dynamics.upper])
+    return make_problem(dynamics.rhs[row], columns, box, dynamics.constants, dynamics.constant_box)
+
+
+def _rate(
+    problem: Problem, dynamics: System, bottom: Array, top: Array, row: int, side: int
+) -> float:
+    """Bound the outward rate of a state on the slab next to the box; never negative."""
+    n = len(dynamics.names)
+    lower, upper = dynamics.lower.copy(), dynamics.upper.copy()
+    lower[:n], upper[:n] = bottom, top
+    if side > 0:
+        lower[row] = dynamics.upper[row]
+    else:
+        upper[row] = dynamics.lower[row]
+    outcome = maximise(replace(problem, lower=lower, upper=upper), _RTOL, EFFORTS["fast"])
+    return max(0.0, float(outcome.bound[1 if side > 0 else 0]))
+
+
+def _failure(dynamics: System, row: int, bottom: Array, top: Array, step: float) -> FlowError:
+    name = dynamics.names[row]
+    return FlowError(
+        f"no box holds the solutions over a step of {step:g} s: next to the range of {name} "
+        f"(tried [{bottom[row]:.6g}, {top[row]:.6g}]) the rates are undefined, unbounded or too "
+        f"fast. Take a shorter step, or keep the range of {name} away from there",
+        symbol=name,
+        step=step,
+        tried=(float(bottom[row]), float(top[row])),
+    )
+
+
+def flow_tubes(
+    dynamics: System, first: Array, last: Array, held: Array, step: float
+) -> tuple[Array, Array]:
+    """Enclose the solutions over one step from every small box of a batch.
+
+    Parameters
+    ----------
+    dynamics : System
+        The plant.
+    first, last : ndarray, shape (n, N)
+        Lower and upper ends of the starting states.
+    held : ndarray, shape (n_v, N)
+        Held signals.
+    step : float
+        Length of the step.
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (n, N)
+        By the theorem of Picard and Lindeloef: start + [0, step] f(Y) inside Y. Infinite where
+        no Y was found.
+    """
+    program = dynamics.program(dynamics.rhs)
+    others = np.vstack([held, np.zeros((1, first.shape[1]))])
+    margin = 1e-12 * np.maximum(np.abs(first), np.abs(last)) + 1e-300
+    lower, upper = first - margin, last + margin
+    found: NDArray[np.bool_] = np.zeros(first.shape[1], dtype=np.bool_)
+    for attempt in range(_ATTEMPTS):
+        with np.errstate(invalid="ignore", over="ignore"):
+            low, high = evaluate(program, np.vstack([lower, others]), np.vstack([upper, others]))
+            fall = np.minimum(0.0, np.nextafter(step * low, -np.inf))
+            rise = np.maximum(0.0, np.nextafter(step * high, np.inf))
+            below, above = np.nextafter(first + fall, -np.inf), np.nextafter(last + rise, np.inf)
+            inside = (below >= lower) & (above <= upper)
+            found = np.asarray(inside.all(axis=0), dtype=np.bool_)
+            if found.all():
+                return below, above
+            growth = 1.05 + 0.05 * attempt
+            wider = np.minimum(lower, first + growth * fall - margin)
+            lower = np.where(found, lower, wider)
+            upper = np.where(found, upper, np.maximum(upper, last + growth * rise + margin))
+    return np.where(found, lower, -np.inf), np.where(found, upper, np.inf)

@@ -1,0 +1,167 @@
+"""Intervals for the local error of a discretisation, and the plant that carries them."""
+
+from dataclasses import dataclass, replace
+from html import escape
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals import Status
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["Remainder"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """x(t + Ts) = step(x(t)) + r with r in [lower, upper], everything else held over the step.
+
+    Attributes
+    ----------
+    plant : Plant
+        The continuous plant.
+    method : str
+        ``"euler"`` or ``"rk4"``.
+    exact_Ts : sympy.Expr
+        Sampling time in s, as it was given.
+    lower, upper : ndarray, shape (n,)
+        Guaranteed bounds of r, for every state of the box and every held signal in its range.
+    attained_lower, attained_upper : ndarray, shape (n,)
+        Values that r is guaranteed to reach or pass, so that the exact range lies between.
+    attained_at : tuple of dict
+        For every state, the state and held signals with the larger attained modulus.
+    flow_lower, flow_upper : ndarray, shape (n,)
+        A box that no solution from the plant's box leaves within a step.
+    order : int
+        Power of Ts of the bound: 2 for Euler, 5 for Runge-Kutta, less where the dynamics have
+        kinks inside the box.
+    assumed : dict of str to (float, float)
+        Ranges that were given for this purpose and are not the plant's own.
+    status : Status
+        How far bounds and attained values are apart, by the tolerance that was asked for.
+    """
+
+    plant: Plant
+    method: str
+    exact_Ts: sp.Expr
+    lower: Array
+    upper: Array
+    attained_lower: Array
+    attained_upper: Array
+    attained_at: tuple[dict[str, float], ...]
+    flow_lower: Array
+    flow_upper: Array
+    order: int
+    assumed: dict[str, tuple[float, float]]
+    status: Status
+
+    @property
+    def Ts(self) -> float:
+        """Sampling time in s."""
+        return float(self.exact_Ts)
+
+    @property
+    def radius(self) -> Array:
+        """Largest modulus per state, shape (n,)."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
+    @property
+    def excess(self) -> Array:
+        """Guaranteed width over attained width, per state; 1 is perfect, 1 too where both are 0."""
+        wide, real = self.upper - self.lower, self.attained_upper - self.attained_lower
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return np.where(wide <= 1e-250, 1.0, np.where(real > 0.0, wide / real, np.inf))
+
+    def as_disturbance(self, prefix: str = "r_") -> Plant:
+        """Return the discrete plant with the remainder as one more disturbance per state.
+
+        What is guaranteed for it holds for the continuous plant at the sampling instants, as long
+        as inputs, faults and disturbances are held over each step and the state is in its box.
+        Assumed ranges become ranges of the signals.
+
+        Parameters
+        ----------
+        prefix : str
+            Put before the names of the states.
+
+        Returns
+        -------
+        Plant
+            Discrete; states whose remainder is zero get no disturbance.
+
+        Raises
+        ------
+        DerivationError
+            A name that is taken.
+        """
+        step = self.plant.discretise(self.method, self.exact_Ts)
+        result = Plant(step.name)
+        taken = {s.name for s in step.signals} | set(step.output_names)
+        signals = [
+            replace(s, lower=self.assumed[s.name][0], upper=self.assumed[s.name][1])
+            if s.name in self.assumed
+            else s
+            for s in step.signals
+        ]
+        result.add_signals(signals)
+        rows, outputs = list(step.equations[0]), step.equations[1]
+        for i, signal in enumerate(step.x):
+            if self.lower[i] == self.upper[i] == 0.0:
+                continue
+            name = prefix + signal.name
+            if name in taken:
+                raise DerivationError(
+                    f"the plant has a signal {name} already; choose another prefix=", symbol=name
+                )
+            pair = (float(self.lower[i]), float(self.upper[i]))
+            (symbol,) = result.disturbances([name], range=pair, unit=signal.unit)
+            rows[i] = rows[i] + symbol
+        result.dynamics(rows, Ts=step.exact_Ts)
+        result.outputs(list(outputs), names=step.output_names, unit=list(step.output_units))
+        return result
+
+    def _table(self) -> list[tuple[str, ...]]:
+        rows: list[tuple[str, ...]] = []
+        for i, signal in enumerate(self.plant.x):
+            rows.append(
+                (
+                    signal.name,
+                    f"[{self.lower[i]:.4g}, {self.upper[i]:.4g}]",
+                    f"[{self.attained_lower[i]:.4g}, {self.attained_upper[i]:.4g}]",
+                    f"[{self.flow_lower[i]:.6g}, {self.flow_upper[i]:.6g}]",
+                    signal.unit,
+                )
+            )
+        return rows
+
+    def _title(self) -> str:
+        held = "".join(f", {k} in [{a:g}, {b:g}]" for k, (a, b) in self.assumed.items())
+        return (
+            f"Remainder of {self.method}, Ts = {self.Ts:g} s, for {self.plant.name} "
+            f"(order {self.order}; signals held over a step{held})"
+        )
+
+    def __str__(self) -> str:
+        head = ("state", "guaranteed", "attained", "flow over a step", "unit")
+        table = [head, *self._table()]
+        widths = [max(len(row[k]) for row in table) for k in range(len(head))]
+        lines = [
+            "  " + "  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip()
+            for row in table
+        ]
+        return "\n".join([self._title(), *lines])
+
+    def _repr_html_(self) -> str:
+        head = "".join(
+            f"<th>{word}</th>"
+            for word in ("state", "guaranteed", "attained", "flow over a step", "unit")
+        )
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in self._table()
+        )
+        return f"<table><caption>{escape(self._title())}</caption><tr>{head}</tr>{rows}</table>"

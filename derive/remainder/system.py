@@ -1,0 +1,255 @@
+"""A continuous plant as CasADi columns with one box, and derivatives along its solutions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.errors import DerivationError, UnboundedError
+from obsynth.derive.exact import enclose_number
+from obsynth.derive.intervals import Program, Ranges, bound_ranges
+from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.rules import JUMPS
+from obsynth.symbolic.discretise import runge_kutta
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["System", "step_derivatives", "system", "time_derivatives"]
+
+Array = NDArray[np.float64]
+_HELD = ("u", "d", "f", "w", "p", "rho")
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """dx/dt = f(x, v) with v held over a step.
+
+    Attributes
+    ----------
+    x, v, s : casadi.SX
+        States, held signals that occur, and the time within a step.
+    rhs : casadi.SX
+        f.
+    names, held : tuple of str
+        Names of states and held signals.
+    lower, upper : ndarray, shape (n + n_v,)
+        The box.
+    constants : casadi.SX
+        Constants of the plant.
+    constant_box : list of (float, float)
+        Their enclosures.
+    """
+
+    x: ca.SX
+    v: ca.SX
+    s: ca.SX
+    rhs: ca.SX
+    names: tuple[str, ...]
+    held: tuple[str, ...]
+    lower: Array
+    upper: Array
+    constants: ca.SX
+    constant_box: list[tuple[float, float]]
+
+    @property
+    def variables(self) -> ca.SX:
+        """States, held signals and time, as a column."""
+        return ca.vertcat(self.x, self.v, self.s)
+
+    def box(self, lower: Array, upper: Array, step: float) -> Array:
+        """Box for `variables` with other states, and time in [0, step]."""
+        n = len(self.names)
+        low = np.concatenate([lower[:n], self.lower[n:], [0.0]])
+        high = np.concatenate([upper[:n], self.upper[n:], [step]])
+        return np.column_stack([low, high])
+
+    def program(self, column: ca.SX) -> Program:
+        """Return a column of expressions as an interval program of `variables`."""
+        function = ca.Function("column", [self.variables, self.constants], [ca.densify(column)])
+        return Program.from_casadi(function, {1: self.constant_box})
+
+    def ranges(self, column: ca.SX, box: Array, what: str, rtol: float, effort: str) -> Ranges:
+        """Bound one expression per state over a box.
+
+        Raises
+        ------
+        UnboundedError
+            A row without a finite bound, by the name of its state.
+        """
+        found = bound_ranges(
+            column,
+            self.variables,
+            box,
+            self.constants,
+            self.constant_box,
+            rtol=rtol,
+            effort=effort,
+        )
+        if found.failures:
+            failure = found.failures[0]
+            labels = (*self.names, *self.held, "time in the step")
+            sub_box = {
+                label: (float(failure.lower[k]), float(failure.upper[k]))
+                for k, label in enumerate(labels)
+            }
+            where = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in sub_box.items())
+            raise UnboundedError(
+                f"{what} has no finite bound in the row of {self.names[failure.index]} "
+                f"({failure.operation} at {where}). Keep the ranges further away from there, or "
+                "take a shorter step",
+                entries=(f"{what} of {self.names[failure.index]}",),
+                operation=failure.operation,
+                sub_box=sub_box,
+            )
+        return found
+
+    def may_jump(self, column: ca.SX, box: Array) -> bool:
+        """Tell whether an expression contains an operation that may jump inside the box."""
+        program = self.program(column)
+        outputs = range(len(program.outputs))
+        jumps = any(program.nodes[k].op in JUMPS for o in outputs for k in program.breaks(o))
+        if not jumps:
+            return False
+        found = enclose(program, box[:, :1], box[:, 1:], outputs, len(outputs))
+        return bool(found.rough.any())
+
+
+def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None) -> System:
+    """Read a continuous plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        Continuous, complete.
+    ranges : mapping of str to (lower, upper), optional
+        Ranges in place of the declared ones, by signal.
+
+    Returns
+    -------
+    System
+        With the held signals that occur in the dynamics.
+
+    Raises
+    ------
+    DerivationError
+        A discrete plant, a name that is no signal, a range out of order.
+    UnboundedError
+        A signal of the dynamics without a finite range.
+    """
+    if plant.check().Ts is not None:
+        raise DerivationError(
+            f"plant {plant.name!r} is discrete (Ts = {plant.Ts:g} s); the remainder belongs to the "
+            "step from a continuous plant: give that one (plant.continuous)",
+            Ts=plant.Ts,
+        )
+    given = {str(name): pair for name, pair in (ranges or {}).items()}
+    sx = plant.sx(constants="symbol")
+    present = {str(symbol) for symbol in ca.symvar(sx.rhs)}
+    known = {s.name for kind in ("x", *_HELD) for s in getattr(plant, kind)}
+    unknown = sorted(set(given) - known)
+    if unknown:
+        raise DerivationError(
+            f"ranges= names {', '.join(unknown)}, which the plant does not have", symbols=unknown
+        )
+    lower, upper, held, columns = [], [], [], []
+    for kind in ("x", *_HELD):
+        for signal, element in zip(
+            getattr(plant, kind), ca.vertsplit(getattr(sx, kind)), strict=True
+        ):
+            if kind != "x" and signal.name not in present:
+                continue
+            low, high = (float(e) for e in given.get(signal.name, (signal.lower, signal.upper)))
+            if low > high:
+                raise DerivationError(
+                    f"the range of {signal.name} is empty: ({low}, {high})", symbol=signal.name
+                )
+            if not (np.isfinite(low) and np.isfinite(high)):
+                raise UnboundedError(
+                    f"the {signal.role} {signal.name} enters the dynamics without a finite range, "
+                    "so nothing bounds what happens within a step; declare a range, or assume one "
+                    f"here: ranges={{{signal.name!r}: (lower, upper)}}",
+                    entries=(signal.name,),
+                    operation="an unbounded signal",
+                    sub_box={signal.name: (low, high)},
+                )
+            lower.append(low)
+            upper.append(high)
+            if kind != "x":
+                held.append(signal.name)
+                columns.append(element)
+    return System(
+        sx.x,
+        ca.vertcat(*columns) if columns else ca.SX(0, 1),
+        ca.SX.sym("s"),
+        sx.rhs,
+        plant.names("x"),
+        tuple(held),
+        np.array(lower),
+        np.array(upper),
+        sx.c,
+        [enclose_number(value) for value in plant.constant_values.values()],
+    )
+
+
+def time_derivatives(dynamics: System, order: int) -> list[ca.SX]:
+    """Form the derivatives of a solution by time, as functions of the state: f, J f, J(J f) f, ...
+
+    Parameters
+    ----------
+    dynamics : System
+        The plant.
+    order : int
+        Highest derivative.
+
+    Returns
+    -------
+    list of casadi.SX
+        Entry k - 1 is the k-th derivative.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic import Plant
+    >>> plant = Plant("decay")
+    >>> (x,) = plant.states("x", range=(1, 2))
+    >>> plant.dynamics([-x]); plant.outputs([x])
+    ('y1',)
+    >>> time_derivatives(system(plant), 2)
+    [SX((-x)), SX(x)]
+    """
+    found = [dynamics.rhs]
+    for _ in range(order - 1):
+        found.append(ca.cse(ca.jtimes(found[-1], dynamics.x, dynamics.rhs)))
+    return found
+
+
+def step_derivatives(dynamics: System, method: str, order: int) -> list[ca.SX]:
+    """Form the derivatives of a method's step by its length s, as functions of x and s.
+
+    Parameters
+    ----------
+    dynamics : System
+        The plant.
+    method : {"euler", "rk4"}
+        The method.
+    order : int
+        Highest derivative.
+
+    Returns
+    -------
+    list of casadi.SX
+        Entry k - 1 is the k-th derivative at length s.
+    """
+    if method == "euler":
+        return [dynamics.rhs] + [ca.SX.zeros(dynamics.x.numel())] * (order - 1)
+    rates = ca.Function("rates", [dynamics.x, dynamics.v, dynamics.constants], [dynamics.rhs])
+
+    def at(x: ca.SX) -> ca.SX:
+        return rates(x, dynamics.v, dynamics.constants)
+
+    value = runge_kutta(at, dynamics.x, dynamics.s)
+    found = []
+    for _ in range(order):
+        value = ca.cse(ca.densify(ca.jacobian(value, dynamics.s)))
+        found.append(value)
+    return found
