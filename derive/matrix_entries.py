@@ -162,11 +162,13 @@ class MatrixEntries:
         }
 
     def sample(self, count: int) -> dict[Entry, Array]:
-        """Evaluate the entries at fixed random points of the box, those in their domain."""
+        """Evaluate the entries at fixed random points and corners, those in their domain."""
         rng = np.random.default_rng(0)
         lower = np.where(np.isfinite(self.box[:, 0]), self.box[:, 0], -1.0)
         upper = np.where(np.isfinite(self.box[:, 1]), self.box[:, 1], lower + 2.0)
-        points = lower + rng.random((count, len(lower))) * (upper - lower)
+        share = rng.random((count, len(lower)))
+        share[: count // 3] = np.round(share[: count // 3])
+        points = lower + share * (upper - lower)
         middle = np.array([0.5 * lo + 0.5 * hi for lo, hi in self.constant_box])
         function = ca.Function("sample", [self.variables, self.constants], [self.values])
         result = np.array(function(points.T, np.tile(middle[:, None], (1, count))))

@@ -92,7 +92,8 @@ def rotate(centre: Array, radius: Array) -> Rotation:
     across = size.transpose(0, 2, 1)
     image = vectors.transpose(0, 2, 1) @ (safe @ vectors)
     spread = np.where(usable[:, None, None], radius, 0.0) + _gamma(2 * k + 4) * np.abs(safe)
-    charge = across @ (spread @ size) * (1.0 + _gamma(4 * k + 8)) + _UNDERFLOW
+    charge = across @ (spread @ size) * (1.0 + _gamma(4 * k + 8))
+    charge = charge + _UNDERFLOW * spread.any(axis=(1, 2), keepdims=True)
     rest = np.abs(image - values[:, :, None] * np.eye(k)) * (1.0 + 4.0 * UNIT) + charge
     error = rest.sum(axis=2).max(axis=1, initial=0.0) * (1.0 + _gamma(k + 4))
     gram = np.abs(vectors.transpose(0, 2, 1) @ vectors - np.eye(k))
@@ -142,7 +143,9 @@ def largest_eigenvalue(centre: Array, radius: Array | None = None) -> tuple[Arra
         )
         lower = plain.lower(np.nextafter(plain.values[:, -1] - around, -np.inf))
     upper = np.where(finite(radius) & ~np.isnan(upper), upper, np.inf)
-    return np.where(np.isnan(lower), -np.inf, lower), upper
+    lower = np.where(np.isnan(lower), -np.inf, lower)
+    zero = ~(centre.any(axis=(1, 2)) | radius.any(axis=(1, 2)))
+    return np.where(zero, 0.0, lower), np.where(zero, 0.0, upper)
 
 
 def perron_bound(matrix: Array) -> Array:

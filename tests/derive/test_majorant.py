@@ -1,0 +1,221 @@
+"""Diagonal majorants of the H-infinity paper, and why its (11) fails."""
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+import sympy as sp
+
+from obsynth.derive import Status, split
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.majorant import majorant
+from obsynth.symbolic import Plant, plants
+
+
+def hinf_split(variant="consistent"):
+    return split(plants.hinf_example(variant), at=(np.zeros(3), np.zeros(1)), linear="terms")
+
+
+def jacobians(parts, count=4000, seed=0):
+    """Jacobians of g at random points, corners and zeros of the box."""
+    model = parts.model
+    box = np.vstack([model.box("x"), model.box("u")])
+    rng = np.random.default_rng(seed)
+    share = rng.random((count, len(box)))
+    share[: count // 4] = np.round(share[: count // 4])
+    points = box[:, 0] + share * (box[:, 1] - box[:, 0])
+    points[-count // 4 :, :] *= rng.integers(0, 2, (count // 4, len(box)))
+    points = np.clip(points, box[:, 0], box[:, 1])
+    g = parts.g_function()
+    arguments = g.sx_in()
+    slope = ca.densify(ca.jacobian(g(*arguments), arguments[0]))
+    n = len(model.x)
+    function = ca.Function("J", arguments, [ca.vec(slope.T)])
+    values = np.array(function(points[:, :n].T, points[:, n:].T)).T
+    return values.reshape(count, n, n)
+
+
+def excess(parts, found, J):
+    """Largest eigenvalue of J'J - M'M, allowed to be the rounding of A that g takes up."""
+    J = np.where(found.entry_bounds > 0.0, J, 0.0)
+    return float(np.linalg.eigvalsh(J.transpose(0, 2, 1) @ J - found.matrix).max())
+
+
+# -- the paper's example ---------------------------------------------------------------------------
+
+
+def test_consistent_variant_is_equation_52():
+    found = majorant(hinf_split())
+    np.testing.assert_allclose(found.diagonal, [0.0, 0.51663779, 0.1089], rtol=0, atol=5e-9)
+    assert found.diagonal[0] == 0.0
+    assert found.diagonal[1] >= 0.5166377886
+    assert found.status is not Status.BUDGET
+    bounds = found.entry_bounds
+    np.testing.assert_allclose([bounds[0, 1], bounds[2, 2]], [0.7187752004, 0.33], rtol=1e-6)
+
+
+def test_attained_value_of_the_consistent_variant():
+    found = majorant(hinf_split())
+    (x2,) = found.groups[0][2].at.values()
+    a = -7.2 * np.sin(12 * x2) / (x2**2 + 10) - 1.2 * np.cos(12 * x2) * x2 / (x2**2 + 10) ** 2
+    assert a**2 == pytest.approx(found.diagonal[1], rel=1e-8)
+    assert a**2 <= found.diagonal[1]
+
+
+@pytest.mark.parametrize("d2", [10.0, 1.0, 0.1])
+def test_printed_variant_is_a_family(d2):
+    """sup a^2 / d1 + b^2 / d2 <= 1; the note's .51841 is .5184 rounded up."""
+    parts = hinf_split("as_printed")
+    found = majorant(parts, fixed={"x2": d2})
+    assert found.diagonal[1] == d2
+    assert 0.5184 <= found.diagonal[0] <= 0.51841
+    assert found.diagonal[2] == pytest.approx(0.1089, rel=1e-12)
+    J = jacobians(parts)
+    assert (J[:, 0, 0] ** 2 / found.diagonal[0] + J[:, 0, 1] ** 2 / d2).max() <= 1.0
+    assert excess(parts, found, J) <= 1e-15
+
+
+def test_printed_variant_without_a_wish():
+    parts = hinf_split("as_printed")
+    found = majorant(parts)
+    assert found.diagonal[0] == pytest.approx(0.5184, rel=1e-7)
+    assert 0.0123237576**2 < found.diagonal[1] < 0.01
+    bounds = found.entry_bounds
+    np.testing.assert_allclose(bounds[0, :2], [0.72, 0.0123237576], rtol=1e-6)
+    assert excess(parts, found, jacobians(parts)) <= 1e-15
+
+
+@pytest.mark.parametrize(
+    ("variant", "gamma2"), [("consistent", 0.51663779), ("as_printed", 0.5184)]
+)
+def test_scalar_majorant_is_equation_14(variant, gamma2):
+    found = majorant(hinf_split(variant), shape="scalar")
+    np.testing.assert_allclose(found.diagonal, gamma2, rtol=1e-8)
+
+
+def test_rounding_of_A_is_told_and_kept_out():
+    found = majorant(hinf_split())
+    assert 0.0 < found.rounding.max() < 1e-15
+    assert not found.rounding[found.entry_bounds > 0.0].any()
+
+
+# -- why (11) fails --------------------------------------------------------------------------------
+
+
+def violation(M, row):
+    """(M_x e)^2 - (M e)^2 on the direction that M does not see, for one-row matrices."""
+    e = np.array([M[1], -M[0]]) if M.any() else np.array([1.0, 0.0])
+    return float((row @ e) ** 2 - (M @ e) ** 2)
+
+
+def test_no_matrix_within_the_bounds_majorises_a_row():
+    rng = np.random.default_rng(0)
+    corners = np.array([[1.0, 1.0], [1.0, -1.0]])
+    for M in [np.array([1.0, 1.0]), *rng.uniform(-1, 1, (500, 2))]:
+        assert max(violation(M, row) for row in corners) > 0.0
+    assert violation(np.array([1.0, 1.0]), corners[1]) == 4.0
+
+
+def test_the_paper_s_own_printed_example_is_such_a_row():
+    """With the bounds of dg1/dx1 and dg1/dx2, no M of (11) holds for the Jacobians that occur."""
+    parts = hinf_split("as_printed")
+    rows = jacobians(parts)[:, 0, :2]
+    r = majorant(parts).entry_bounds[0, :2]
+    rng = np.random.default_rng(1)
+    for M in [r, r * [1, -1], *rng.uniform(-1, 1, (200, 2)) * r]:
+        assert max(violation(M, row) for row in rows) > 0.0
+
+
+# -- other functions -------------------------------------------------------------------------------
+
+
+def test_rows_that_share_states_are_scaled_together(parts):
+    found = majorant(parts)
+    assert [group[:2] for group in found.groups] == [((0, 2), (0, 2)), ((1, 3), (1, 3))]
+    J = jacobians(parts)
+    assert excess(parts, found, J) <= 1e-15
+    total = np.sum([row.diagonal for row in found.rows], axis=0)
+    assert (found.diagonal <= total * (1 + 1e-12)).all()
+    for _, _, largest in found.groups:
+        assert largest.upper <= 1.0
+        assert largest.attained >= 1.0 - 1e-8
+
+
+@pytest.mark.parametrize("share", [0.999, 0.9])
+def test_a_smaller_diagonal_is_refuted(parts, share):
+    found = majorant(parts)
+    smaller = dataclasses.replace(found, diagonal=share * found.diagonal)
+    assert excess(parts, smaller, jacobians(parts)) > 1e-9
+
+
+def test_every_row_has_a_majorant_of_its_own(parts):
+    J = jacobians(parts)
+    for row in majorant(parts).rows:
+        used = row.diagonal > 0.0
+        sums = (J[:, row.row, used] ** 2 / row.diagonal[used]).sum(axis=1)
+        assert sums.max() <= 1.0 + 1e-14
+        assert sums.max() >= 1.0 - 1e-9
+        np.testing.assert_array_less(
+            np.abs(J[:, row.row, :]).max(axis=0) - 1e-15, row.entries + 1e-15
+        )
+
+
+def test_lorenz_rows():
+    parts = split(plants.lorenz(), at=(np.zeros(3), []), linear="terms")
+    found = majorant(parts)
+    assert excess(parts, found, jacobians(parts)) <= 1e-9
+    fixed = majorant(parts, fixed={"x": 6000.0})
+    assert fixed.diagonal[0] == 6000.0
+    assert excess(parts, fixed, jacobians(parts)) <= 1e-9
+
+
+def test_one_column_in_two_rows_adds_the_squares():
+    plant = Plant("column")
+    (x, y) = plant.states("x y", range=(-1, 1))
+    plant.dynamics([sp.sin(x), sp.cos(x) + y / 2], Ts=1)
+    plant.outputs([x])
+    found = majorant(split(plant, at=(np.zeros(2), []), linear="terms"))
+    # cos^2 + sin^2 = 1, although both derivatives reach 1 and sin(1)
+    np.testing.assert_allclose(found.diagonal, [1.0, 0.0], rtol=1e-8)
+
+
+def test_without_a_nonlinearity_there_is_nothing_to_majorise():
+    plant = Plant("linear")
+    (x,) = plant.states("x", range=(-1, 1))
+    plant.dynamics([x / 2], Ts=1)
+    plant.outputs([x])
+    found = majorant(split(plant, linear="terms"))
+    assert found.diagonal.tolist() == [0.0]
+    assert found.rows == found.groups == ()
+
+
+# -- refusals and reading --------------------------------------------------------------------------
+
+
+def test_fixed_elements_that_are_too_small_are_refused_with_the_factor():
+    with pytest.raises(DerivationError, match="too small for the row of x1") as caught:
+        majorant(hinf_split("as_printed"), fixed={"x2": 1e-5})
+    assert caught.value.symbols == ("x2",)
+    assert caught.value.factor == pytest.approx(0.0123237576**2 / 1e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fixed": {"x9": 1.0}}, "x9"),
+        ({"fixed": {"x2": -1.0}}, "positive"),
+        ({"fixed": {"x2": 1.0}, "shape": "scalar"}, "scalar"),
+        ({"shape": "round"}, "round"),
+    ],
+)
+def test_options_that_make_no_sense(options, text):
+    with pytest.raises(DerivationError, match=text):
+        majorant(hinf_split(), **options)
+
+
+def test_majorant_can_be_read():
+    found = majorant(hinf_split())
+    assert "diag(0, 0.51663779, 0.1089)" in str(found)
+    assert "x2 = " in str(found)
+    assert "<table>" in found._repr_html_()
