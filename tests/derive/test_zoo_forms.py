@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.derive import Status, StructureError, jacobian_bounds, split
+from obsynth.derive import Status, StructureError, equilibrium, jacobian_bounds, split
 from obsynth.symbolic import plants
 
 ZOO = {
@@ -170,6 +170,17 @@ def loose_entries(name, effort, limit=1e-6):
             if gap > limit:
                 loose[(wrt, *place)] = float(gap)
     return loose, varying
+
+
+# -- points of operation -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_plants_rest_inside_their_box_for_their_nominal_inputs(name):
+    plant, point = plant_of(name), equilibrium(plant_of(name))
+    box = plant.box("x")
+    assert ((box[:, 0] <= point.x) & (point.x <= box[:, 1])).all()
+    assert point.residual <= 1e-12 * (1 + np.abs(point.x).max())
 
 
 # -- splits ------------------------------------------------------------------------------------
