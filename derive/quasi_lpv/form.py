@@ -90,7 +90,9 @@ class QuasiLPV:
 
     Notes
     -----
-    The form is not unique; `ranking` tells what else there was.
+    The form is not unique; `ranking` tells what else there was. It is the plant wherever its
+    entries are defined; about another centre than the origin, |g| and sign(g) are taken with the
+    sign that g has on the whole box, and the form is the plant on the box.
     """
 
     model: Plant
@@ -244,15 +246,19 @@ class QuasiLPV:
         """
         return centre_form(self.vertices(), nominal)
 
-    def interval(self, measured: Any = None) -> IntervalForm:
+    def interval(self, measured: Any = None, margin: float = 0.0) -> IntervalForm:
         """Elementwise bounds of A, B and the offset.
 
         Parameters
         ----------
         measured : None, "outputs" or sequence of names
             None: constant bounds. ``"outputs"``: functions of what the outputs show (noise
-            included), the inputs and the measured scheduling variables. Names of states, inputs,
-            scheduling variables (known exactly) or outputs (with their noise).
+            included), the inputs and the measured scheduling variables, as far as they schedule.
+            Names of states, inputs, scheduling variables (known exactly) or outputs (with their
+            noise).
+        margin : float
+            How far the arguments may be off beyond their noise, for instance what they move
+            between two samples.
 
         Returns
         -------
@@ -276,7 +282,11 @@ class QuasiLPV:
         """
         way = self.ranging
         blocks = {name: way.matrix[self.layout.place(name)] for name in ("A", "B", "offset")}
-        known = read_measured(self.model, measured)
+        known = read_measured(self.model, measured, margin)
+        if isinstance(measured, str) and measured == "outputs":
+            used = {s for block in blocks.values() for s in block.free_symbols}
+            used |= {s for lift in way.lifts for s in lift.meaning.free_symbols}
+            known = tuple(k for k in known if k.signal in used)
         return make_interval_form(blocks, self.model, known, way.lifts, way.rtol, way.effort)
 
     def function(self) -> ca.Function:

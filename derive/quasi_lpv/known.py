@@ -44,7 +44,7 @@ class Known:
         return bool(self.ends[0] == self.ends[1])
 
 
-def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
+def read_measured(model: Plant, measured: Any, margin: float = 0.0) -> tuple[Known, ...]:
     """Read the option ``measured=``.
 
     Parameters
@@ -55,6 +55,9 @@ def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
         None: nothing. ``"outputs"``: the states that outputs show, with their noise, the inputs
         and the measured scheduling variables. Names of outputs: with noise; names of states,
         inputs and scheduling variables: exactly.
+    margin : float
+        How far the arguments may be off beyond their noise, in their units, for instance what they
+        move between two samples.
 
     Returns
     -------
@@ -64,7 +67,8 @@ def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
     Raises
     ------
     DerivationError
-        A name that is neither, an output that shows no single state, noise without a bound.
+        A name that is neither, an output that shows no single state, noise without a bound, a
+        margin that is negative.
 
     Examples
     --------
@@ -75,8 +79,13 @@ def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
     >>> h3.ends[0]
     Max(5, y3 - 3602879701896397/36028797018963968)
     """
+    if not 0.0 <= margin < math.inf:
+        raise DerivationError(
+            f"margin= is finite and not negative; given was {margin}", given=margin
+        )
     if measured is None:
         return ()
+    extra = rational(margin)
     shown = {reading.output: reading for reading in readings(model)}
     exact = {s.name: s for kind in ("x", "u", "rho") for s in getattr(model, kind)}
     if isinstance(measured, str) and measured == "outputs":
@@ -87,9 +96,11 @@ def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
     found = []
     for name in names:
         if name in shown:
-            found.append(_from_output(model, shown[name]))
+            found.append(_from_output(model, shown[name], extra))
         elif name in exact:
-            found.append(_itself(exact[name]))
+            signal = exact[name]
+            itself = Reading(name, signal.symbol, sp.Integer(1), ())
+            found.append(_known(itself, signal, signal.symbol, -extra, extra))
         elif name in model.output_names:
             raise DerivationError(
                 f"measured= names the output {name}, which does not show a single state free of "
@@ -105,17 +116,10 @@ def read_measured(model: Plant, measured: Any) -> tuple[Known, ...]:
     return tuple(found)
 
 
-def _itself(signal: Signal) -> Known:
-    return Known(
-        signal.symbol, signal.symbol, (signal.symbol, signal.symbol), signal.lower, signal.upper
-    )
-
-
-def _from_output(model: Plant, reading: Reading) -> Known:
+def _from_output(model: Plant, reading: Reading, extra: sp.Expr) -> Known:
     state = next(s for s in model.x if s.symbol == reading.state)
     bounds = {s.symbol: s for s in model.w}
-    argument = sp.Symbol(reading.output, real=True)
-    low = high = sp.Integer(0)
+    low, high = -extra, extra
     for symbol, factor in reading.noise:
         signal = bounds[symbol]
         if not signal.bounded:
@@ -127,15 +131,22 @@ def _from_output(model: Plant, reading: Reading) -> Known:
             )
         ends = sorted([factor * rational(signal.lower), factor * rational(signal.upper)])
         low, high = low + ends[0], high + ends[1]
+    return _known(reading, state, sp.Symbol(reading.output, real=True), low, high)
+
+
+def _known(
+    reading: Reading, signal: Signal, argument: sp.Symbol, low: sp.Expr, high: sp.Expr
+) -> Known:
+    """Enclose a signal, given that argument - scale * signal lies between low and high."""
     ends = [(argument - high) / reading.scale, (argument - low) / reading.scale]
     if reading.scale.is_negative:
         ends.reverse()
-    if reading.noise and state.bounded:
-        ends[0] = sp.Max(ends[0], rational(state.lower))
-        ends[1] = sp.Min(ends[1], rational(state.upper))
+    if low != high and signal.bounded:
+        ends[0] = sp.Max(ends[0], rational(signal.lower))
+        ends[1] = sp.Min(ends[1], rational(signal.upper))
     domain = (-math.inf, math.inf)
-    if state.bounded:
-        corners = sorted([reading.scale * rational(v) for v in (state.lower, state.upper)])
+    if signal.bounded:
+        corners = sorted([reading.scale * rational(v) for v in (signal.lower, signal.upper)])
         # a double that satisfies an exact bound also satisfies the nearest double of the bound
         domain = (float(corners[0] + low), float(corners[1] + high))
-    return Known(state.symbol, argument, (ends[0], ends[1]), *domain)
+    return Known(signal.symbol, argument, (ends[0], ends[1]), *domain)

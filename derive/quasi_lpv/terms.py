@@ -1,6 +1,6 @@
 """Rows of a plant as terms, each with the ways in which it can be written."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -127,7 +127,7 @@ def prefer_options(model: Plant, terms: list[Term], prefer: Any) -> list[Term]:
     """
     if prefer is None:
         return terms
-    if isinstance(prefer, dict):
+    if isinstance(prefer, Mapping):
         for key, value in prefer.items():
             terms = _prefer_for_term(model, terms, key, str(value))
         return terms

@@ -149,11 +149,32 @@ def test_three_tanks_noise_breaks_the_printed_bounds_and_not_the_widened_ones(
         y = np.clip(state[:2] + noise, LOW[:2], HIGH[:2])
         low, high = by_levels.at(y)["A"]
         broken += bool((true < low - 1e-15).any() or (true > high + 1e-15).any())
-        # u1 and u2 are arguments too: everything that is known at run time is
-        low, high = by_outputs.at([*(state[:2] + noise), 0.0, 0.0])["A"]
+        low, high = by_outputs.at(state[:2] + noise)["A"]
         assert (low - 1e-15 <= true).all()
         assert (high + 1e-15 >= true).all()
     assert broken / len(x) == pytest.approx(0.115, abs=0.02)
+
+
+def test_three_tanks_a_margin_covers_what_moves_between_samples(tanks, by_outputs):
+    assert [str(a) for a in by_outputs.arguments] == ["y1", "y2"]
+    wide = tanks.interval(measured="outputs", margin=1e-3)
+    x, v = samples(300)
+    for state, noise in zip(x, v, strict=True):
+        y = state[:2] + noise
+        low, high = wide.at(y + np.array([1e-3, -1e-3]))["A"]
+        assert (low - 1e-15 <= matrix_at(state)).all()
+        assert (high + 1e-15 >= matrix_at(state)).all()
+        inner = by_outputs.at(y)["A"]
+        outer = wide.at(y)["A"]
+        assert (outer[0] <= inner[0]).all()
+        assert (outer[1] >= inner[1]).all()
+    exact = tanks.interval(measured=["x1", "x2"], margin=4.5e-3)
+    for found, expected in zip(
+        exact.at([0.5, 0.1])["A"], by_outputs.at([0.5, 0.1])["A"], strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    with pytest.raises(DerivationError, match="margin"):
+        tanks.interval(measured="outputs", margin=-1.0)
 
 
 def test_three_tanks_outside_the_domain_is_reported_not_clipped(by_levels, by_outputs):
@@ -163,9 +184,9 @@ def test_three_tanks_outside_the_domain_is_reported_not_clipped(by_levels, by_ou
     assert float(inside([0.5, 0.1])[6]) == 1.0
     assert float(inside([0.43, 0.1])[6]) == 0.0
     # what a noisy but possible measurement shows is inside
-    assert by_outputs.at([0.44 - 4.4e-3, 0.1, 0, 0])["A"][0].shape == (3, 3)
+    assert by_outputs.at([0.44 - 4.4e-3, 0.1])["A"][0].shape == (3, 3)
     with pytest.raises(DerivationError, match="y1"):
-        by_outputs.at([0.44 - 4.6e-3, 0.1, 0, 0])
+        by_outputs.at([0.44 - 4.6e-3, 0.1])
     with pytest.raises(DerivationError, match="one value for each of x1, x2"):
         by_levels.at([0.5])
 
