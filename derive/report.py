@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from obsynth.derive.diagnosis.summary import family_lines, fault_lines
 from obsynth.derive.equilibrium import Equilibrium
 from obsynth.derive.faults import invariant_zeros, separable_faults
 from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
@@ -137,8 +138,9 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
     Returns
     -------
     StructureReport
-        Signals, equilibrium, split, decoupling of unknown inputs, Jacobian family, detectability
-        and separability of the faults.
+        Signals, equilibrium, split, which single faults show and can be told apart, what has to
+        move for that, decoupling of unknown inputs, Jacobian family, detectability at its vertices
+        and inside, invariant zeros and separability of the faults.
 
     Examples
     --------
@@ -158,6 +160,7 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
             return StructureReport(model.name, tuple(notes.checks), None, None)
         notes.inform("signals", _signals(model))
         part = notes.step("split", lambda: _split(model))
+    notes.checks += [Check(*line) for line in fault_lines(model)]
     if part is None:
         return StructureReport(model.name, tuple(notes.checks), None, None)
     found = part
@@ -173,6 +176,7 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
     notes.inform("vertices", text + (f":\n{reasons}" if reasons else ""))
     if decoupling is not None:
         notes.step("detectability", lambda: _detect(found, family))
+        notes.checks += [Check(*line) for line in family_lines(found, family)]
     if model.names("f"):
         _separate(notes, found, family)
     return StructureReport(model.name, tuple(notes.checks), found, family)
