@@ -3,28 +3,22 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import casadi as ca
 import numpy as np
-import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.affine_family import AffineFamily, build_family
 from obsynth.derive.continuity import refuse_jumps
 from obsynth.derive.dependence import AffineDependence, entry_name, find_dependences
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.exact import enclose_number, rational, substitute
-from obsynth.derive.intervals import Quotients, Ranges, Status, bound_ranges
-from obsynth.derive.intervals.removable import remove_singularities
+from obsynth.derive.exact import enclose_number
+from obsynth.derive.intervals import Ranges, Status, bound_ranges
+from obsynth.derive.jacobian_entries import JacobianEntries, jacobian_entries, sample_entries
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
 __all__ = ["JacobianBounds", "jacobian_bounds"]
 
 Array = NDArray[np.float64]
-_SAMPLES = 96
-# Expanding a longer entry costs more than the zeros it may show.
-_LONG = 500
-_KINDS = ("x", "u", "p", "rho", "d", "f", "w")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,121 +104,7 @@ class JacobianBounds:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Entries:
-    """Entries of the Jacobian that are not structurally zero, in CasADi and in SymPy."""
-
-    places: list[tuple[int, int]]
-    values: ca.SX
-    variables: ca.SX
-    names: tuple[str, ...]
-    box: Array
-    constants: ca.SX
-    constant_box: list[tuple[float, float]]
-    symbolic: dict[tuple[int, int], sp.Expr]
-    symbols: list[sp.Symbol]
-    quotients: Quotients | None
-
-
-def _collect(model: Plant, part: Split | None, wrt: str) -> _Entries:
-    kind = {"states": "x", "inputs": "u"}[wrt]
-    sx = model.sx(constants="symbol")
-    columns = getattr(sx, kind)
-    values_of = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
-    rhs = sx.rhs
-    if part is not None:
-        noise = ca.vertcat(sx.d, sx.f, sx.w)
-        rhs = ca.substitute(rhs, noise, ca.SX.zeros(noise.numel()))
-    jacobian, quotients = _differentiated(model, rhs, columns, values_of)
-    linear = None if part is None else (part.A if kind == "x" else part.B)
-    wrt_symbols = [s.symbol for s in getattr(model, kind)]
-    symbolic = (
-        sp.Matrix(model.rhs).jacobian(wrt_symbols) if wrt_symbols else sp.zeros(len(model.x), 0)
-    )
-    quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
-    places, values, shifts, shift_symbols = [], [], [], []
-    expressions: dict[tuple[int, int], sp.Expr] = {}
-    for i in range(jacobian.shape[0]):
-        for j in range(jacobian.shape[1]):
-            present = jacobian.sparsity().has_nz(i, j)
-            offset = 0.0 if linear is None else float(linear[i, j])
-            if not present and offset == 0.0:
-                continue
-            value = jacobian[i, j] if present else ca.SX(0)
-            exact = substitute(symbolic[i, j], model.constant_values)
-            if offset != 0.0:
-                symbol = ca.SX.sym(f"a{i + 1}{j + 1}")
-                shifts.append((offset, offset))
-                shift_symbols.append(symbol)
-                value, exact = value - symbol, exact - rational(offset)
-            if part is not None:
-                exact = exact.subs(quiet)
-            if exact.count_ops() < _LONG:
-                exact = sp.expand(exact)
-            if exact == 0:
-                continue
-            places.append((i, j))
-            values.append(value)
-            expressions[(i, j)] = exact
-    column = ca.vertcat(*values) if values else ca.SX(0, 1)
-    inner = [] if quotients is None else [q.argument for q in quotients.members]
-    needed = {str(s) for s in ca.symvar(ca.vertcat(column, *inner))}
-    names: list[str] = []
-    symbols: list[sp.Symbol] = []
-    parts: list[ca.SX] = []
-    boxes: list[tuple[float, float]] = []
-    for k in _KINDS:
-        for signal, element in zip(getattr(model, k), ca.vertsplit(getattr(sx, k)), strict=True):
-            if k == "x" or signal.name in needed:
-                names.append(signal.name)
-                symbols.append(signal.symbol)
-                parts.append(element)
-                boxes.append((signal.lower, signal.upper))
-    return _Entries(
-        places,
-        column,
-        ca.vertcat(*parts),
-        tuple(names),
-        np.array(boxes, dtype=float).reshape(-1, 2),
-        ca.vertcat(sx.c, *shift_symbols),
-        [*values_of, *shifts],
-        expressions,
-        symbols,
-        quotients,
-    )
-
-
-def _differentiated(
-    model: Plant, rhs: ca.SX, columns: ca.SX, constants: list[tuple[float, float]]
-) -> tuple[ca.SX, Quotients | None]:
-    """Jacobian, through quotients with removable singularities where there are some."""
-    sx = model.sx(constants="symbol")
-    variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
-    box = np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
-    found = remove_singularities(ca.densify(rhs), variables, sx.c, box, constants)
-    if found is None:
-        return ca.jacobian(rhs, columns), None
-    return found[1].jacobian(found[0], columns), found[1]
-
-
-def _sample(entries: _Entries) -> dict[tuple[int, int], Array]:
-    """Values of all entries at fixed random points of the box."""
-    rng = np.random.default_rng(0)
-    lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)
-    upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)
-    points = lower + rng.random((_SAMPLES, len(lower))) * (upper - lower)
-    middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
-    values = entries.values
-    if entries.quotients is not None:
-        values = entries.quotients.closed(values)
-    function = ca.Function("sample", [entries.variables, entries.constants], [values])
-    result = np.array(function(points.T, np.tile(middle[:, None], (1, _SAMPLES))))
-    # points outside the domain of some entry say nothing about dependences
-    usable = np.isfinite(result).all(axis=0)
-    return dict(zip(entries.places, result[:, usable], strict=True))
-
-
-def _refuse(entries: _Entries, ranges: Ranges, what: str) -> None:
+def _refuse(entries: JacobianEntries, ranges: Ranges, what: str) -> None:
     failures = ranges.failures
     if not failures:
         return
@@ -302,7 +182,7 @@ def jacobian_bounds(
     part = split_or_model if isinstance(split_or_model, Split) else None
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     refuse_jumps(model.check())
-    entries = _collect(model, part, wrt)
+    entries = jacobian_entries(model, part, wrt)
     ranges = bound_ranges(
         entries.values,
         entries.variables,
@@ -319,7 +199,7 @@ def jacobian_bounds(
     return _assemble(entries, ranges, shape)
 
 
-def _assemble(entries: _Entries, ranges: Ranges, shape: tuple[int, int]) -> JacobianBounds:
+def _assemble(entries: JacobianEntries, ranges: Ranges, shape: tuple[int, int]) -> JacobianBounds:
     filled = {
         name: np.zeros(shape) for name in ("min", "max", "attained_min", "attained_max", "gap")
     }
@@ -347,7 +227,7 @@ def _assemble(entries: _Entries, ranges: Ranges, shape: tuple[int, int]) -> Jaco
         where[place][0], where[place][1] = ranges.points_lower[k], ranges.points_upper[k]
         status[place] = judged[k]
     basis, dependences = find_dependences(
-        entries.symbolic, _sample(entries) if entries.places else {}, entries.symbols
+        entries.symbolic, sample_entries(entries) if entries.places else {}, entries.symbols
     )
     family = build_family(shape, basis, dependences, bounds, supports)
     varying = sum(1 for place in entries.places if supports[place])
