@@ -60,6 +60,16 @@ def _multiply(graph: Graph, args: list[int]) -> int:
                 return graph.plain("multiply", [other, _power(graph, first, 2)])
             if graph.nodes[first].args[0] == second:
                 return graph.append(Node("absolute", (second,)))
+            argument = graph.nodes[first].args[0]
+            if inner.op == "multiply" and argument in inner.args:
+                other = inner.args[1] if inner.args[0] == argument else inner.args[0]
+                return graph.plain("multiply", [other, _absolute(graph, [argument])])
+        if inner.op == "multiply":
+            for k in (0, 1):
+                sign = graph.nodes[inner.args[k]]
+                if sign.op == "sign" and sign.args[0] == first:
+                    size = _absolute(graph, [first])
+                    return graph.plain("multiply", [inner.args[1 - k], size])
     (base, n), (other, m) = _split_power(graph, a), _split_power(graph, b)
     if base == other and base not in graph.constants:
         return _power(graph, base, n + m)

@@ -50,6 +50,11 @@ def discretisation_remainder(
     `flow_box`. Inputs, unknown inputs, faults, disturbances and scheduling variables are held over
     the step.
 
+    On smooth plants of moderate size the guaranteed width is within 1.1 times what is attained
+    for Euler and within 6 times for Runge-Kutta (tested for the tanks, van der Pol, Lorenz and a
+    reactor); ``Remainder.excess`` says it for the plant at hand. Kinks and wide boxes in many
+    variables cost more.
+
     Parameters
     ----------
     plant : Plant
