@@ -23,6 +23,7 @@ from obsynth.symbolic.plant import Plant
 __all__ = ["Alternative", "RowRanking", "choose"]
 
 Combination = tuple[int, ...]
+_TIE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,8 @@ class RowRanking:
     row : str
         Name of the state or output.
     alternatives : tuple of Alternative
-        In order of their scores.
+        The chosen one, then the others in order of their scores; scores that differ by no more
+        than 2 % are equal, and the structurally simpler way is taken.
     total : int
         How many ways there are; more than listed where there are many.
     """
@@ -161,7 +163,11 @@ class _Chooser:
             alternative = Alternative(choices, plain, needs, score)
             ranked.append((score, sum(combination), combination, alternative))
         ranked.sort(key=lambda item: item[:3])
-        best = ranked[0][2]
+        # the widths are no better than their tolerance, so what is as good is settled by structure
+        near = [item for item in ranked if item[0] <= (1.0 + _TIE) * ranked[0][0]]
+        first = min(near, key=lambda item: item[1:3])
+        ranked.sort(key=lambda item: item is not first)
+        best = first[2]
         chosen = [t.options[k] for t, k in zip(terms, best, strict=True)]
         total = int(np.prod([len(t.options) for t in terms], dtype=object)) if terms else 1
         return RowRanking(self.names[row], tuple(r[3] for r in ranked), total), chosen
