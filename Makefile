@@ -6,6 +6,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 WORKERS ?= 2
+# The matrices are small: threads inside BLAS cost more than they bring.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .PHONY: help run test test-long notebook lint format lock benchmarks clean

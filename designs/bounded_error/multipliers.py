@@ -18,12 +18,11 @@ from obsynth.designs.bounded_error.synthesis import (
     EllipsoidSolution,
     Objective,
     largest_feasible,
-    largest_margin,
     set_objective,
     solve_reliably,
 )
 from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.lmi import Problem, diagonal, full, scalar, symmetric
+from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, symmetric
 
 __all__ = [
     "box_vertices",
@@ -122,15 +121,16 @@ def largest_multiplier_gamma(data: ModelData) -> float:
     n, n_f, m, n_w = data.sizes
     p, n_v = n + n_f, 2 * n_w + n_f
 
-    def room(gamma: float) -> float:
+    def state(gamma: float) -> tuple[Problem, Affine]:
         problem = Problem(f"(51), repaired, decay at gamma = {gamma:.6g}")
         P, H = symmetric("P", p), full("H", p, m)
         a, b = diagonal("a", n), diagonal("b", n)
         problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
         block = multiplier_block(quiet, P, H, 1.0 - gamma, np.eye(n_v), a, b)
-        return largest_margin(problem, block, P)
+        problem.add_lmi("(51)", block, ">>")
+        return problem, P
 
-    return largest_feasible(room)
+    return largest_feasible(state)
 
 
 def synthesise_multipliers(

@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.error_system import ErrorSystem
 from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Affine,
     Problem,
     Solution,
+    bisect_feasible,
     diagonal,
     full,
-    scalar,
+    largest_margin,
+    search_line,
+    solve_lazily,
+    solve_with_retries,
     symmetric,
     symmetric_block,
     trace,
@@ -29,11 +33,10 @@ __all__ = [
     "EllipsoidSolution",
     "Objective",
     "analyse_gain",
-    "decay_room",
+    "decay_problem",
     "design_problem",
     "largest_feasible",
     "largest_gamma",
-    "largest_margin",
     "search_gamma",
     "set_objective",
     "solve_reliably",
@@ -47,6 +50,11 @@ OBJECTIVES: tuple[Objective, ...] = ("trace_inverse", "log_det", "lambda_min", "
 # Room between the solver's answer and the boundary, relative to blocks scaled to about one:
 # large against the solver's tolerance, small against the digits anybody reads.
 MARGIN = 1e-7
+GAP = 1e-5
+LEAST_GAMMA = 1e-9
+# Shares of the largest gamma that are tried before the golden sections.
+GRID = (0.1, 0.3, 0.5, 0.65, 0.8, 0.95)
+REFINE = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +191,7 @@ def synthesise(
     """
     scale = np.ones(system.sizes[0])
     problem = design_problem(system, gamma, noise, objective, weights, scale, gain)
-    rough = problem.solve(accept_inaccurate=True, **_accuracy(1e-5))
-    if "Infeasible" in rough.status:
-        problem.solve()
+    rough = problem.solve(accept_inaccurate=True, tol_gap_abs=1e-5, tol_gap_rel=1e-5)
     if np.linalg.eigvalsh(rough["P"])[0] > 0:
         scale = 2.0 ** np.round(0.5 * np.log2(np.diag(np.linalg.inv(rough["P"]))))
     problem = design_problem(system, gamma, noise, objective, weights, scale, gain)
@@ -198,17 +204,19 @@ def synthesise(
     return EllipsoidSolution(K, 0.5 * (P + P.T), gamma, np.maximum(Q_v, 0.0))
 
 
-def _accuracy(tolerance: float) -> dict[str, Any]:
-    return dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), tolerance)
-
-
 def solve_reliably(problem: Problem) -> Solution:
-    """Solve to the best accuracy that the solver reaches and calls solved."""
-    for tolerance in (1e-8, 1e-7, 1e-6):
-        solution = problem.solve(accept_inaccurate=True, **_accuracy(tolerance))
-        if solution.solved:
-            return solution
-    return problem.solve(**_accuracy(1e-5))
+    """Solve lazily over the vertices, with retries.
+
+    An answer short of the solver's full accuracy serves if its duality gap is
+    small: that it is feasible is proved afterwards in any case.
+    """
+
+    def solve(stated: Problem) -> Solution:
+        return solve_with_retries(
+            stated, second_solvers=(), good_enough=lambda found: 0 <= found.gap < GAP
+        )
+
+    return solve_lazily(problem, floor=-0.5 * MARGIN, solve=solve).solution
 
 
 def analyse_gain(
@@ -246,34 +254,20 @@ def largest_gamma(system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | No
     float
         A feasible value, within `rtol` of the largest; 0 where nothing is feasible.
     """
-    return largest_feasible(lambda gamma: decay_room(system, gamma, gain), rtol)
+    return largest_feasible(lambda gamma: decay_problem(system, gamma, gain), rtol)
 
 
-def largest_feasible(room: Callable[[float], float], rtol: float = 1e-3) -> float:
-    """Bisect for the largest gamma in (0, 1) with ``room(gamma) > 0``; room falls with gamma."""
-    if room(0.0) <= 0:
-        return 0.0
-    low, high = 0.0, 1e-4
-    while high < 1.0 and room(high) > 0:
-        low, high = high, min(3.0 * high, 1.0)
-    while low == 0.0:
-        if high < 1e-9:
-            return 0.0
-        if room(high / 3.0) > 0:
-            low = high / 3.0
-        else:
-            high /= 3.0
-    while high - low > rtol * high:
-        middle = 0.5 * (low + high)
-        if room(middle) > 0:
-            low = middle
-        else:
-            high = middle
-    return low
+def decay_problem(
+    system: ErrorSystem, gamma: float, gain: FloatArray | None = None
+) -> tuple[Problem, Affine]:
+    """State ``[(1 - gamma) P, X'P; P X, P] > 0``: quadratic boundedness without noise.
 
-
-def decay_room(system: ErrorSystem, gamma: float, gain: FloatArray | None = None) -> float:
-    """Return the largest t with ``[(1-gamma) P, X'P; P X, P] >= t I``, P <= I, less a tolerance."""
+    Returns
+    -------
+    problem : Problem
+    P : Affine
+        To be capped, since the problem is homogeneous.
+    """
     p, m, _ = system.sizes
     problem = Problem(f"decay at gamma = {gamma:.6g}")
     P = symmetric("P", p)
@@ -281,17 +275,27 @@ def decay_room(system: ErrorSystem, gamma: float, gain: FloatArray | None = None
         X = P @ system.Abar - full("H", p, m) @ system.Cbar
     else:
         X = P @ system.closed_loop(gain)[0]
-    return largest_margin(problem, symmetric_block([[P * (1.0 - gamma)], [X, P]]), P)
+    problem.add_lmi("decay", symmetric_block([[P * (1.0 - gamma)], [X, P]]), ">>")
+    return problem, P
 
 
-def largest_margin(problem: Problem, block: Affine, P: Affine) -> float:
-    """Phase 1: the largest t with ``block >= t I`` and P <= I, minus the solver's tolerance."""
-    room = scalar("t")
-    problem.add_lmi("block", block - room * np.eye(block.shape[0]), ">>")
-    problem.add_lmi("size", P - np.eye(P.shape[0]), "<<")
-    problem.maximise(room)
-    solution = problem.solve(accept_inaccurate=True)
-    return solution.number("t") - 1e-9
+def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: float = 1e-3) -> float:
+    """Return the largest gamma with a margin, 0 where there is none.
+
+    Parameters
+    ----------
+    state : callable
+        From gamma to a homogeneous problem and the variable to cap at the identity.
+    rtol : float
+    """
+
+    def feasible(gamma: float) -> bool:
+        problem, P = state(gamma)
+        cap = {"size": P << np.eye(P.shape[0])}
+        return largest_margin(problem, caps=cap, explain=False).feasible
+
+    found = bisect_feasible(feasible, LEAST_GAMMA, 1.0 - 1e-9, rtol=rtol, logarithmic=True)
+    return 0.0 if found is None else found.feasible
 
 
 def search_gamma(
@@ -300,7 +304,7 @@ def search_gamma(
     top: float,
     xatol: float = 5e-3,
 ) -> EllipsoidSolution:
-    """Line search over gamma for the smallest sum of the (weighted) half widths.
+    """Search gamma for the smallest sum of the (weighted) half widths.
 
     Parameters
     ----------
@@ -309,24 +313,12 @@ def search_gamma(
     weights : ndarray of shape (p,)
     top : float
         Largest gamma to try (exclusive).
-    xatol : float
-        Of log gamma.
     """
-    from scipy.optimize import minimize_scalar
-
-    best: list[tuple[float, EllipsoidSolution]] = []
-
-    def cost(log_gamma: float) -> float:
-        try:
-            solution = solve(float(np.exp(log_gamma)))
-        except (InfeasibleDesign, SolverTrouble):
-            return 1e30
-        value = float(np.sqrt(weights * solution.inverse_diagonal).sum())
-        best.append((value, solution))
-        return value
-
-    bounds = (np.log(top * 0.05), np.log(top * 0.9999))
-    minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": xatol})
-    if not best:
-        raise InfeasibleDesign(f"no gamma below {top:.4g} is feasible", largest_gamma=top)
-    return min(best, key=lambda pair: pair[0])[1]
+    found = search_line(
+        solve,
+        lambda solution: float(np.sqrt(weights * solution.inverse_diagonal).sum()),
+        [top * share for share in GRID],
+        refine=REFINE,
+        name="gamma",
+    )
+    return found.result

@@ -16,8 +16,15 @@ if TYPE_CHECKING:
     from obsynth.derive import StructureError as StructureError
     from obsynth.derive import UnboundedError as UnboundedError
     from obsynth.derive import analyse as analyse
+    from obsynth.derive import discretisation_remainder as discretisation_remainder
     from obsynth.derive import equilibrium as equilibrium
+    from obsynth.derive import excitation as excitation
+    from obsynth.derive import fault_isolability as fault_isolability
     from obsynth.derive import jacobian_bounds as jacobian_bounds
+    from obsynth.derive import lipschitz as lipschitz
+    from obsynth.derive import majorant as majorant
+    from obsynth.derive import qpv as qpv
+    from obsynth.derive import quasi_lpv as quasi_lpv
     from obsynth.derive import split as split
     from obsynth.designs import BoundedErrorUIO as BoundedErrorUIO
     from obsynth.designs import Certificate as Certificate
@@ -66,15 +73,22 @@ __all__ = [
     "__version__",
     "analyse",
     "coverage_table",
+    "discretisation_remainder",
     "equilibrium",
+    "excitation",
+    "fault_isolability",
     "generate_c",
     "jacobian_bounds",
+    "lipschitz",
     "load",
+    "majorant",
     "plants",
     "plot_errors",
     "plot_run",
     "plot_signal",
     "plot_widths",
+    "qpv",
+    "quasi_lpv",
     "report",
     "scenarios",
     "simulate",
@@ -92,6 +106,7 @@ _ROOMS = {
         "analyse",
         "equilibrium",
         "jacobian_bounds",
+        "discretisation_remainder",
         "split",
     ),
     "designs": (
