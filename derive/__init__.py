@@ -22,6 +22,16 @@ from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.lipschitz import InnerBound, LipschitzConstants, lipschitz
 from obsynth.derive.majorant import Majorant, majorant
 from obsynth.derive.majorant_parts import RowMajorant
+from obsynth.derive.polytopes import (
+    JacobianPolytope,
+    Polytope,
+    drop_scalars,
+    jacobian_polytope,
+    polytope_from_halfspaces,
+    polytope_from_vertices,
+    principal_family,
+    sampled_hull,
+)
 from obsynth.derive.qpv import QPV, QPVVertices, qpv
 from obsynth.derive.quasi_lpv import CentredForm, IntervalForm, PolytopicForm, QuasiLPV, quasi_lpv
 from obsynth.derive.remainder import FlowError, Remainder, discretisation_remainder
@@ -52,9 +62,11 @@ __all__ = [
     "InnerBound",
     "IntervalForm",
     "JacobianBounds",
+    "JacobianPolytope",
     "LipschitzConstants",
     "Majorant",
     "Maximum",
+    "Polytope",
     "PolytopeZeros",
     "PolytopicForm",
     "QPVVertices",
@@ -74,14 +86,20 @@ __all__ = [
     "decouple",
     "detectability",
     "discretisation_remainder",
+    "drop_scalars",
     "equilibrium",
     "excitation",
     "fault_isolability",
     "jacobian_bounds",
+    "jacobian_polytope",
     "lipschitz",
     "majorant",
+    "polytope_from_halfspaces",
+    "polytope_from_vertices",
+    "principal_family",
     "qpv",
     "quasi_lpv",
+    "sampled_hull",
     "split",
     "system_zeros",
     "unknown_input_condition",

@@ -122,7 +122,8 @@ class AffineFamily:
     def contains(self, matrix: Array) -> bool:
         """Whether a matrix belongs to the family, up to the radius.
 
-        The scalars are read off the entries that define them.
+        The scalars are read off the entries that define them; a linear program looks for them
+        where there are no such entries.
 
         Parameters
         ----------
@@ -136,9 +137,27 @@ class AffineFamily:
         """
         scalars = []
         for direction, (lower, upper) in zip(self.directions, self.ranges, strict=True):
-            entry = tuple(np.argwhere((direction == 1.0) & self._defining(direction))[0])
-            scalars.append(min(max(float(matrix[entry]), lower), upper))
+            places = np.argwhere((direction == 1.0) & self._defining(direction))
+            if not len(places):
+                return self._reaches(matrix)
+            scalars.append(min(max(float(matrix[tuple(places[0])]), lower), upper))
         return bool((np.abs(matrix - self.at(scalars)) <= self.radius).all())
+
+    def _reaches(self, matrix: Array) -> bool:
+        """Look for scalars that reproduce a matrix where no entry defines them."""
+        from scipy.optimize import linprog
+
+        columns = self.directions.reshape(len(self.directions), -1).T
+        rest, slack = (matrix - self.constant).ravel(), self.radius.ravel()
+        slack = slack + 8 * _UNIT * np.abs(matrix).ravel()
+        found = linprog(
+            np.zeros(len(self.ranges)),
+            np.vstack([columns, -columns]),
+            np.concatenate([rest + slack, slack - rest]),
+            bounds=self.ranges,
+            method="highs",
+        )
+        return bool(found.status == 0)
 
     def _defining(self, direction: Array) -> NDArray[np.bool_]:
         alone = np.abs(self.directions).sum(axis=0) == np.abs(direction)

@@ -1,0 +1,201 @@
+"""Fewer scalars: what is dropped stays as an interval remainder, so that the guarantee stands."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.errors import DerivationError, UnboundedError
+from obsynth.derive.intervals import bound_ranges
+from obsynth.derive.jacobian_bounds import jacobian_bounds
+from obsynth.derive.jacobian_entries import jacobian_entries, sample_entries
+from obsynth.derive.polytopes.support import basis_entries
+from obsynth.derive.split import Split
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["drop_scalars", "principal_family"]
+
+Array = NDArray[np.float64]
+_UNIT = 2.0**-53
+_ROUND = 1.0 + 2.0**-44
+
+
+def _above(value: Array) -> Array:
+    """Push up what was computed with some hundred roundings of nonnegative terms."""
+    return np.where(value > 0.0, np.nextafter(value * _ROUND, np.inf), 0.0)
+
+
+def drop_scalars(
+    family: AffineFamily, drop: Sequence[int] | None = None, most_vertices: int | None = None
+) -> AffineFamily:
+    """Fix scalars at the middle of their ranges and keep their variation as an interval.
+
+    Parameters
+    ----------
+    family : AffineFamily
+        Matrices affine in scalars.
+    drop : sequence of int, optional
+        Positions of the scalars to be dropped.
+    most_vertices : int, optional
+        In place of ``drop``: drop the scalars that move the matrix least until the family has no
+        more vertices than this.
+
+    Returns
+    -------
+    AffineFamily
+        With fewer scalars and a larger ``radius``; it holds every matrix of the given one.
+
+    Raises
+    ------
+    DerivationError
+        Positions that do not exist, or neither or both of the options.
+
+    Examples
+    --------
+    >>> one = np.eye(2)
+    >>> family = AffineFamily(
+    ...     np.zeros((2, 2)), np.array([np.diag(e) for e in one]),
+    ...     np.array([[0.0, 4.0], [1.0, 1.5]]), np.zeros((2, 2)), ("a", "b"), True)
+    >>> fewer = drop_scalars(family, most_vertices=2)
+    >>> fewer.labels, fewer.constant[1, 1], round(fewer.radius[1, 1], 12)
+    (('a',), np.float64(1.25), np.float64(0.25))
+    """
+    count = len(family.ranges)
+    if (drop is None) == (most_vertices is None):
+        raise DerivationError("give drop= (positions of scalars) or most_vertices=, one of them")
+    size = np.abs(family.directions).max(axis=(1, 2), initial=0.0) * family.half_ranges
+    if most_vertices is not None:
+        if most_vertices < 1:
+            raise DerivationError(f"most_vertices={most_vertices} leaves nothing")
+        varying = [int(k) for k in np.argsort(size, kind="stable") if family.half_ranges[k] > 0.0]
+        keep = int(np.log2(most_vertices))
+        drop = varying[: max(len(varying) - keep, 0)]
+    dropped = sorted(set(drop or ()))
+    if any(not 0 <= k < count for k in dropped):
+        raise DerivationError(f"the family has the scalars 0 to {count - 1}, not {dropped}")
+    return _without(family, dropped)
+
+
+def _without(family: AffineFamily, dropped: Sequence[int]) -> AffineFamily:
+    kept = [k for k in range(len(family.ranges)) if k not in dropped]
+    constant, radius = family.constant.copy(), family.radius.copy()
+    for k in dropped:
+        low, high = family.ranges[k]
+        middle = low + 0.5 * (high - low)
+        half = np.nextafter(max(high - middle, middle - low), np.inf) if high > low else 0.0
+        direction = np.abs(family.directions[k])
+        constant = constant + middle * family.directions[k]
+        # the product and the sum round once each
+        lost = 4.0 * _UNIT * (np.abs(constant) + 2.0 * abs(middle) * direction)
+        radius = radius + half * direction + np.where(direction > 0.0, lost, 0.0)
+    return replace(
+        family,
+        constant=constant,
+        directions=family.directions[kept],
+        ranges=family.ranges[kept],
+        radius=_above(radius) if dropped else radius,
+        labels=tuple(family.labels[k] for k in kept),
+        exact=family.exact and not dropped,
+    )
+
+
+def principal_family(
+    split_or_model: Split | Plant,
+    keep: int,
+    wrt: Literal["states", "inputs"] = "states",
+    rtol: float = 1e-4,
+    effort: Literal["fast", "normal", "tight"] = "normal",
+) -> AffineFamily:
+    """Write a Jacobian in its principal coordinates, the small ones as an interval remainder.
+
+    The directions come from samples, the ranges of the coordinates do not: every coordinate is
+    bounded over the box by branch and bound, so the family holds every Jacobian. It can still be
+    worse than the box of ranges, since a box along other axes may be larger.
+
+    Parameters
+    ----------
+    split_or_model : Split or Plant
+        As for `jacobian_bounds`.
+    keep : int
+        Principal coordinates that stay scalars: 2**keep vertices.
+    wrt : {"states", "inputs"}
+        What to differentiate by.
+    rtol : float
+        Wanted gap of every range.
+    effort : {"fast", "normal", "tight"}
+        How many boxes branch and bound may use.
+
+    Returns
+    -------
+    AffineFamily
+        ``exact`` is False: an outer polytope.
+
+    Raises
+    ------
+    StructureError, UnboundedError, DerivationError
+        As `jacobian_bounds`; a number of coordinates that does not fit.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import exothermic_cstr
+    >>> found = principal_family(exothermic_cstr(), keep=1)
+    >>> len(found.vertices()), found.labels
+    (2, ('c1(C_A, T)',))
+    """
+    bounds = jacobian_bounds(split_or_model, wrt, rtol, effort)
+    part = split_or_model if isinstance(split_or_model, Split) else None
+    model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
+    entries, family = jacobian_entries(model, part, wrt), bounds.family
+    basis = basis_entries(bounds)
+    count = len(basis)
+    if not 0 <= keep <= count:
+        raise DerivationError(f"keep={keep} has to be between 0 and {count}, the number of scalars")
+    if count == 0:
+        return family
+    samples = sample_entries(entries)
+    half = np.maximum(family.half_ranges, 1e-300)
+    values = np.array([samples[place] for place in basis]).T / half
+    # coordinates c = axes s, and back
+    rotation = np.linalg.svd(values - values.mean(axis=0))[2]
+    axes, inverse = rotation / half, rotation.T * half[:, None]
+    columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
+    scalars = ca.vertcat(*[columns[place] for place in basis])
+    found = bound_ranges(
+        ca.mtimes(ca.DM(axes), scalars),
+        entries.variables,
+        entries.box,
+        entries.constants,
+        entries.constant_box,
+        rtol=rtol,
+        effort=effort,
+        quotients=entries.quotients,
+    )
+    if not np.isfinite(found.lower + found.upper).all():
+        raise UnboundedError("a principal coordinate has no finite bound over the box")
+    # s = inverse c + defect s: the product of the two matrices is not quite the identity
+    size = np.abs(family.ranges).max(axis=1)
+    defect = np.abs(np.eye(count) - inverse @ axes)
+    defect = defect + (2 * count + 4) * _UNIT * (np.abs(inverse) @ np.abs(axes) + np.eye(count))
+    spread = np.maximum(np.abs(found.lower), np.abs(found.upper))
+    rest = defect @ size + (2 * count + 4) * _UNIT * (np.abs(inverse) @ spread)
+    weights = np.abs(family.directions)
+    directions = np.tensordot(inverse.T, family.directions, axes=1)
+    rounding = (
+        (2 * count + 8)
+        * _UNIT
+        * (np.tensordot(np.abs(inverse) @ spread + size, weights, axes=1) + np.abs(family.constant))
+    )
+    order = np.argsort(-np.ptp(values @ rotation.T, axis=0), kind="stable")
+    whole = replace(
+        family,
+        directions=directions[order],
+        ranges=np.column_stack([found.lower, found.upper])[order],
+        radius=_above(family.radius + np.tensordot(rest, weights, axes=1) + rounding),
+        labels=tuple(f"c{k + 1}({', '.join(entries.names)})" for k in range(count)),
+        exact=False,
+    )
+    return _without(whole, range(keep, count))

@@ -1,0 +1,232 @@
+"""Polytopes by half-spaces and by vertices, and the way from one to the other with proof."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.polytopes.pivoting import Degenerate, walk_vertices
+
+__all__ = ["Label", "Polytope", "polytope_from_halfspaces", "polytope_from_vertices"]
+
+Array = NDArray[np.float64]
+# Faces are moved outwards by so much of the size, each by a different multiple, until no more than
+# n of them meet in a vertex.
+_NUDGES = (2.0**-44, 2.0**-40, 2.0**-34)
+
+
+class Label(StrEnum):
+    """What a polytope says about the set it stands for; the value is a sentence for the reader.
+
+    Examples
+    --------
+    >>> print(Label.OUTER)
+    outer: holds the set, with proof, and may be larger
+    """
+
+    EXACT = "exact: the hull of the set, up to the tolerance of its ranges"
+    OUTER = "outer: holds the set, with proof, and may be larger"
+    SAMPLED = "sampled: hull of samples, which the set may leave; no guarantee"
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope:
+    """A bounded polytope {x : normals x <= offsets}, and vertices whose hull holds it.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (m, n)
+        Outer normals.
+    offsets : ndarray, shape (m,)
+        Right-hand sides.
+    vertices : ndarray, shape (N, n)
+        Corners.
+    radius : ndarray, shape (n,)
+        Rounding of the vertices: every point of the polytope is a convex combination of points
+        that lie no farther than this from the vertices, coordinate by coordinate.
+
+    Notes
+    -----
+    From `polytope_from_halfspaces` the half-spaces are the given ones and the vertices hold them;
+    from `polytope_from_vertices` it is the other way round.
+    """
+
+    normals: Array
+    offsets: Array
+    vertices: Array
+    radius: Array
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return int(self.normals.shape[1])
+
+    def contains(self, point: ArrayLike) -> bool:
+        """Whether a point satisfies all inequalities, in exact arithmetic."""
+        x = [Fraction(float(v)) for v in np.ravel(np.asarray(point, dtype=float))]
+        return all(
+            sum(Fraction(float(a)) * v for a, v in zip(row, x, strict=True)) <= Fraction(float(b))
+            for row, b in zip(self.normals, self.offsets, strict=True)
+        )
+
+    @property
+    def volume(self) -> float:
+        """Volume of the hull of the vertices; a length in one dimension."""
+        return hull_volume(self.vertices)
+
+
+def hull_volume(points: Array) -> float:
+    """Return the volume of the hull of points, 0 when it is flat.
+
+    Examples
+    --------
+    >>> hull_volume(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]]))
+    1.0
+    """
+    if points.shape[1] == 1:
+        return float(np.ptp(points[:, 0])) if len(points) else 0.0
+    from scipy.spatial import ConvexHull, QhullError
+
+    size = np.ptp(points, axis=0) if len(points) else np.zeros(points.shape[1])
+    if len(points) <= points.shape[1] or not size.all():
+        return 0.0
+    try:
+        return float(ConvexHull(points / size).volume * np.prod(size))
+    except QhullError:
+        return 0.0
+
+
+def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope:
+    """Find the vertices of a polytope that is given by half-spaces.
+
+    Parameters
+    ----------
+    normals : array_like, shape (m, n)
+        Outer normals.
+    offsets : array_like, shape (m,)
+        Right-hand sides of normals x <= offsets.
+
+    Returns
+    -------
+    Polytope
+        Its vertices are exact up to ``radius``. Where more than n faces meet in a vertex, they are
+        moved outwards by a relative 1e-13 or so, so that the hull of the vertices holds the
+        polytope in any case.
+
+    Raises
+    ------
+    DerivationError
+        Shapes that do not match, numbers that are not finite, an empty or unbounded polytope.
+
+    Examples
+    --------
+    >>> found = polytope_from_halfspaces([[1, 0], [0, 1], [-1, -1]], [1, 1, 0])
+    >>> found.vertices.tolist()
+    [[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]]
+    """
+    A, b = np.atleast_2d(np.asarray(normals, dtype=float)), np.ravel(np.asarray(offsets, float))
+    if A.ndim != 2 or len(A) != len(b) or A.shape[1] == 0:
+        raise DerivationError(
+            f"half-spaces are normals (m, n) and offsets (m,); given were shapes {A.shape} and "
+            f"{b.shape}",
+            normals=A.shape,
+            offsets=b.shape,
+        )
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        raise DerivationError("normals and offsets of half-spaces have to be finite numbers")
+    exact = [[Fraction(float(v)) for v in row] for row in A]
+    right = [Fraction(float(v)) for v in b]
+    rng = np.random.default_rng(0)
+    size = Fraction(float(np.abs(b).max(initial=0.0)) or 1.0)
+    shares = [Fraction(1 + int(v)) for v in rng.integers(0, 2**20, len(b))]
+    lengths = [sum((abs(v) for v in row), Fraction(0)) for row in exact]
+    longest = max(lengths) or Fraction(1)
+    for nudge in (0.0, *_NUDGES):
+        unit = Fraction(nudge) * Fraction(1, 2**20) * size
+        moved = [
+            r + unit * share * length / longest
+            for r, share, length in zip(right, shares, lengths, strict=True)
+        ]
+        try:
+            corners = list(walk_vertices(exact, moved).values())
+        except Degenerate:
+            continue
+        vertices = np.array([[float(v) for v in corner] for corner in corners])
+        errors = [
+            [abs(Fraction(float(d)) - e) for d, e in zip(row, corner, strict=True)]
+            for row, corner in zip(vertices, corners, strict=True)
+        ]
+        radius = [max(column) for column in zip(*errors, strict=True)]
+        order = np.lexsort(vertices.T[::-1])
+        return Polytope(A, b, vertices[order], np.array([_above(r) for r in radius]))
+    raise DerivationError(
+        "the vertices of these half-spaces could not be told apart: the polytope is flat or "
+        "nearly so. Describe it in fewer coordinates",
+        halfspaces=len(b),
+        condition="flat",
+    )
+
+
+def _above(value: Fraction) -> float:
+    """Return a double that is not below a nonnegative number."""
+    if value == 0:
+        return 0.0
+    near = float(value)
+    return near if Fraction(near) >= value else float(np.nextafter(near, np.inf))
+
+
+def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
+    """Find half-spaces whose intersection holds the hull of points.
+
+    Parameters
+    ----------
+    vertices : array_like, shape (N, n)
+        Points that do not lie in one hyperplane.
+
+    Returns
+    -------
+    Polytope
+        With the points on the hull, and offsets rounded up until every point satisfies them
+        exactly.
+
+    Raises
+    ------
+    DerivationError
+        Too few points, or points in one hyperplane.
+
+    Examples
+    --------
+    >>> found = polytope_from_vertices([[0, 0], [1, 0], [0, 1], [0.25, 0.25]])
+    >>> len(found.vertices), len(found.offsets), found.contains([0.25, 0.5])
+    (3, 3, True)
+    """
+    points = np.atleast_2d(np.asarray(vertices, dtype=float))
+    n = points.shape[1]
+    if n == 1 and len(points):
+        ends = np.array([[points.min()], [points.max()]])
+        normals = np.array([[-1.0], [1.0]])
+        return Polytope(normals, np.array([-ends[0, 0], ends[1, 0]]), ends, np.zeros(1))
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise DerivationError(
+            f"{len(points)} points do not span {n} dimensions; describe them in fewer coordinates",
+            points=len(points),
+            dimension=n,
+        ) from error
+    normals = np.unique(hull.equations[:, :-1], axis=0)
+    kept = points[hull.vertices]
+    exact = [[Fraction(float(v)) for v in point] for point in points]
+    offsets = []
+    for row in normals:
+        a = [Fraction(float(v)) for v in row]
+        largest = max(sum(x * y for x, y in zip(a, p, strict=True)) for p in exact)
+        near = float(largest)
+        offsets.append(near if Fraction(near) >= largest else float(np.nextafter(near, np.inf)))
+    order = np.lexsort(kept.T[::-1])
+    return Polytope(normals, np.array(offsets), kept[order], np.zeros(n))

@@ -1,0 +1,429 @@
+"""Outer polytopes of a Jacobian: support functions of groups of two or three scalars.
+
+The scalars of an affine family that share variables do not take their values independently, and the
+box of their ranges holds combinations that never occur. In a group of two or three, max d's over
+the box of the plant is bounded by branch and bound for a dozen directions d, which gives an outer
+polytope with proof; groups that share nothing multiply.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.dependence import entry_name
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals import bound_ranges
+from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.jacobian_entries import JacobianEntries, jacobian_entries
+from obsynth.derive.polytopes.polytope import (
+    Label,
+    Polytope,
+    hull_volume,
+    polytope_from_halfspaces,
+)
+from obsynth.derive.polytopes.thinning import thin
+from obsynth.derive.split import Split
+from obsynth.symbolic.plant import Plant
+
+__all__ = [
+    "Group",
+    "JacobianPolytope",
+    "basis_entries",
+    "groups_of",
+    "jacobian_polytope",
+    "scalar_values",
+]
+
+Array = NDArray[np.float64]
+Entry = tuple[int, int]
+_UNIT = 2.0**-53
+_MOST_VERTICES = 2**16
+_LARGEST_GROUP = 3
+# Smallest integer directions: multiples of pi/8 or so in the plane, and towards the faces, edges
+# and corners of a cube.
+_PLANE = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2))
+_SPACE = tuple(d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Scalars of a family that share variables, and the polytope in which they lie.
+
+    Attributes
+    ----------
+    scalars : tuple of int
+        Positions in the family.
+    places : tuple of (row, column)
+        The entries they are.
+    polytope : Polytope
+        Holds every combination that occurs.
+    label : Label
+        EXACT for a single scalar with a tight range, OUTER for others.
+    attained : ndarray, shape (N, K)
+        Combinations that occur, up to rounding: the polytope can be no smaller than their hull.
+    """
+
+    scalars: tuple[int, ...]
+    places: tuple[Entry, ...]
+    polytope: Polytope
+    label: Label
+    attained: Array
+
+    @property
+    def fill(self) -> float:
+        """Volume of the polytope relative to that of the box around it."""
+        low, high = self.attained.min(axis=0), self.attained.max(axis=0)
+        box = float(np.prod(high - low))
+        return self.polytope.volume / box if box > 0.0 else 1.0
+
+    @property
+    def gap(self) -> float:
+        """Share of the polytope that is not known to be needed; 1 for a box of four or more."""
+        volume = self.polytope.volume
+        return max(1.0 - hull_volume(self.attained) / volume, 0.0) if volume > 0.0 else 0.0
+
+    def __str__(self) -> str:
+        names, word = ", ".join(map(entry_name, self.places)), str(self.label).split(":")[0]
+        text = (
+            f"{names}: {len(self.polytope.vertices)} vertices ({word}) in place of "
+            f"{2 ** len(self.scalars)}"
+        )
+        if len(self.scalars) == 1 or self.gap == 1.0:
+            return text
+        return f"{text}, {100 * self.fill:.3g} % of the box, {100 * self.gap:.2g} % to spare"
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianPolytope:
+    """Matrices constant + sum_k s_k directions_k with the scalars in a product of polytopes.
+
+    Attributes
+    ----------
+    family : AffineFamily
+        The family with the box of ranges.
+    groups : tuple of Group
+        Groups without common variables.
+    radius : ndarray, shape (n, k)
+        Elementwise rounding: every Jacobian over the box is a convex combination of matrices no
+        farther than this from the vertices.
+    naive_vertex_count : int
+        Vertices of the entrywise box.
+    """
+
+    family: AffineFamily
+    groups: tuple[Group, ...]
+    radius: Array
+    naive_vertex_count: int
+
+    @property
+    def label(self) -> Label:
+        """EXACT where all groups are, OUTER otherwise."""
+        exact = all(group.label is Label.EXACT for group in self.groups)
+        return Label.EXACT if exact else Label.OUTER
+
+    @property
+    def vertex_radius(self) -> Array:
+        """The same as ``radius``, under the name it has in a family."""
+        return self.radius
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, without making them."""
+        count = 1
+        for group in self.groups:
+            count *= len(group.polytope.vertices)
+        return count
+
+    @property
+    def box_vertex_count(self) -> int:
+        """Vertices of the family with the box of ranges."""
+        return self.family.vertex_count
+
+    def vertices(self) -> Array:
+        """Matrices at the combinations of the groups' vertices.
+
+        Returns
+        -------
+        ndarray, shape (N, n, k)
+
+        Raises
+        ------
+        DerivationError
+            More than 2^16 vertices.
+        """
+        if self.vertex_count > _MOST_VERTICES:
+            raise DerivationError(
+                f"the polytope has {self.vertex_count} vertices, more than a polytopic design can "
+                "use; ask for fewer with most_vertices=",
+                vertices=self.vertex_count,
+            )
+        matrices = []
+        for corner in product(*(group.polytope.vertices for group in self.groups)):
+            scalars = np.zeros(len(self.family.ranges))
+            for group, values in zip(self.groups, corner, strict=True):
+                scalars[list(group.scalars)] = values
+            matrices.append(self.family.at(scalars))
+        return np.array(matrices).reshape(-1, *self.family.constant.shape)
+
+    def contains(self, matrix: Array) -> bool:
+        """Whether a matrix belongs to the polytope, up to the radius.
+
+        Parameters
+        ----------
+        matrix : ndarray, shape (n, k)
+            The matrix; its scalars are read off the entries that define them.
+
+        Returns
+        -------
+        bool
+        """
+        scalars = np.zeros(len(self.family.ranges))
+        for group in self.groups:
+            values = np.array([matrix[place] for place in group.places])
+            if not group.polytope.contains(values):
+                return False
+            scalars[list(group.scalars)] = values
+        return bool((np.abs(matrix - self.family.at(scalars)) <= self.radius).all())
+
+    def __str__(self) -> str:
+        word = str(self.label).split(":")[0]
+        lines = [
+            f"{self.vertex_count} vertices ({word}) in place of {self.box_vertex_count} of the "
+            f"box of scalars and {self.naive_vertex_count} of the box of entries"
+        ]
+        return "\n".join([*lines, *(f"  {group}" for group in self.groups)])
+
+
+def groups_of(supports: Sequence[Sequence[str]]) -> list[tuple[int, ...]]:
+    """Join scalars that share variables, directly or through others.
+
+    Parameters
+    ----------
+    supports : sequence of sequence of str
+        Variables of every scalar.
+
+    Returns
+    -------
+    list of tuple of int
+
+    Examples
+    --------
+    >>> groups_of([("x",), ("y", "z"), ("u",), ("z",)])
+    [(0,), (1, 3), (2,)]
+    """
+    groups: list[tuple[set[str], list[int]]] = []
+    for k, names in enumerate(supports):
+        joined, members = set(names), [k]
+        for group in [g for g in groups if g[0] & joined]:
+            groups.remove(group)
+            joined |= group[0]
+            members += group[1]
+        groups.append((joined, members))
+    return sorted(tuple(sorted(members)) for _, members in groups)
+
+
+def jacobian_polytope(
+    split_or_model: Split | Plant,
+    wrt: Literal["states", "inputs"] = "states",
+    rtol: float = 1e-4,
+    effort: Literal["fast", "normal", "tight"] = "normal",
+    most_vertices: int | None = None,
+) -> JacobianPolytope:
+    """Enclose a Jacobian in a product of polytopes, one per group of scalars that share variables.
+
+    Parameters
+    ----------
+    split_or_model : Split or Plant
+        As for `jacobian_bounds`.
+    wrt : {"states", "inputs"}
+        What to differentiate by.
+    rtol : float
+        Wanted gap of every support value, relative to the width in its direction.
+    effort : {"fast", "normal", "tight"}
+        How many boxes branch and bound may use.
+    most_vertices : int, optional
+        Largest number of vertices of a group; faces that cut off least are given up, with the
+        guarantee kept. 4 in the plane and 8 in space are as many as those of a box.
+
+    Returns
+    -------
+    JacobianPolytope
+        Groups of more than three scalars keep the box of their ranges.
+
+    Raises
+    ------
+    StructureError, UnboundedError, DerivationError
+        As `jacobian_bounds`.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> plant = Plant("curve")
+    >>> (x,) = plant.states("x", range=(0, 1))
+    >>> (u,) = plant.inputs("u", range=(0, 1))
+    >>> plant.dynamics([x**3 / 3 + u])
+    >>> plant.outputs([x])
+    ('y1',)
+    >>> found = jacobian_polytope(plant)
+    >>> found.vertex_count, str(found.label)[:5]
+    (2, 'exact')
+    """
+    bounds = jacobian_bounds(split_or_model, wrt, min(rtol, 1e-6), effort)
+    part = split_or_model if isinstance(split_or_model, Split) else None
+    model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
+    entries = jacobian_entries(model, part, wrt)
+    basis = basis_entries(bounds)
+    values = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
+    named = list(zip(entries.names, entries.symbols, strict=True))
+    supports = [[n for n, s in named if entries.symbolic[place].has(s)] for place in basis]
+    groups = []
+    for members in groups_of(supports):
+        places = tuple(basis[k] for k in members)
+        expressions = ca.vertcat(*[values[place] for place in places])
+        options = (rtol, effort, most_vertices)
+        groups.append(_group(members, places, expressions, bounds, entries, options))
+    radius = _radius(bounds.family, groups)
+    return JacobianPolytope(bounds.family, tuple(groups), radius, bounds.naive_vertex_count)
+
+
+def _radius(family: AffineFamily, groups: Sequence[Group]) -> Array:
+    """Add up what rounding costs: in the family, in the vertices, in sums formed with them."""
+    size, reach = np.zeros(len(family.ranges)), np.zeros(len(family.ranges))
+    for group in groups:
+        size[list(group.scalars)] = np.abs(group.polytope.vertices).max(axis=0, initial=0.0)
+        reach[list(group.scalars)] = group.polytope.radius
+    weights = np.abs(family.directions)
+    moved = np.tensordot(reach, weights, axes=1)
+    magnitude = np.abs(family.constant) + np.tensordot(size, weights, axes=1)
+    # entries that are a scalar themselves are copied
+    sums = family.radius > 0.0
+    total = family.radius + moved
+    total = total + np.where(sums, (4 * len(size) + 8) * _UNIT * magnitude, 0.0)
+    return np.where(total > 0.0, np.nextafter(total * (1.0 + 2.0**-40), np.inf), 0.0)
+
+
+def scalar_values(entries: JacobianEntries, places: Sequence[Entry], points: Array) -> Array:
+    """Evaluate entries at points of the box, in doubles.
+
+    Parameters
+    ----------
+    entries : JacobianEntries
+        The entries.
+    places : sequence of (row, column), length K
+        Which of them.
+    points : ndarray, shape (N, v)
+        Points, in the order of the entries' variables.
+
+    Returns
+    -------
+    ndarray, shape (M, K)
+        One row per point at which all of them are defined.
+    """
+    columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
+    expressions = ca.vertcat(*[columns[place] for place in places])
+    if entries.quotients is not None:
+        expressions = entries.quotients.closed(expressions)
+    middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
+    function = ca.Function("scalars", [entries.variables, entries.constants], [expressions])
+    found = np.array(function(points.T, np.tile(middle[:, None], (1, len(points)))))
+    return found[:, np.isfinite(found).all(axis=0)].T
+
+
+def basis_entries(bounds: JacobianBounds) -> list[Entry]:
+    """List the entries that are the scalars of a family, in its order.
+
+    Parameters
+    ----------
+    bounds : JacobianBounds
+        Bounds with their family.
+
+    Returns
+    -------
+    list of (row, column)
+    """
+    dependent = {d.entry for d in bounds.dependences}
+    found = []
+    for direction in bounds.family.directions:
+        (entry,) = [
+            (int(i), int(j))
+            for i, j in np.argwhere(direction == 1.0)
+            if (int(i), int(j)) not in dependent
+        ]
+        found.append(entry)
+    return found
+
+
+def _box(ranges: Array) -> Polytope:
+    """Polytope of a box; coordinates without width have one end only."""
+    unit = np.eye(len(ranges))
+    ends = [sorted(set(pair)) for pair in ranges.tolist()]
+    return Polytope(
+        np.vstack([unit, -unit]),
+        np.concatenate([ranges[:, 1], -ranges[:, 0]]),
+        np.array(list(product(*ends)), dtype=float),
+        np.zeros(len(ranges)),
+    )
+
+
+def _group(
+    members: tuple[int, ...],
+    places: tuple[Entry, ...],
+    expressions: ca.SX,
+    bounds: JacobianBounds,
+    entries: JacobianEntries,
+    options: tuple[float, str, int | None],
+) -> Group:
+    ranges = bounds.family.ranges[list(members)]
+    rtol, effort, most = options
+    if len(members) == 1:
+        tight = bounds.gap[places[0]] <= rtol * (ranges[0, 1] - ranges[0, 0])
+        label = Label.EXACT if tight else Label.OUTER
+        return Group(members, places, _box(ranges), label, ranges.T.copy())
+    width = ranges[:, 1] - ranges[:, 0]
+    if len(members) > _LARGEST_GROUP or not (np.isfinite(width) & (width > 0.0)).all():
+        return Group(members, places, _box(ranges), Label.OUTER, ranges.T.copy())
+    # powers of two bring all scalars to a width between 1 and 2, without rounding
+    weight = 2.0 ** -np.floor(np.log2(width))
+    directions = np.array(_PLANE if len(members) == 2 else _SPACE, dtype=float)
+    single = np.abs(directions).sum(axis=1) == 1.0
+    scaled = directions * weight
+    found = bound_ranges(
+        ca.mtimes(ca.DM(scaled[~single]), expressions),
+        entries.variables,
+        entries.box,
+        entries.constants,
+        entries.constant_box,
+        rtol=rtol,
+        effort=effort,
+        quotients=entries.quotients,
+    )
+    lower, upper = np.empty(len(directions)), np.empty(len(directions))
+    lower[~single], upper[~single] = found.lower, found.upper
+    for k in np.flatnonzero(single):
+        axis = int(np.argmax(directions[k]))
+        lower[k], upper[k] = weight[axis] * ranges[axis]
+    normals = np.vstack([directions, -directions])
+    offsets = np.concatenate([upper, -lower])
+    usable = np.isfinite(offsets)
+    normals, offsets = normals[usable], offsets[usable]
+    attained = scalar_values(entries, places, np.vstack([found.points_lower, found.points_upper]))
+    kept = thin(normals, offsets, (attained * weight).mean(axis=0), most)
+    try:
+        polytope = polytope_from_halfspaces(normals[kept], offsets[kept])
+    except DerivationError as error:
+        if getattr(error, "condition", None) != "flat":
+            raise
+        return Group(members, places, _box(ranges), Label.OUTER, ranges.T.copy())
+    back = Polytope(
+        polytope.normals * weight,
+        polytope.offsets,
+        polytope.vertices / weight,
+        polytope.radius / weight,
+    )
+    return Group(members, places, back, Label.OUTER, attained)
