@@ -26,6 +26,7 @@ from obsynth.designs.bounded_error.synthesis import (
     Objective,
     analyse_gain,
     design_problem,
+    explain_infeasible,
     largest_gamma,
     search_gamma,
     synthesise,
@@ -301,7 +302,7 @@ class BoundedErrorUIO:
 
         else:
             solve, top = self._multiplier_form(prepared, weights)
-        solution = _solve_or_explain(solve, top, weights, self.gamma)
+        solution = _solve_or_explain(solve, top, weights, self.gamma, system)
         gain = solution.gain
         n, m = prepared.design.K.shape
         kept = self._kept(prepared.design)
@@ -388,7 +389,7 @@ def _read_gains(design: UioDesign, gains: Mapping[str, ArrayLike]) -> tuple[Floa
 
 
 def _solve_or_explain(
-    solve: Any, top: Any, weights: FloatArray, gamma: float | None
+    solve: Any, top: Any, weights: FloatArray, gamma: float | None, system: ErrorSystem
 ) -> EllipsoidSolution:
     """Solve at gamma, or search it; explain an infeasible one by the largest that is feasible."""
     if gamma is None:
@@ -409,14 +410,16 @@ def _solve_or_explain(
         largest = top()
         if gamma < largest:
             raise
+        lines, share = explain_infeasible(system, gamma)
         raise InfeasibleDesign(
             f"gamma = {gamma:.6g} is infeasible",
             [
                 f"the largest feasible gamma is about {largest:.5g}",
                 "the bounds of disturbances and rates do not enter feasibility: they only scale P",
-                "what helps: a smaller gamma, or a smaller box of the states",
+                *lines,
             ],
             gamma=gamma,
             largest_gamma=largest,
+            largest_share=share,
         ) from error
     return solution

@@ -14,6 +14,7 @@ from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
 from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Affine,
+    Margin,
     Problem,
     Solution,
     bisect_feasible,
@@ -35,6 +36,7 @@ __all__ = [
     "analyse_gain",
     "decay_problem",
     "design_problem",
+    "explain_infeasible",
     "largest_feasible",
     "largest_gamma",
     "search_gamma",
@@ -277,6 +279,33 @@ def decay_problem(
         X = P @ system.closed_loop(gain)[0]
     problem.add_lmi("decay", symmetric_block([[P * (1.0 - gamma)], [X, P]]), ">>")
     return problem, P
+
+
+def explain_infeasible(system: ErrorSystem, gamma: float) -> tuple[list[str], float | None]:
+    """Say what binds at an infeasible gamma, and how much narrower the Jacobian set has to be.
+
+    Returns
+    -------
+    lines : list of str
+    share : float or None
+        The largest share of the set's width, about its middle, that is feasible.
+    """
+
+    def margin(share: float, explain: bool = False) -> Margin:
+        middle = system.Abar.mean(axis=0)
+        narrowed = replace(system, Abar=middle + share * (system.Abar - middle))
+        problem, P = decay_problem(narrowed, gamma)
+        return largest_margin(problem, caps={"size": P << np.eye(P.shape[0])}, explain=explain)
+
+    lines = margin(1.0, explain=True).lines()
+    found = bisect_feasible(lambda share: margin(share).feasible, 0.0, 1.0, rtol=0.01)
+    if found is None:
+        return [*lines, "no box is small enough: infeasible even for one constant Jacobian"], None
+    return [
+        *lines,
+        f"the same gamma is feasible if the Jacobian varies {100 * found.feasible:.0f} % as much "
+        "about its middle: make the box of the states smaller",
+    ], found.feasible
 
 
 def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: float = 1e-3) -> float:

@@ -118,7 +118,9 @@ def test_gamma_of_the_paper_is_refused_with_the_largest_feasible(tank_split, tan
     with pytest.raises(ob.InfeasibleDesign, match="largest feasible gamma") as refusal:
         ob.BoundedErrorUIO(gamma=0.01).design(tank_split, tank_bounds)
     assert refusal.value.largest_gamma == pytest.approx(0.00903, rel=0.02)
-    assert "noise" in str(refusal.value) or "disturbances" in str(refusal.value)
+    assert "disturbances and rates do not enter feasibility" in str(refusal.value)
+    assert 0.5 < refusal.value.largest_share < 1.0
+    assert "binding: decay" in str(refusal.value)
 
 
 def test_peak_bounds_of_the_given_gain(given_peak):
