@@ -134,16 +134,23 @@ def negate(a: Interval) -> Interval:
     return -a[1], -a[0]
 
 
+def _sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """Sum and the sign of what rounding took from it, exactly (Knuth); not a number on overflow."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
 def add(a: Interval, b: Interval) -> Interval:
-    """Return a + b; a sum of doubles that rounds to zero is zero, so it is left alone."""
-    lo, hi = a[0] + b[0], a[1] + b[1]
-    return np.where(lo == 0.0, 0.0, down(lo)), np.where(hi == 0.0, 0.0, up(hi))
+    """Return a + b; a sum that is a double is left as it is."""
+    lo, below = _sum(a[0], b[0])
+    hi, above = _sum(a[1], b[1])
+    return np.where(below >= 0.0, lo, down(lo)), np.where(above <= 0.0, hi, up(hi))
 
 
 def subtract(a: Interval, b: Interval) -> Interval:
     """Return a - b for independent operands."""
-    lo, hi = a[0] - b[1], a[1] - b[0]
-    return np.where(lo == 0.0, 0.0, down(lo)), np.where(hi == 0.0, 0.0, up(hi))
+    return add(a, (-b[1], -b[0]))
 
 
 def twice(a: Interval) -> Interval:
@@ -194,13 +201,28 @@ def power_int(a: Interval, n: int) -> Interval:
     if n == 2:
         big = np.maximum(np.abs(lo), np.abs(hi))
         small = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
-        return np.maximum(down(small * small), 0.0), np.where(big == 0.0, 0.0, up(big * big))
+        least, most = small * small, big * big
+        return (
+            np.where(_squares_exactly(small), least, np.maximum(down(least), 0.0)),
+            np.where(_squares_exactly(big), most, up(most)),
+        )
     if n % 2 == 0:
         base_lo, base_hi = absolute(a)
         ends = _powers(base_lo, base_hi, n)
         return np.maximum(ends[0], 0.0), np.where(base_hi == 0.0, 0.0, ends[1])
     ends = _powers(lo, hi, n)
     return np.where(lo == 0.0, 0.0, ends[0]), np.where(hi == 0.0, 0.0, ends[1])
+
+
+def _squares_exactly(value: Array) -> Mask:
+    """Whether a square needs no rounding: up to 24 significant bits, far from under- and overflow.
+
+    Ends of boxes are such numbers more often than not, and 1 - x**2 has to be 0 at x = 1 for a root
+    of it to be defined.
+    """
+    with np.errstate(over="ignore"):
+        short = value.astype(np.float32) == value
+    return np.asarray(short & ((value == 0.0) | (np.abs(value) > 1e-30)))
 
 
 def _powers(lo: Array, hi: Array, n: int) -> Interval:

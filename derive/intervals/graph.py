@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -37,10 +38,13 @@ class Graph:
         Operands always precede their node.
     constants : dict of int to Interval
         Nodes that do not depend on the box, already evaluated.
+    memory : dict
+        What rewrites remember of nodes.
     """
 
     nodes: list[Node] = field(default_factory=list)
     constants: dict[int, Interval] = field(default_factory=dict)
+    memory: dict[int, Any] = field(default_factory=dict, repr=False)
     _known: dict[Node, int] = field(default_factory=dict, repr=False)
     _numbers: dict[tuple[float, float], int] = field(default_factory=dict, repr=False)
 

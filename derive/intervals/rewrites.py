@@ -6,6 +6,7 @@ that stands for it.
 
 from collections.abc import Callable
 
+from obsynth.derive.intervals.cancelling import cancelled
 from obsynth.derive.intervals.graph import Graph, Node
 
 __all__ = ["REWRITES"]
@@ -45,6 +46,9 @@ def _square(graph: Graph, args: list[int]) -> int:
 
 def _multiply(graph: Graph, args: list[int]) -> int:
     a, b = args
+    shorter = cancelled(graph, a, b, 1)
+    if shorter is not None:
+        return shorter
     for first, second in ((a, b), (b, a)):
         value = graph.exact(first)
         if value == 1.0:
@@ -80,6 +84,9 @@ def _divide(graph: Graph, args: list[int]) -> int:
     a, b = args
     if graph.exact(b) == 1.0:
         return a
+    shorter = cancelled(graph, a, b, -1)
+    if shorter is not None:
+        return shorter
     top, bottom = graph.nodes[a], graph.nodes[b]
     if top.op == "less_equal" and bottom.op == "add" and a in bottom.args:
         other = bottom.args[1] if bottom.args[0] == a else bottom.args[0]
