@@ -14,6 +14,7 @@ __all__ = ["NUMERIC", "FormProof", "prove_zero"]
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 NUMERIC = "numerically zero at 60 digits"
+_ORDER = ("syntactic", "expand", "cancel", "simplify", NUMERIC)
 _DIGITS = 60
 _WORKING = 100
 _POINTS = 6
@@ -21,6 +22,8 @@ _TRIES = 40
 # Beyond this size cancel and simplify take minutes, and numbers are the better evidence.
 _LARGEST_CANCEL = 3000
 _LARGEST_EXPONENTIAL = 1000
+_LARGEST_NUMERATOR = 3000
+_LARGEST_POWER = 8
 _LARGEST_SIMPLIFY = 600
 _GRID = 10**6
 
@@ -93,24 +96,40 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
     expression = sp.expand(quotients(expression))
     if expression == 0:
         return "expand"
-    if not _vanishes(expression, box):
+    known = _positive(expression, box)
+    signed = sp.expand(expression.xreplace(known))
+    if signed == 0:
+        return "expand"
+    terms = list(sp.Add.make_args(signed))
+    values = _values(terms, {known.get(s, s): bounds for s, bounds in box.items()})
+    if values is None or not _vanish(values):
         return ""
-    signed = _with_signs(expression, box)
-    if sp.expand(signed) == 0:
+    return max((_prove(sp.Add(*group)) for group in _groups(terms, values)), key=_ORDER.index)
+
+
+def _prove(expression: sp.Expr) -> str:
+    """Prove what numbers say is zero."""
+    if expression == 0:
         return "expand"
     for name, attempt, limit in (
-        ("cancel", sp.cancel, _LARGEST_CANCEL),
+        ("cancel", _cancel, _LARGEST_CANCEL),
         ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL),
         ("simplify", sp.simplify, _LARGEST_SIMPLIFY),
     ):
-        if signed.count_ops() > limit:
+        if expression.count_ops() > limit or _size_over_one(expression) > _LARGEST_NUMERATOR:
             continue
         try:
-            if attempt(signed) == 0:
+            if attempt(expression) == 0:
                 return name
         except (sp.PolynomialError, NotImplementedError):
             continue
     return NUMERIC
+
+
+def _cancel(expression: sp.Expr) -> sp.Expr:
+    if _size_over_one(expression) > _LARGEST_NUMERATOR:
+        return expression
+    return sp.cancel(expression)
 
 
 def _cancel_exponentials(expression: sp.Expr) -> sp.Expr:
@@ -119,17 +138,58 @@ def _cancel_exponentials(expression: sp.Expr) -> sp.Expr:
     Addition theorems are then identities between monomials.
     """
     written = sp.expand_log(expression).rewrite(sp.exp)
-    return sp.cancel(sp.expand(written, trig=False))
+    return _cancel(sp.expand(written, trig=False))
 
 
-def _with_signs(expression: sp.Expr, box: Box) -> sp.Expr:
-    """Tell SymPy which symbols are positive over the box."""
-    known = {}
-    for symbol in expression.free_symbols:
-        lower, _ = box.get(symbol, (-1.0, 1.0))
-        if lower > 0.0:
-            known[symbol] = sp.Dummy(symbol.name, positive=True)
-    return expression.xreplace(known)
+def _size_over_one(expression: sp.Expr) -> int:
+    """Estimate how many terms there are over one common denominator."""
+    terms = sp.Add.make_args(expression)
+    powers: dict[sp.Expr, int] = {}
+    for term in terms:
+        for factor in sp.Mul.make_args(term):
+            base, exponent = factor.as_base_exp()
+            if base.is_Add and exponent.is_number and exponent < 0:
+                powers[base] = max(powers.get(base, 0), int(sp.ceiling(-exponent)))
+    size = len(terms)
+    for base, power in powers.items():
+        size *= min(len(base.args), _LARGEST_NUMERATOR) ** min(power, _LARGEST_POWER)
+    return size
+
+
+def _groups(terms: list[sp.Expr], values: list[list[Any]]) -> list[list[sp.Expr]]:
+    """Parts of a sum that vanish by themselves: terms that are connected by common functions.
+
+    What does not vanish by itself stays in one part.
+    """
+    parts: list[tuple[list[int], set[sp.Expr]]] = []
+    for k, term in enumerate(terms):
+        joined: tuple[list[int], set[sp.Expr]] = ([k], _functions(term))
+        rest = []
+        for part in parts:
+            if part[1] & joined[1] or not part[1] | joined[1]:
+                joined = (part[0] + joined[0], part[1] | joined[1])
+            else:
+                rest.append(part)
+        parts = [*rest, joined]
+    alone = [part for part, _ in parts if _vanish([values[k] for k in part])]
+    settled = {k for part in alone for k in part}
+    left = [k for k in range(len(terms)) if k not in settled]
+    return [[terms[k] for k in part] for part in ([*alone, left] if left else alone)]
+
+
+def _functions(term: sp.Expr) -> set[sp.Expr]:
+    """Factors of a term that are no powers of symbols, without their exponents."""
+    bases = (factor.as_base_exp()[0] for factor in sp.Mul.make_args(term))
+    return {base for base in bases if not base.is_Symbol and not base.is_number}
+
+
+def _positive(expression: sp.Expr, box: Box) -> dict[sp.Symbol, sp.Symbol]:
+    """Symbols of which SymPy may know that they are positive over the box."""
+    return {
+        symbol: sp.Dummy(symbol.name, positive=True)
+        for symbol in expression.free_symbols
+        if box.get(symbol, (-1.0, 1.0))[0] > 0.0
+    }
 
 
 def _points(symbols: list[sp.Symbol], box: Box) -> Iterator[list[sp.Rational]]:
@@ -145,30 +205,32 @@ def _points(symbols: list[sp.Symbol], box: Box) -> Iterator[list[sp.Rational]]:
         yield point
 
 
-def _vanishes(expression: sp.Expr, box: Box) -> bool:
-    """Tell whether an expression is zero to 60 digits, relative to its terms, at random points."""
+def _values(terms: list[sp.Expr], box: Box) -> list[list[Any]] | None:
+    """Values of terms at random points of the box, to 100 digits; None where there are too few."""
     mpmath: Any = import_module("mpmath")
-    symbols = sorted(expression.free_symbols, key=str)
-    terms = sp.Add.make_args(expression)
-    if not symbols:
-        value = expression.evalf(_WORKING)
-        return bool(abs(value) < sp.Float(10) ** -_DIGITS)
-    function = sp.lambdify(symbols, list(terms), "mpmath", cse=True)
-    found = 0
+    symbols = sorted(set().union(*(term.free_symbols for term in terms)), key=str)
+    function = sp.lambdify(symbols, terms, "mpmath", cse=True)
+    found: list[list[Any]] = []
     with mpmath.workdps(_WORKING):
-        limit = mpmath.mpf(10) ** -_DIGITS
         for point in _points(symbols, box):
             try:
                 values = function(*[mpmath.mpf(int(v.p)) / int(v.q) for v in point])
-                size = mpmath.fsum(abs(v) for v in values)
-                total = abs(mpmath.fsum(values))
+                if not all(mpmath.isfinite(v) for v in values):
+                    continue
             except (ZeroDivisionError, ValueError, TypeError, OverflowError):
                 continue
-            if not mpmath.isfinite(size):
-                continue
-            if total > limit * size:
-                return False
-            found += 1
-            if found == _POINTS:
-                return True
-    return False
+            found.append(values)
+            if len(found) == _POINTS:
+                return [list(column) for column in zip(*found, strict=True)]
+    return None
+
+
+def _vanish(values: list[list[Any]]) -> bool:
+    """Tell whether terms add up to zero to 60 digits, relative to their size, at every point."""
+    mpmath: Any = import_module("mpmath")
+    with mpmath.workdps(_WORKING):
+        limit = mpmath.mpf(10) ** -_DIGITS
+        return all(
+            abs(mpmath.fsum(column)) <= limit * mpmath.fsum(abs(v) for v in column)
+            for column in zip(*values, strict=True)
+        )
