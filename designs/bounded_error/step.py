@@ -9,7 +9,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import STATUS, STEP_OUTPUTS
+from obsynth.designs.stepping import (
+    FINITE,
+    all_finite,
+    clip,
+    finite_or,
+    inside,
+    make_step,
+    select,
+    status_word,
+)
 
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant
@@ -17,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["RuntimeBound", "build_step", "memory_layout"]
 
 FloatArray = NDArray[np.float64]
-FINITE = 1e300
 ROUND_UP = 1.0 + 2.0**-50
 # covers the rounding of estimate - half and estimate + half
 ULPS = 2.0**-50
@@ -74,32 +82,6 @@ def memory_layout(n: int, n_f: int) -> dict[str, slice]:
     return layout
 
 
-def _clip(value: ca.SX, box: FloatArray) -> ca.SX:
-    parts = []
-    for i, (low, high) in enumerate(box):
-        entry = value[i]
-        if np.isfinite(low):
-            entry = ca.fmax(entry, low)
-        if np.isfinite(high):
-            entry = ca.fmin(entry, high)
-        parts.append(entry)
-    return ca.vertcat(*parts)
-
-
-def _inside(lower: ca.SX, upper: ca.SX, box: FloatArray) -> ca.SX:
-    inside = ca.SX(1)
-    for i, (low, high) in enumerate(box):
-        inside = ca.logic_and(inside, ca.logic_and(lower[i] >= low, upper[i] <= high))
-    return inside
-
-
-def _finite(vector: ca.SX) -> ca.SX:
-    finite = ca.SX(1)
-    for i in range(vector.numel()):
-        finite = ca.logic_and(finite, ca.fabs(vector[i]) <= FINITE)
-    return finite
-
-
 def build_step(
     model: Plant,
     C: FloatArray,
@@ -146,20 +128,16 @@ def build_step(
     box, f_box = model.box("x"), model.box("f")
 
     y_shifted = y - ca.DM(W2 @ w_centre)
-    y_finite, u_finite = _finite(y), _finite(u)
+    y_finite, u_finite = all_finite(y), all_finite(u)
     expected = ca.DM(C) @ prediction
-    y_used = ca.vertcat(
-        *(ca.if_else(ca.fabs(y[i]) <= FINITE, y_shifted[i], expected[i]) for i in range(m))
-    )
+    y_used = finite_or(y_shifted, expected)
     nominal = [0.0 if signal.nominal is None else float(signal.nominal) for signal in model.u]
-    u_used = ca.vertcat(
-        *(ca.if_else(ca.fabs(u[i]) <= FINITE, u[i], nominal[i]) for i in range(n_u))
-    )
+    u_used = finite_or(u, nominal)
 
     xhat = z - ca.DM(E) @ y_used
     innovation = y_used - ca.DM(C) @ xhat
-    xhat_inside = _inside(xhat, xhat, box)
-    fhat_inside = _inside(fhat, fhat, f_box)
+    xhat_inside = inside(xhat, xhat, box)
+    fhat_inside = inside(fhat, fhat, f_box)
     can_reset = ca.logic_and(xhat_inside, fhat_inside)
     s_parts = []
     for i in range(n + n_f):
@@ -182,13 +160,16 @@ def build_step(
     consistent = ca.SX(1)
     for i in range(m):
         consistent = ca.logic_and(consistent, ca.fabs(innovation[i]) <= allowed[i])
-    status = (
-        STATUS["not_initialised"] * ca.logic_not(initialised)
-        + STATUS["non_finite_input"] * ca.logic_not(ca.logic_and(y_finite, u_finite))
-        + STATUS["outside_domain"]
-        * ca.logic_not(ca.logic_and(_inside(x_lower, x_upper, box), xhat_inside))
-        + STATUS["inconsistent_measurement"] * ca.logic_not(consistent)
-        + STATUS["fault_not_valid"] * ca.logic_not(valid)
+    status = status_word(
+        {
+            "not_initialised": ca.logic_not(initialised),
+            "non_finite_input": ca.logic_not(ca.logic_and(y_finite, u_finite)),
+            "outside_domain": ca.logic_not(
+                ca.logic_and(inside(x_lower, x_upper, box), xhat_inside)
+            ),
+            "inconsistent_measurement": ca.logic_not(consistent),
+            "fault_not_valid": ca.logic_not(valid),
+        }
     )
 
     # Outside the box the dynamics may not be defined (a level below zero); the
@@ -197,7 +178,7 @@ def build_step(
     rhs = model.function()
     zeros = {"d": len(model.d), "p": len(model.p), "rho": len(model.rho)}
     next_state = rhs(
-        _clip(xhat, box),
+        clip(xhat, box),
         u_used,
         ca.DM.zeros(zeros["d"]),
         fhat,
@@ -210,14 +191,16 @@ def build_step(
     s_next = ca.DM(bound.decay) * s_now + ca.DM(bound.offset)
     s_next = ca.vertcat(*(ca.if_else(u_finite, s_next[i], ca.inf) for i in range(n + n_f)))
     moved = ca.vertcat(z_next, fhat_next, s_next, next_state, 1)
-    memory_next = ca.vertcat(
-        *(ca.if_else(initialised, moved[i], memory[i]) for i in range(memory.numel()))
-    )
-    return ca.Function(
-        "step",
-        [memory, u, y],
-        [memory_next, xhat, fhat, x_lower, x_upper, f_lower, f_upper, status],
-        ["memory", "u", "y"],
-        list(STEP_OUTPUTS),
-        {"allow_duplicate_io_names": True},
+    return make_step(
+        {"memory": memory, "u": u, "y": y},
+        {
+            "memory": select(initialised, moved, memory),
+            "xhat": xhat,
+            "fhat": fhat,
+            "x_lower": x_lower,
+            "x_upper": x_upper,
+            "f_lower": f_lower,
+            "f_upper": f_upper,
+            "status": status,
+        },
     )
