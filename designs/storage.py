@@ -20,7 +20,13 @@ __all__ = ["FORMAT", "VERSION", "load", "method_module", "save"]
 FORMAT = "obsynth design"
 VERSION = 1
 
-_METHODS = {"bounded_error_uio": "obsynth.designs.bounded_error.assembly"}
+_METHODS = {
+    "bounded_error_uio": "obsynth.designs.bounded_error.assembly",
+    "hinf_uio": "obsynth.designs.hinf.assembly",
+    "interval_observer": "obsynth.designs.interval.assembly",
+    "qpv_observer": "obsynth.designs.qpv.assembly",
+    "set_adaptive_observer": "obsynth.designs.set_adaptive.assembly",
+}
 
 
 def method_module(record: Mapping[str, Any]) -> str:
