@@ -22,6 +22,7 @@ from obsynth.designs.lmi import (
     full,
     largest_margin,
     search_line,
+    search_log_convex,
     solve_lazily,
     solve_with_retries,
     symmetric,
@@ -57,6 +58,8 @@ LEAST_GAMMA = 1e-9
 # Shares of the largest gamma that are tried before the golden sections.
 GRID = (0.1, 0.3, 0.5, 0.65, 0.8, 0.95)
 REFINE = 6
+# Of the trace for a given gain, against the proved lower bound.
+SEARCH_RTOL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +227,23 @@ def solve_reliably(problem: Problem) -> Solution:
 def analyse_gain(
     system: ErrorSystem, gain: FloatArray, noise: FloatArray | None, weights: FloatArray
 ) -> EllipsoidSolution:
-    """Find the best ellipsoid and gamma for a given gain."""
+    """Find the best ellipsoid and gamma for a given gain: the least weighted trace of P^-1.
+
+    Notes
+    -----
+    With the gain fixed, the LMI at gamma says of X = P^-1, at every vertex i,
+
+        X >= A_i X A_i' / (1 - gamma) + W_i Q_v^-1 W_i' / gamma .
+
+    Take X1, X2 that satisfy it at gamma1, gamma2 with weights Q1, Q2, and X = X1 # X2, their
+    weighted geometric mean with exponents 1 - t and t. The mean is monotone, superadditive and
+    not decreased by ``A . A'``, so X satisfies the inequality at (1 - t) gamma1 + t gamma2 with
+    Q = Q1 # Q2, whose trace is no larger than both allow, because arithmetic means of gamma and
+    1 - gamma exceed geometric ones. As trace(S X) <= trace(S X1)^(1-t) trace(S X2)^t, the
+    optimum is log-convex in gamma: one minimum, found with a bound of what is left. With the
+    gain free the argument fails (what a measurement takes off is not superadditive the right
+    way), which is why `search_gamma` needs its grid.
+    """
     radius = _decay_limit(system, gain)
     if radius >= 1.0:
         raise InfeasibleDesign(
@@ -232,12 +251,14 @@ def analyse_gain(
             "Jacobian set",
             spectral_radius=radius,
         )
-    top = 1.0 - radius**2
 
     def solve(gamma: float) -> EllipsoidSolution:
         return synthesise(system, gamma, noise, "trace_inverse", weights, gain)
 
-    return search_gamma(solve, weights, top)
+    def size(solution: EllipsoidSolution) -> float:
+        return float(weights @ solution.inverse_diagonal)
+
+    return search_log_convex(solve, size, 0.0, 1.0 - radius**2, rtol=SEARCH_RTOL).result
 
 
 def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:

@@ -70,6 +70,7 @@ from obsynth.designs.lmi.search import (
     Search,
     bisect_feasible,
     search_line,
+    search_log_convex,
     smallest_changes,
 )
 from obsynth.designs.lmi.solution import Solution
@@ -115,6 +116,7 @@ __all__ = [
     "row_multipliers",
     "scalar",
     "search_line",
+    "search_log_convex",
     "smallest_changes",
     "solve_lazily",
     "solve_with_margin",

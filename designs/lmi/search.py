@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -11,7 +12,15 @@ import numpy as np
 from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["Bisection", "Knob", "Search", "bisect_feasible", "search_line", "smallest_changes"]
+__all__ = [
+    "Bisection",
+    "Knob",
+    "Search",
+    "bisect_feasible",
+    "search_line",
+    "search_log_convex",
+    "smallest_changes",
+]
 
 Result = TypeVar("Result")
 
@@ -170,12 +179,16 @@ class Search(Generic[Result]):
         Its objective.
     tried : tuple of (float, float)
         Every value tried, in order, with its objective (inf where infeasible).
+    lower_bound : float
+        What no value of the line can be below, where the shape of the objective is known;
+        0 where only a grid speaks.
     """
 
     value: float
     result: Result
     objective: float
     tried: tuple[tuple[float, float], ...]
+    lower_bound: float = 0.0
 
 
 def search_line(
@@ -235,6 +248,111 @@ def search_line(
     return Search(value, result, least, tuple(record.tried))
 
 
+def search_log_convex(
+    design: Callable[[float], Result],
+    objective: Callable[[Result], float],
+    low: float,
+    high: float,
+    *,
+    rtol: float = 1e-3,
+    most: int = 40,
+) -> Search[Result]:
+    """Minimise an objective whose logarithm is known to be convex along a line.
+
+    Such an objective has one minimum, its feasible values are one interval, and the chords
+    through the points tried bound it from below, so that the search knows when to stop.
+
+    Parameters
+    ----------
+    design : callable
+        As in `search_line`.
+    objective : callable
+        Positive, of the result.
+    low, high : float
+        Ends of the line, not tried themselves.
+    rtol : float
+        The search stops as soon as the best value is within this of the lower bound.
+    most : int
+        Largest number of designs.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no value tried gives a design.
+    ObsynthError
+        If the values tried contradict log-convexity by more than `rtol`.
+
+    Examples
+    --------
+    >>> found = search_log_convex(lambda g: 1 / (g * (1 - g) ** 3), float, 0.0, 1.0, rtol=1e-6)
+    >>> round(found.value, 3), found.lower_bound <= found.objective
+    (0.25, True)
+    """
+    record = _Record(objective)
+
+    def left_over() -> float:
+        return _lower_bound(record, low, high)
+
+    def enough() -> bool:
+        return record.best is not None and left_over() >= (1.0 - rtol) * record.best[1]
+
+    _refine(lambda value: record.add(value, _attempt(design, value)), low, high, most, enough)
+    if record.best is None:
+        raise InfeasibleDesign(
+            f"no value between {low:.4g} and {high:.4g} gives a design",
+            record.troubles,
+            tried=tuple(record.tried),
+        )
+    _require_log_convex(record, rtol)
+    value, least, result = record.best
+    return Search(value, result, least, tuple(record.tried), min(left_over(), least))
+
+
+def _require_log_convex(record: _Record[Result], rtol: float) -> None:
+    points = sorted((v, m) for v, m in record.tried if np.isfinite(m))
+    for (a, at_a), (x, at_x), (b, at_b) in zip(points, points[1:], points[2:], strict=False):
+        share = (x - a) / (b - a)
+        chord = at_a ** (1.0 - share) * at_b**share
+        if at_x > (1.0 + rtol) * chord:
+            raise ObsynthError(
+                f"the objective is not log-convex: it is {at_x:.6g} at {x:.4g}, but {at_a:.6g} at "
+                f"{a:.4g} and {at_b:.6g} at {b:.4g} allow {chord:.6g} at most",
+                tried=tuple(record.tried),
+            )
+
+
+def _lower_bound(record: _Record[Result], low: float, high: float) -> float:
+    """Return what chords of log-convex values leave as the least value on [low, high]."""
+    points = sorted((v, float(np.log(m))) for v, m in record.tried if np.isfinite(m))
+    if len(points) < 2:
+        return 0.0
+    infeasible = [v for v, m in record.tried if not np.isfinite(m)]
+    low = max([low, *(v for v in infeasible if v < points[0][0])])
+    high = min([high, *(v for v in infeasible if v > points[-1][0])])
+    slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(points)]
+    least = np.inf
+    for k in range(len(points) + 1):
+        left = low if k == 0 else points[k - 1][0]
+        right = high if k == len(points) else points[k][0]
+        # left of the gap and right of it, a chord continued into the gap lies below
+        lines = []
+        if k >= 2:
+            lines.append((points[k - 1], slopes[k - 2]))
+        if k <= len(points) - 2:
+            lines.append((points[k], slopes[k]))
+        corners = {left, right}
+        if len(lines) == 2 and lines[0][1] != lines[1][1]:
+            (p, a), (q, b) = lines
+            corners.add((q[1] - p[1] + a * p[0] - b * q[0]) / (a - b))
+        heights = [
+            max((p[1] + a * (x - p[0]) for p, a in lines), default=-np.inf)
+            for x in corners
+            if left <= x <= right
+        ]
+        least = min([least, *heights])
+    return float(np.exp(least))
+
+
 class _Record(Generic[Result]):
     """Everything tried so far and the best of it."""
 
@@ -256,11 +374,19 @@ class _Record(Generic[Result]):
         return measured
 
 
-def _refine(measure: Callable[[float], float], low: float, high: float, steps: int) -> None:
+def _refine(
+    measure: Callable[[float], float],
+    low: float,
+    high: float,
+    steps: int,
+    enough: Callable[[], bool] = lambda: False,
+) -> None:
     """Golden sections of [low, high], one evaluation per step."""
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = measure(left), measure(right)
     for _ in range(steps - 2):
+        if enough():
+            return
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)

@@ -9,10 +9,15 @@ import pytest
 import obsynth as ob
 from obsynth.designs.bounded_error.assembly import assemble, to_record
 from obsynth.designs.bounded_error.design import UioDesign
-from obsynth.designs.bounded_error.error_system import plain_error, shifted_error
+from obsynth.designs.bounded_error.error_system import (
+    build_error_system,
+    plain_error,
+    shifted_error,
+)
 from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.prepare import prepare
 from obsynth.designs.bounded_error.step import build_step
-from obsynth.designs.bounded_error.synthesis import synthesise
+from obsynth.designs.bounded_error.synthesis import analyse_gain, synthesise
 
 # M_min and M_max as printed in section 6 of the paper.
 PRINTED_RANGES = {"m11": (0.0026, 0.0065), "m22": (0.0008, 0.0033)}
@@ -492,3 +497,22 @@ def test_shifted_error_recursion(design, tank_split, run):
         xi[:-1] @ X.T + v @ Z.T + np.hstack([s[:-1] @ design.T.T[:, kept], np.zeros((5000, 2))])
     )
     assert np.abs(xi[1:] - predicted)[1:].max() < 1e-4
+
+
+def test_the_best_trace_of_a_given_gain_is_log_convex_in_gamma(base, tank_split, tank_bounds):
+    """Why the search over gamma has one minimum when the gain is given."""
+    prepared = prepare(tank_split, tank_bounds)
+    system = build_error_system(prepared.design.data, "plain")
+    noise = ob.BoundedErrorUIO._noise(prepared, system.blocks)
+    gain = np.vstack([base.gains["K"], base.gains["F"]])
+    weights = np.ones(len(gain))
+    gammas = [0.001, 0.0025, 0.004, 0.0055]
+    traces = [
+        synthesise(system, g, noise, "trace_inverse", weights, gain).inverse_diagonal.sum()
+        for g in gammas
+    ]
+    values = np.log(traces)
+    # second differences far above what the solver's accuracy could hide
+    assert np.diff(values, 2).min() > 1e-4
+    best = analyse_gain(system, gain, noise, weights)
+    assert best.inverse_diagonal.sum() <= min(traces) * (1 + 1e-3)

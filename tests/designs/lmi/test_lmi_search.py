@@ -1,9 +1,18 @@
 """Bisection, line search, the smallest change that helps."""
 
+import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_lyapunov
 
 from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import Knob, bisect_feasible, search_line, smallest_changes
+from obsynth.designs.lmi import (
+    Knob,
+    bisect_feasible,
+    search,
+    search_line,
+    search_log_convex,
+    smallest_changes,
+)
 from obsynth.symbolic.errors import ObsynthError
 
 
@@ -63,6 +72,40 @@ def test_a_search_without_a_design_says_what_happened():
     with pytest.raises(InfeasibleDesign, match="gamma") as caught:
         search_line(design, cost, [0.01, 0.9], name="gamma")
     assert "stuck" in str(caught.value) and "no room" in str(caught.value)
+
+
+def lyapunov_trace(gamma):
+    """Least trace of X >= A X A' / (1 - gamma) + I / gamma, log-convex in gamma."""
+    A = np.array([[0.8, 0.3], [0.0, 0.7]]) / np.sqrt(1.0 - gamma)
+    if np.abs(np.linalg.eigvals(A)).max() >= 1.0:
+        raise InfeasibleDesign("unstable")
+    return float(np.trace(solve_discrete_lyapunov(A, np.eye(2) / gamma)))
+
+
+def test_a_log_convex_objective_is_searched_with_a_bound_of_what_is_left():
+    fine = min(lyapunov_trace(g) for g in np.linspace(1e-3, 0.35, 20001))
+    found = search_log_convex(lyapunov_trace, float, 0.0, 1.0, rtol=1e-4)
+    assert fine * (1 - 1e-6) <= found.objective <= fine * (1 + 1e-4)
+    assert found.objective * (1 - 1e-4) <= found.lower_bound <= fine * (1 + 1e-9)
+    assert len(found.tried) < 40
+
+
+def test_a_bound_that_is_too_high_would_be_seen(monkeypatch):
+    """A bound that takes the best value tried for the optimum stops at once, above the truth."""
+
+    def overconfident(record, low, high):
+        return 0.0 if record.best is None else record.best[1]
+
+    monkeypatch.setattr(search, "_lower_bound", overconfident)
+    found = search_log_convex(lyapunov_trace, float, 0.0, 1.0, rtol=1e-4)
+    fine = min(lyapunov_trace(g) for g in np.linspace(1e-3, 0.35, 2001))
+    assert found.lower_bound > fine * 1.001
+
+
+def test_an_objective_that_is_not_log_convex_is_refused():
+    with pytest.raises(ObsynthError, match="not log-convex") as caught:
+        search_log_convex(lambda g: np.exp(-20.0 * (g - 0.45) ** 2), float, 0.0, 1.0)
+    assert caught.value.tried
 
 
 def test_changes_are_listed_and_what_does_not_help_is_said():
