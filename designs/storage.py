@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.designs.errors import CertificateError
 
 if TYPE_CHECKING:
+    from obsynth.designs.certificate import Claim
     from obsynth.designs.observer import Observer
 
 __all__ = ["FORMAT", "VERSION", "load", "method_module", "save"]
 
 FORMAT = "obsynth design"
 VERSION = 1
+CLAIMS = "claims"
 
 _METHODS = {
     "bounded_error_uio": "obsynth.designs.bounded_error.assembly",
@@ -54,13 +58,17 @@ def method_module(record: Mapping[str, Any]) -> str:
 def save(observer: Observer, path: str | os.PathLike[str]) -> None:
     """Write the record of an observer; an existing file is replaced only when complete.
 
+    The claims stand in the file too, for people to read; `load` proves them again and never
+    believes them.
+
     Raises
     ------
     FileNotFoundError
         If the folder does not exist.
     """
     target = Path(path)
-    text = json.dumps(observer.record, indent=1, allow_nan=False) + "\n"
+    claims = [_claim(claim) for claim in observer.certificate]
+    text = json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
@@ -70,6 +78,11 @@ def save(observer: Observer, path: str | os.PathLike[str]) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def _claim(claim: Claim) -> dict[str, Any]:
+    margin = claim.margin if math.isfinite(claim.margin) else None
+    return {**asdict(claim), "margin": margin}
 
 
 def load(path: str | os.PathLike[str]) -> Observer:
@@ -91,6 +104,7 @@ def load(path: str | os.PathLike[str]) -> Observer:
         raise CertificateError(f"{source.name} is not JSON: {error}") from error
     if not isinstance(record, dict):
         raise CertificateError(f"{source.name} holds no design")
+    record.pop(CLAIMS, None)
     module = importlib.import_module(method_module(record))
     observer: Observer = module.assemble(record, level="lmi")
     return observer
