@@ -69,6 +69,9 @@ class Observer:
         0 or 1: how many samples the fault estimate lags behind.
     ode : casadi.Function or None
         Right-hand side of continuous-time methods.
+    step_covered : bool
+        Continuous-time methods: whether the guarantee covers the step too, called
+        every `model.Ts` seconds on the continuous plant.
     """
 
     method: str
@@ -83,6 +86,7 @@ class Observer:
     start: Callable[..., FloatArray] = field(repr=False)
     fault_delay: int = 0
     ode: ca.Function | None = None
+    step_covered: bool = False
 
     @property
     def record(self) -> Mapping[str, Any]:

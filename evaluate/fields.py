@@ -1,6 +1,6 @@
 """The signals of a scenario as checked arrays, and the assumptions that they do not keep."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,9 +9,18 @@ from numpy.typing import NDArray
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
 
-__all__ = ["broken_assumptions", "finite", "scenario_fields", "vector"]
+__all__ = ["WORDS", "broken_assumptions", "finite", "function_values", "scenario_fields", "vector"]
 
 Array = NDArray[np.float64]
+
+WORDS: Mapping[str, str] = {
+    "u": "inputs",
+    "d": "unknown_inputs",
+    "f": "faults",
+    "w": "disturbances",
+    "rho": "scheduling",
+}
+"""What a scenario calls each group of signals, in the order in which plants take them."""
 
 
 def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, Array]:
@@ -19,10 +28,8 @@ def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, Ar
     if isinstance(seed, bool) or int(seed) != seed or seed < 0:
         raise SimulationError(f"seed={seed!r} is not a whole number from 0 on.", seed=seed)
     arrays: Mapping[str, Any] = scenario.arrays(model, int(seed))
-    words = {"u": "inputs", "d": "unknown_inputs", "f": "faults", "w": "disturbances"}
-    words["rho"] = "scheduling"
     fields: dict[str, Array] = {}
-    for key, word in words.items():
+    for key, word in WORDS.items():
         names = model.names(key)
         value = arrays.get(key)
         if value is None:
@@ -75,6 +82,33 @@ def vector(value: Any, names: tuple[str, ...], word: str) -> Array:
             shape=row.shape,
         )
     return _checked(row.reshape(1, -1), (1, len(names)), word, names).reshape(-1)
+
+
+def function_values(
+    function: Callable[[float], Any], points: Array, names: tuple[str, ...], word: str
+) -> Array:
+    """Return a function of the real-valued k at many points, one row for each."""
+    rows = [np.ravel(np.asarray(function(k), dtype=float)) for k in points.tolist()]
+    for k, row in zip(points, rows, strict=True):
+        if row.shape != (len(names),):
+            raise SimulationError(
+                f"the {word} at k = {k:g} are {row.size} numbers; one for each of "
+                f"{', '.join(names) or 'no signal'} is needed.",
+                field=word,
+                shape=row.shape,
+            )
+    values: Array = np.array(rows)
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        row_of, i = (int(v) for v in bad[0])
+        raise SimulationError(
+            f"the {word} are not finite: {names[i]} is {values[row_of, i]} at k = "
+            f"{points[row_of]:.12g}.",
+            field=word,
+            symbol=names[i],
+            instant=float(points[row_of]),
+        )
+    return values
 
 
 def finite(values: Array, names: tuple[str, ...]) -> None:

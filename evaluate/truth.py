@@ -11,7 +11,17 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant
 
-__all__ = ["Call", "Truth", "dense"]
+__all__ = [
+    "Call",
+    "Truth",
+    "continuous_plant",
+    "dense",
+    "parameter_text",
+    "parameters",
+    "same_signals",
+    "sample_time",
+    "substeps_of",
+]
 
 Array = NDArray[np.float64]
 
@@ -21,11 +31,12 @@ class Truth:
 
     def __init__(self, model: Plant, observer: StepObserver, substeps: int | None) -> None:
         own = observer.model
-        _same_signals(model, own)
+        same_signals(model, own)
         self.model = model
-        self.Ts = _sample_time(own)
+        self.Ts = sample_time(own)
         self.outside: tuple[str, ...] = ()
-        p = np.array([_nominal(signal) for signal in model.p], dtype=float)
+        self._ode = getattr(observer, "ode", None)
+        p = parameters(model)
         if substeps is not None:
             self._continuous(substeps)
             step = _held(self.plant, self.Ts, substeps, p)
@@ -33,30 +44,23 @@ class Truth:
             self._discrete(own)
             x, u, d, f, w, rho = _symbols(model)
             step = ca.Function("truth", [x, u, d, f, w, rho], _call(model, x, u, d, f, w, p, rho))
+        if self._ode is not None and not getattr(observer, "step_covered", False):
+            self.outside += (
+                "the guarantee speaks of the observer's differential equation; its sampled step, "
+                f"with everything measured held over {self.Ts:g} s, is outside it",
+            )
         self.function = dense(step)
-        if p.size:
-            values = ", ".join(f"{s.name} = {v:g}" for s, v in zip(model.p, p, strict=True))
-            self.description += f"; {values}"
+        self.description += parameter_text(model, p)
 
     def _continuous(self, substeps: int) -> None:
-        if isinstance(substeps, bool) or int(substeps) != substeps or substeps < 1:
-            raise SimulationError(
-                f"substeps={substeps!r} is not a positive whole number.", substeps=substeps
-            )
-        source = self.model if self.model.Ts is None else self.model.continuous
-        if source is None:
-            raise SimulationError(
-                f"substeps={substeps} needs a continuous plant, but {self.model.name!r} was "
-                "declared in discrete time: leave substeps out, or give the plant that was "
-                "discretised.",
-                substeps=substeps,
-            )
-        self.plant = source
+        substeps = substeps_of(substeps)
+        self.plant = continuous_plant(self.model, f"substeps={substeps}")
         self.description = f"continuous plant, {substeps} Runge-Kutta steps per sample, inputs held"
-        self.outside = (
-            "the truth is the continuous plant; the error of its discretisation is no declared "
-            "disturbance, so the guarantee does not cover it",
-        )
+        if self._ode is None:
+            self.outside = (
+                "the truth is the continuous plant; the error of its discretisation is no declared "
+                "disturbance, so the guarantee does not cover it",
+            )
 
     def _discrete(self, own: Plant) -> None:
         if self.model.Ts is None:
@@ -77,9 +81,14 @@ class Truth:
         else:
             self.description = f"another discrete model{way}"
             self.outside = ("the truth is not the model for which the observer was designed",)
+        if self._ode is not None:
+            self.outside += (
+                "the truth is a discretisation of the plant; the guarantee speaks of the "
+                "differential equation",
+            )
 
 
-def _same_signals(model: Plant, own: Plant) -> None:
+def same_signals(model: Plant, own: Plant) -> None:
     """Refuse a truth whose signals are not those of the observer's model."""
     groups = {"x": "states", "u": "inputs", "d": "unknown inputs", "f": "faults"}
     groups |= {"w": "disturbances", "rho": "scheduling signals"}
@@ -96,14 +105,47 @@ def _same_signals(model: Plant, own: Plant) -> None:
             )
 
 
-def _sample_time(own: Plant) -> float:
+def sample_time(own: Plant) -> float:
+    """Return the observer's sample time in seconds."""
     if own.Ts is None:
         raise SimulationError("the observer's model is continuous: its step has no sample time.")
     return float(own.Ts)
 
 
+def substeps_of(substeps: int) -> int:
+    """Return the number of Runge-Kutta steps per sample, or refuse it."""
+    if isinstance(substeps, bool) or int(substeps) != substeps or substeps < 1:
+        raise SimulationError(
+            f"substeps={substeps!r} is not a positive whole number.", substeps=substeps
+        )
+    return int(substeps)
+
+
+def continuous_plant(model: Plant, why: str) -> Plant:
+    """Return the differential equation that a model is or comes from."""
+    source = model if model.Ts is None else model.continuous
+    if source is None:
+        raise SimulationError(
+            f"{why} needs a continuous plant, but {model.name!r} was declared in discrete time: "
+            "leave it out, or give the plant that was discretised.",
+            model=model.name,
+        )
+    return source
+
+
+def parameters(model: Plant) -> Array:
+    """Return the constant parameters of the truth: nominal, else mid-range."""
+    return np.array([_nominal(signal) for signal in model.p], dtype=np.float64)
+
+
+def parameter_text(model: Plant, p: Array) -> str:
+    """Say which parameters the truth has, to be put behind its description."""
+    if not p.size:
+        return ""
+    return "; " + ", ".join(f"{s.name} = {v:g}" for s, v in zip(model.p, p, strict=True))
+
+
 def _nominal(signal: Any) -> float:
-    """Return the value of a constant parameter in the truth: nominal, else mid-range."""
     if signal.nominal is not None:
         return float(signal.nominal)
     return 0.5 * (float(signal.lower) + float(signal.upper))
@@ -151,11 +193,22 @@ def dense(function: ca.Function) -> ca.Function:
 
 
 class Call:
-    """A CasADi function behind fixed NumPy buffers: about a microsecond a call."""
+    """A CasADi function behind fixed NumPy buffers: about a microsecond a call.
 
-    def __init__(self, function: ca.Function) -> None:
-        self.args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        self.results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+    Buffers that are given may serve several functions, but not as argument and result of one.
+    """
+
+    def __init__(
+        self,
+        function: ca.Function,
+        args: list[Array] | None = None,
+        results: list[Array] | None = None,
+    ) -> None:
+        if args is None:
+            args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        if results is None:
+            results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        self.args, self.results = args, results
         # CasADi's own stubs describe neither call as its Python layer takes it.
         buffer, self.evaluate = typing.cast(Any, function).buffer()
         for i, argument in enumerate(self.args):

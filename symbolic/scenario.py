@@ -17,6 +17,14 @@ __all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 
+_FIELDS = {
+    "u": "inputs",
+    "d": "unknown_inputs",
+    "f": "faults",
+    "w": "disturbances",
+    "rho": "scheduling",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
@@ -34,20 +42,27 @@ class Scenario:
         What the observer believes at the start.
     inputs : array (N+1, n_u) or callable
         Samples, or a function of k, or a feedback (k, y) for a plant without feed-through.
-    faults : array (N+1, n_f), optional
+    faults : array (N+1, n_f) or callable k -> array, optional
         None: no fault.
-    unknown_inputs : array (N+1, n_d), optional
+    unknown_inputs : array (N+1, n_d) or callable k -> array, optional
         None: zero.
-    scheduling : array (N+1, n_rho), optional
+    scheduling : array (N+1, n_rho) or callable k -> array, optional
         None: nominal value, or the middle of the range.
-    disturbances : array (N+1, n_w) or callable (rng, k) -> array, optional
-        None: uniform in the declared box.
+    disturbances : array (N+1, n_w) or callable, optional
+        A function of k, or a sampler (rng, k) that is called once for each sample. None:
+        uniform in the declared box.
     x_range : array (n, 2), optional
         Box of the initial state that a design may assume.
     f_range : array (n_f, 2), optional
         Box of the initial fault that a design may assume.
     feedback : bool
         True when ``inputs`` is a function of (k, y); set by itself where it needs both.
+
+    Notes
+    -----
+    An array holds its values from one sample to the next. A function of k is a function of
+    time in samples, k = t / Ts: where plant and observer are integrated together it is read
+    between the samples too, with a real k; everywhere else with the whole numbers 0..N.
 
     Raises
     ------
@@ -65,10 +80,10 @@ class Scenario:
     x0: Array
     guess: Array
     inputs: Array | Callable[..., ArrayLike]
-    faults: Array | None = None
-    unknown_inputs: Array | None = None
-    scheduling: Array | None = None
-    disturbances: Array | Callable[[np.random.Generator, int], ArrayLike] | None = None
+    faults: Array | Callable[[float], ArrayLike] | None = None
+    unknown_inputs: Array | Callable[[float], ArrayLike] | None = None
+    scheduling: Array | Callable[[float], ArrayLike] | None = None
+    disturbances: Array | Callable[..., ArrayLike] | None = None
     x_range: Array | None = None
     f_range: Array | None = None
     feedback: bool = False
@@ -93,6 +108,30 @@ class Scenario:
                 if np.any(box[:, 0] > box[:, 1]):
                     raise PlantError(f"scenario {self.name!r}: {field} has lower above upper")
                 object.__setattr__(self, field, box)
+
+    @property
+    def functions(self) -> dict[str, Callable[[float], ArrayLike]]:
+        """The signals that are given as functions of k, by the keys of :meth:`arrays`.
+
+        Neither a feedback nor a sampler of disturbances is among them.
+
+        Examples
+        --------
+        >>> sine = Scenario("sine", 3, x0=[1], guess=[0], inputs=lambda k: [np.sin(k)])
+        >>> list(sine.functions)
+        ['u']
+        """
+        given: dict[str, Any] = {key: getattr(self, field) for key, field in _FIELDS.items()}
+        if self.feedback:
+            del given["u"]
+        if callable(self.disturbances) and self._sampled:
+            del given["w"]
+        return {key: value for key, value in given.items() if callable(value)}
+
+    @property
+    def _sampled(self) -> bool:
+        """Whether the disturbances are a sampler (rng, k)."""
+        return callable(self.disturbances) and _needed(self.disturbances, unknown=2) != 1
 
     def arrays(self, model: "Plant", seed: int | None = 0) -> dict[str, Array | None]:
         """Return the samples of u, d, f, w and rho for a plant.
@@ -131,20 +170,16 @@ class Scenario:
                 f"scenario {self.name!r}: f_range has {len(self.f_range)} rows, plant "
                 f"{model.name!r} {len(model.f)} faults"
             )
-        samples = self.steps + 1
         u = None
         if not self.feedback:
-            values = self.inputs
-            if callable(values):
-                values = self._called("inputs", [values(k) for k in range(samples)])
-            u = self._fit("inputs", values, model.names("u"))
+            u = self._fit("inputs", self._samples("inputs"), model.names("u"))
         middle = [_middle(s.lower, s.upper, s.nominal) for s in model.rho]
         return {
             "u": u,
-            "d": self._fit("unknown_inputs", self.unknown_inputs, model.names("d")),
-            "f": self._fit("faults", self.faults, model.names("f")),
+            "d": self._fit("unknown_inputs", self._samples("unknown_inputs"), model.names("d")),
+            "f": self._fit("faults", self._samples("faults"), model.names("f")),
             "w": self._disturbances(model, seed),
-            "rho": self._fit("scheduling", self.scheduling, model.names("rho"), middle),
+            "rho": self._fit("scheduling", self._samples("scheduling"), model.names("rho"), middle),
         }
 
     def _disturbances(self, model: "Plant", seed: int | None) -> Array:
@@ -159,9 +194,18 @@ class Scenario:
                 )
             return rng.uniform(box[:, 0], box[:, 1], (samples, len(box)))
         values = self.disturbances
-        if callable(values):
+        if callable(values) and self._sampled:
             values = self._called("disturbances", [values(rng, k) for k in range(samples)])
+        else:
+            values = self._samples("disturbances")
         return self._fit("disturbances", values, model.names("w"))
+
+    def _samples(self, field: str) -> Any:
+        """Return a field with a function of k replaced by its values at 0..N."""
+        value = getattr(self, field)
+        if not callable(value):
+            return value
+        return self._called(field, [value(k) for k in range(self.steps + 1)])
 
     def _called(self, field: str, rows: list[ArrayLike]) -> Array:
         """Return what a function gave, one row per sample."""
@@ -206,12 +250,12 @@ class Scenario:
         return array
 
 
-def _needed(function: Callable[..., Any]) -> int:
+def _needed(function: Callable[..., Any], unknown: int = 1) -> int:
     """Return how many arguments a function cannot do without."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except ValueError:
-        return 1
+        return unknown
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(p.kind in positional and p.default is p.empty for p in parameters)
 

@@ -94,6 +94,30 @@ def test_functions_of_the_step():
     np.testing.assert_array_equal(arrays["w"], [[0, 0], [1, 1], [2, 2]])
 
 
+def test_every_signal_may_be_a_function_of_the_step():
+    given = small(
+        inputs=lambda k: k,
+        faults=lambda k: [2 * k],
+        unknown_inputs=lambda k: [[3 * k]],
+        scheduling=lambda k: [k, k + 1],
+        disturbances=lambda k: (k, -k),
+    )
+    arrays = given.arrays(plant(bound=None))
+    np.testing.assert_array_equal(arrays["f"].ravel(), [0, 2, 4])
+    np.testing.assert_array_equal(arrays["d"].ravel(), [0, 3, 6])
+    np.testing.assert_array_equal(arrays["rho"], [[0, 1], [1, 2], [2, 3]])
+    np.testing.assert_array_equal(arrays["w"], [[0, 0], [1, -1], [2, -2]])
+    assert sorted(given.functions) == ["d", "f", "rho", "u", "w"]
+    assert given.functions["rho"](0.5) == [0.5, 1.5]
+
+
+def test_neither_a_feedback_nor_a_sampler_is_a_function_of_the_step():
+    given = small(inputs=lambda k, y: -y, disturbances=lambda rng, k: rng.normal(size=2))
+    assert given.functions == {}
+    assert small(disturbances=np.zeros((3, 2))).functions == {}
+    assert list(small(disturbances=lambda k: [k, k]).functions) == ["w"]
+
+
 def test_feedback_has_no_samples():
     given = small(inputs=lambda k, y: -y)
     assert given.feedback
@@ -141,6 +165,7 @@ MISFITS = {
     "states": ({"x0": [1, 2], "guess": [0, 0]}, "2 initial states"),
     "inputs": ({"inputs": np.ones((3, 2))}, r"inputs has shape \(3, 2\)"),
     "faults": ({"faults": np.ones((3, 2))}, r"faults has shape"),
+    "function of faults": ({"faults": lambda k: [k, k]}, r"faults has shape"),
     "function": ({"inputs": lambda k: [k, k]}, r"inputs has shape"),
     "non-finite function": ({"inputs": lambda k: 1 / max(k, 1) if k else np.nan}, "non-finite"),
     "f_range": ({"f_range": np.zeros((2, 2))}, "f_range"),

@@ -1,0 +1,358 @@
+"""Plant and continuous-time observer as one differential equation."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.evaluate.calls import (
+    first_memory,
+    refuse_algebraic_loop,
+    scheduling_columns,
+    step_function,
+)
+from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.fields import (
+    WORDS,
+    broken_assumptions,
+    finite,
+    function_values,
+    scenario_fields,
+    vector,
+)
+from obsynth.evaluate.interface import StepObserver
+from obsynth.evaluate.run import Run
+from obsynth.evaluate.truth import (
+    Call,
+    continuous_plant,
+    dense,
+    parameter_text,
+    parameters,
+    same_signals,
+    sample_time,
+    substeps_of,
+)
+from obsynth.symbolic import Plant, Scenario
+
+__all__ = ["joint"]
+
+Array = NDArray[np.float64]
+
+# Runge-Kutta steps evaluated in one call; bounds what the signals' values take of memory.
+_CHUNK = 8192
+
+
+def joint(
+    model: Plant, observer: StepObserver, scenario: Scenario, seed: int, substeps: int | None
+) -> Run:
+    """Integrate plant and observer together; see :func:`obsynth.simulate`.
+
+    Every signal but the states enters a Runge-Kutta step by three values: at its
+    beginning, in its middle and at its end. A feedback (k, y) reads the output
+    of each stage.
+    """
+    system = _System(model, observer, 1 if substeps is None else substeps_of(substeps))
+    fields = scenario_fields(model, scenario, seed)
+    march = _with_feedback if scenario.feedback else _with_signals
+    z = march(system, observer, scenario, fields)
+    n = len(model.x)
+    x, memory = np.ascontiguousarray(z[:, :n]), np.ascontiguousarray(z[:, n:])
+    y = np.concatenate([_mapped(system.output, part)[0] for part in _parts(z, _samples(fields))])
+    finite(x, model.names("x"))
+    finite(y, tuple(model.output_names))
+    broken = broken_assumptions(observer.model, scenario, fields)
+    return Run.collect(
+        model=model,
+        observer=observer,
+        scenario=scenario.name,
+        seed=int(seed),
+        truth=system.describe(scenario),
+        outside=(*system.outside, *broken),
+        t=np.arange(scenario.steps + 1, dtype=np.float64) * np.float64(system.Ts),
+        truths={"x": x, "y": y, **fields},
+        claims=_claims(step_function(observer, model), model, memory, y, fields),
+    )
+
+
+class _System:
+    """z' = rates(z, v) and y = output(z, v) with z = (x, memory) and v = (u, d, f, w, rho)."""
+
+    def __init__(self, model: Plant, observer: StepObserver, substeps: int) -> None:
+        ode = getattr(observer, "ode", None)
+        if ode is None:
+            raise SimulationError(
+                "engine='joint' integrates plant and observer as one differential equation and "
+                f"needs a continuous-time method; {observer.method} is a discrete-time observer: "
+                "use engine='step', with substeps= for a continuous truth.",
+                engine="joint",
+            )
+        own = observer.model
+        same_signals(model, own)
+        self.plant = continuous_plant(model, "engine='joint'")
+        designed = continuous_plant(own, "engine='joint'")
+        self.outside: tuple[str, ...] = ()
+        if self.plant is not designed and self.plant.to_dict() != designed.to_dict():
+            self.outside = ("the truth is not the plant for which the observer was designed",)
+        self.model, self.substeps = model, substeps
+        self.Ts = sample_time(own)
+        self.h = self.Ts / substeps
+        self.p = parameters(self.plant)
+        self._join(ode)
+
+    def _join(self, ode: ca.Function) -> None:
+        columns = scheduling_columns(ode, self.model, "ode")
+        sizes = [len(self.model.names(key)) for key in WORDS]
+        n, n_memory = len(self.model.x), int(ode.numel_in(0))
+        z, v = ca.MX.sym("z", n + n_memory), ca.MX.sym("v", sum(sizes))
+        u, d, f, w, rho = ca.vertsplit(v, [0, *np.cumsum(sizes).tolist()])
+        call: Any = self.plant.function()
+        dx, y = call(z[:n], u, d, f, w, self.p, rho)
+        measured = [z[n:], u, y] + ([rho[columns]] if ode.n_in() == 4 else [])
+        derivative: Any = ode(*measured)
+        if int(derivative.numel()) != n_memory:
+            raise SimulationError(
+                f"the observer's ode takes {n_memory} numbers as memory and returns "
+                f"{derivative.numel()}.",
+                field="memory",
+            )
+        self.n_x, self.n_memory, self.n_v = n, n_memory, sum(sizes)
+        self.rates = _scalar(ca.Function("rates", [z, v], [ca.vertcat(dx, derivative)]))
+        self.output = _scalar(ca.Function("output", [z, v], [y]))
+
+    def start(self, observer: StepObserver, scenario: Scenario, v: Array) -> Array:
+        """Return z at k = 0: the scenario's x0 and the memory for the first measurement."""
+        x0 = vector(scenario.x0, self.model.names("x"), "x0")
+        z0 = np.concatenate([x0, np.zeros(self.n_memory)])
+        y0 = _mapped(self.output, [z0[None], v[None]])[0][0]
+        return np.concatenate([x0, first_memory(observer, scenario, y0, self.n_memory)])
+
+    def describe(self, scenario: Scenario) -> str:
+        """Say what was integrated how."""
+        at_stages = [WORDS[key] for key in scenario.functions]
+        at_stages += ["inputs (feedback)"] if scenario.feedback else []
+        how = (
+            f"{', '.join(at_stages)} at the stages, all else held" if at_stages else "signals held"
+        )
+        return (
+            "continuous plant and the observer's differential equation together, Runge-Kutta "
+            f"steps of {self.h:g} s ({self.substeps} per sample), {how}"
+            f"{parameter_text(self.plant, self.p)}"
+        )
+
+
+def _scalar(function: ca.Function) -> ca.Function:
+    """Return the function as scalar operations where it can be written so; they are faster."""
+    try:
+        return dense(function.expand())
+    except RuntimeError:
+        return dense(function)
+
+
+def _parts(*arrays: Array) -> Iterator[list[Array]]:
+    """Yield the rows of several arrays in chunks."""
+    for k in range(0, len(arrays[0]), _CHUNK):
+        yield [array[k : k + _CHUNK] for array in arrays]
+
+
+def _mapped(function: ca.Function, arguments: list[Array]) -> list[Array]:
+    """Evaluate a function of columns for every row of its arguments."""
+    rows = len(arguments[0])
+    call = Call(dense(function).map(rows))
+    for buffer, argument in zip(call.args, arguments, strict=True):
+        buffer[:] = argument.ravel()
+    call.evaluate()
+    return [result.reshape(rows, -1) for result in call.results]
+
+
+def _claims(
+    step: ca.Function, model: Plant, memory: Array, y: Array, fields: dict[str, Array]
+) -> dict[str, Array]:
+    """Read from the observer's step what it says for the integrated memories."""
+    arguments = [memory, fields["u"], y]
+    if len(step.name_in()) == 4:
+        arguments.append(fields["rho"][:, scheduling_columns(step, model, "step")])
+    if step.numel_in(0) != memory.shape[1]:
+        raise SimulationError(
+            f"the observer's ode has {memory.shape[1]} numbers as memory, its step "
+            f"{step.numel_in(0)}.",
+            field="memory",
+        )
+    results = [_mapped(step, part)[1:] for part in _parts(*arguments)]
+    columns = [np.concatenate(pieces) for pieces in zip(*results, strict=True)]
+    return dict(zip(STEP_OUTPUTS[1:], columns, strict=True))
+
+
+def _samples(fields: dict[str, Array]) -> Array:
+    """Return all signals at the samples, beside each other; zero where a feedback sets u."""
+    return np.hstack([fields[key] for key in WORDS])
+
+
+def _stages(
+    system: _System, scenario: Scenario, samples: Array
+) -> Iterator[tuple[int, int, tuple[Array, Array, Array]]]:
+    """Yield the signals at beginning, middle and end of every Runge-Kutta step, in chunks.
+
+    Each item is a range of samples and three arrays with one row for each step.
+    """
+    steps, per = scenario.steps, system.substeps
+    ends = np.cumsum([0, *(len(system.model.names(key)) for key in WORDS)])
+    columns = {key: slice(ends[i], ends[i + 1]) for i, key in enumerate(WORDS)}
+    size = max(1, _CHUNK // per)
+    for begin in range(0, steps, size):
+        end = min(steps, begin + size)
+        first, middle, last = (np.repeat(samples[begin:end], per, axis=0) for _ in range(3))
+        points = np.arange(2 * per * begin, 2 * per * end + 1) / (2.0 * per)
+        for key, function in scenario.functions.items():
+            names = system.model.names(key)
+            values = function_values(function, points, names, WORDS[key])
+            first[:, columns[key]] = values[:-1:2]
+            middle[:, columns[key]] = values[1::2]
+            last[:, columns[key]] = values[2::2]
+        yield begin, end, (first, middle, last)
+
+
+def _with_signals(
+    system: _System, observer: StepObserver, scenario: Scenario, fields: dict[str, Array]
+) -> Array:
+    """Integrate with every signal known beforehand; return z at the samples."""
+    samples = _samples(fields)
+    z = np.empty((scenario.steps + 1, system.n_x + system.n_memory))
+    z[0] = system.start(observer, scenario, samples[0])
+    step = _runge_kutta(system)
+    marches: dict[int, Call] = {}
+    for begin, end, stages in _stages(system, scenario, samples):
+        count = len(stages[0])
+        if count not in marches:
+            marches[count] = Call(dense(step if count == 1 else step.mapaccum(count)))
+        march = marches[count]
+        march.args[0][:] = z[begin]
+        for buffer, values in zip(march.args[1:], stages, strict=True):
+            buffer[:] = values.ravel()
+        march.evaluate()
+        z[begin + 1 : end + 1] = march.results[0].reshape(count, -1)[
+            system.substeps - 1 :: system.substeps
+        ]
+    return z
+
+
+def _runge_kutta(system: _System) -> ca.Function:
+    z = ca.MX.sym("z", system.n_x + system.n_memory)
+    first, middle, last = (ca.MX.sym(name, system.n_v) for name in ("first", "middle", "last"))
+    h, rates = system.h, _called(system.rates)
+    k1 = rates(z, first)
+    k2 = rates(z + h / 2 * k1, middle)
+    k3 = rates(z + h / 2 * k2, middle)
+    k4 = rates(z + h * k3, last)
+    following = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return _scalar(ca.Function("step", [z, first, middle, last], [following]))
+
+
+def _called(function: ca.Function) -> Callable[..., Any]:
+    # CasADi's stubs do not know that a call of symbols returns symbols.
+    return function
+
+
+def _with_feedback(
+    system: _System, observer: StepObserver, scenario: Scenario, fields: dict[str, Array]
+) -> Array:
+    """Integrate with inputs that read the output of every stage; return z, and u in the fields."""
+    refuse_algebraic_loop(scenario, system.plant)
+    model = system.model
+    names = model.names("u")
+    n_u = len(names)
+    u = fields["u"] = np.zeros((scenario.steps + 1, n_u))
+    samples = _samples(fields)
+    loop = _Stages(system)
+    law: Any = scenario.inputs
+
+    def control(k: float) -> Array:
+        value = np.asarray(law(k, loop.y.copy()), dtype=float)
+        if value.shape == (n_u,) and np.isfinite(value.sum()):
+            return value
+        return vector(value, names, f"inputs at k = {k:.12g}")
+
+    z = np.empty((scenario.steps + 1, loop.z.size))
+    z[0] = loop.z[:] = system.start(observer, scenario, samples[0])
+    per, v = system.substeps, loop.v
+    for begin, _, (first, middle, last) in _stages(system, scenario, samples):
+        for j in range(len(first)):
+            k, within = begin + j // per, 2 * (j % per)
+            points = [(2 * per * k + within + i) / (2.0 * per) for i in range(3)]
+            v[:] = first[j]
+            loop.measure.evaluate()
+            v[:n_u] = start = control(points[0])
+            if within == 0:
+                u[k] = start
+            loop.next_v[:] = middle[j]
+            loop.first.evaluate()
+            v[:] = middle[j]
+            v[:n_u] = control(points[1])
+            loop.second.evaluate()
+            v[:n_u] = control(points[1])
+            loop.next_v[:] = last[j]
+            loop.third.evaluate()
+            v[:] = last[j]
+            v[:n_u] = control(points[2])
+            loop.last.evaluate()
+            loop.z[:] = loop.next_z
+            if within == 2 * (per - 1):
+                z[k + 1] = loop.z
+    v[:] = samples[-1]
+    loop.measure.evaluate()
+    u[-1] = control(float(scenario.steps))
+    return z
+
+
+class _Stages:
+    """The stages of one Runge-Kutta step on shared buffers; each leaves the next one's output in y.
+
+    As y does not depend on u, the output of the next stage can be taken before u is known.
+    """
+
+    def __init__(self, system: _System) -> None:
+        h, rates, output = system.h, _called(system.rates), _called(system.output)
+        n_z = system.n_x + system.n_memory
+        z, k1, k2, k3 = (ca.MX.sym(name, n_z) for name in ("z", "k1", "k2", "k3"))
+        v, ahead = ca.MX.sym("v", system.n_v), ca.MX.sym("ahead", system.n_v)
+        self.z, self.next_z, *slopes = (np.zeros(n_z) for _ in range(5))
+        self.v, self.next_v = np.zeros(system.n_v), np.zeros(system.n_v)
+        self.y = np.zeros(len(system.model.output_names))
+        now = [self.z, self.v]
+
+        def stage(
+            inputs: list[Any], outputs: list[Any], args: list[Array], results: list[Array]
+        ) -> Call:
+            return Call(_scalar(ca.Function("stage", inputs, outputs)), args, results)
+
+        self.measure = stage([z, v], [output(z, v)], now, [self.y])
+        slope = rates(z, v)
+        self.first = stage(
+            [z, v, ahead],
+            [slope, output(z + h / 2 * slope, ahead)],
+            [*now, self.next_v],
+            [slopes[0], self.y],
+        )
+        slope = rates(z + h / 2 * k1, v)
+        self.second = stage(
+            [z, v, k1, ahead],
+            [slope, output(z + h / 2 * slope, ahead)],
+            [*now, slopes[0], self.next_v],
+            [slopes[1], self.y],
+        )
+        slope = rates(z + h / 2 * k2, v)
+        self.third = stage(
+            [z, v, k2, ahead],
+            [slope, output(z + h * slope, ahead)],
+            [*now, slopes[1], self.next_v],
+            [slopes[2], self.y],
+        )
+        slope = rates(z + h * k3, v)
+        self.last = stage(
+            [z, v, k1, k2, k3],
+            [z + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope)],
+            [*now, *slopes],
+            [self.next_z],
+        )
