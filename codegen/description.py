@@ -62,6 +62,10 @@ class Description:
     fields : tuple of Field
         The memory in order.
     x, u, y, f : tuple of Port
+    theta : tuple of Port
+        The measured scheduling signals; empty where the step does not read them.
+    scheduling : tuple of int
+        Their places among all scheduling signals of the plant.
     start : ndarray of shape (n_memory,)
         The initialised memory that ``NAME_init_default`` sets.
     model_hash : str
@@ -76,16 +80,20 @@ class Description:
     u: tuple[Port, ...]
     y: tuple[Port, ...]
     f: tuple[Port, ...]
+    theta: tuple[Port, ...]
+    scheduling: tuple[int, ...]
     start: FloatArray
     model_hash: str
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Lengths of the vectors."""
+        """Lengths of the vectors; that of theta where the observer is scheduled."""
+        theta = {"theta": len(self.theta)} if self.theta else {}
         return {
             "memory": int(self.start.size),
             "u": len(self.u),
             "y": len(self.y),
+            **theta,
             "x": len(self.x),
             "f": len(self.f),
         }
@@ -128,9 +136,10 @@ def describe(
     chosen = project_name(name, model.name)
     fields = _fields(observer.memory_layout)
     n_memory = fields[-1].start + fields[-1].size
-    _check_step(observer.step, model, n_memory)
+    scheduling = _scheduling(observer.step, model)
+    _check_step(observer.step, model, n_memory, len(scheduling))
     start = _start(observer, memory, n_memory)
-    _check_not_initialised(observer, n_memory)
+    _check_not_initialised(observer)
     return Description(
         name=chosen,
         observer=observer,
@@ -140,6 +149,8 @@ def describe(
         u=_ports(model, "u"),
         y=_measurements(model),
         f=_ports(model, "f"),
+        theta=tuple(_ports(model, "rho")[i] for i in scheduling) if scheduling else (),
+        scheduling=scheduling,
         start=start,
         model_hash=_hash(model.to_dict()),
     )
@@ -165,25 +176,41 @@ def _fields(layout: Mapping[str, slice]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _check_step(step: ca.Function, model: PlantLike, n_memory: int) -> None:
-    n, n_f = len(model.x), len(model.f)
-    inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
-    if "theta" in inputs:
+def _scheduling(step: ca.Function, model: PlantLike) -> tuple[int, ...]:
+    """Return the places of the scheduling signals that a step reads as theta."""
+    if step.n_in() < len(STEP_INPUTS):
+        return ()
+    last = step.name_in()[-1]
+    if last != "theta":
         raise CodegenError(
-            "the step has a scheduling input theta; projects for scheduled observers are not"
-            f" available yet, the inputs available are {', '.join(STEP_INPUTS)}",
+            f"the last input of the step is called {last!r}; a fourth input has to be theta, the"
+            " measured scheduling signals",
+            symbol=last,
+        )
+    measured = tuple(i for i, signal in enumerate(model.rho) if signal.measured)
+    if not measured:
+        raise CodegenError(
+            f"the step reads theta, but {model.name!r} declares no measured scheduling signal:"
+            " declare them by plant.scheduling(...)",
             symbol="theta",
         )
-    expected_in = (n_memory, len(model.u), len(model.output_names))
+    return measured
+
+
+def _check_step(step: ca.Function, model: PlantLike, n_memory: int, n_theta: int) -> None:
+    n, n_f = len(model.x), len(model.f)
+    inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
+    names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
+    expected_in = (n_memory, len(model.u), len(model.output_names)) + (n_theta,) * bool(n_theta)
     expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1)
     found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
     found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
-    if len(inputs) != len(STEP_INPUTS) or len(outputs) != len(STEP_OUTPUTS):
+    if len(inputs) != len(names) or len(outputs) != len(STEP_OUTPUTS):
         raise CodegenError(
-            f"the step maps {inputs} to {outputs}; it has to map {STEP_INPUTS} to {STEP_OUTPUTS}"
+            f"the step maps {inputs} to {outputs}; it has to map {names} to {STEP_OUTPUTS}"
         )
     for name, found, expected in zip(
-        (*STEP_INPUTS, *(f"the returned {name}" for name in STEP_OUTPUTS)),
+        (*names, *(f"the returned {name}" for name in STEP_OUTPUTS)),
         (*found_in, *found_out),
         (*expected_in, *expected_out),
         strict=True,
@@ -208,9 +235,9 @@ def midpoints(box: FloatArray) -> FloatArray:
     return result
 
 
-def nominal_values(model: PlantLike, kind: Literal["x", "u"]) -> FloatArray:
+def nominal_values(model: PlantLike, kind: Literal["x", "u", "rho"]) -> FloatArray:
     """Return the nominal values; the middle of the range where none is declared."""
-    signals = model.x if kind == "x" else model.u
+    signals = {"x": model.x, "u": model.u}[kind] if kind != "rho" else model.rho
     values = midpoints(model.box(kind))
     for i, signal in enumerate(signals):
         if signal.nominal is not None:
@@ -230,10 +257,9 @@ def _start(observer: ObserverLike, memory: FloatArray | None, n_memory: int) -> 
     return start
 
 
-def _check_not_initialised(observer: ObserverLike, n_memory: int) -> None:
+def _check_not_initialised(observer: ObserverLike) -> None:
     """Make sure that a state nobody has initialised is told apart by the step itself."""
-    model = observer.model
-    zeros = [np.zeros(size) for size in (n_memory, len(model.u), len(model.output_names))]
+    zeros = [np.zeros(observer.step.numel_in(i)) for i in range(observer.step.n_in())]
     status = float(Machine(observer.step)(*zeros)[-1][0])
     if not (status.is_integer() and int(status) & 1):
         raise CodegenError(

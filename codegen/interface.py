@@ -9,7 +9,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FloatArray", "GuaranteeLike", "ObserverLike", "PlantLike", "SignalLike"]
+__all__ = [
+    "FloatArray",
+    "GuaranteeLike",
+    "ObserverLike",
+    "PlantLike",
+    "SchedulingLike",
+    "SignalLike",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +37,15 @@ class SignalLike(Protocol):
     @property
     def nominal(self) -> Any:
         """Value in normal operation, or None."""
+        ...
+
+
+class SchedulingLike(SignalLike, Protocol):
+    """One scheduling signal of the plant."""
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is known at run time."""
         ...
 
 
@@ -59,6 +75,11 @@ class PlantLike(Protocol):
     @property
     def f(self) -> Sequence[SignalLike]:
         """Faults."""
+        ...
+
+    @property
+    def rho(self) -> Sequence[SchedulingLike]:
+        """Scheduling signals; read only for a step with the input theta."""
         ...
 
     @property

@@ -13,8 +13,8 @@ from obsynth.designs.observer import STEP_OUTPUTS
 
 __all__ = ["STEP_INPUTS", "Kernel", "generate_kernel"]
 
-STEP_INPUTS = ("memory", "u", "y")
-"""Inputs of a step, in their order."""
+STEP_INPUTS = ("memory", "u", "y", "theta")
+"""Inputs of a step, in their order; the last one of scheduled observers only."""
 
 _RESULTS = ("next", *STEP_OUTPUTS[1:])
 
@@ -50,7 +50,7 @@ class Kernel:
     functions : str
         Static functions; the last one is ``NAME_kernel``.
     arguments : tuple of str
-        Its arguments: those of ``memory, u, y, next, xhat, ...`` that it reads or writes.
+        Its arguments: those of ``memory, u, y, theta, next, xhat, ...`` that it reads or writes.
     library : tuple of str
         What it calls from ``math.h``, sorted.
     inexact : tuple of str
@@ -124,7 +124,8 @@ def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
     Parameters
     ----------
     step : casadi.Function
-        ``(memory, u, y) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper, status)``.
+        ``(memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
+        status)``.
     prefix : str
         Name of the project; every name at file scope starts with it.
 
@@ -221,7 +222,7 @@ def _enclose(function: ca.Function, prefix: str, body: str) -> tuple[str, tuple[
     real = f"{prefix}_real_t"
     words = set(_WORD.findall(body))
     arguments, parameters = [], []
-    for i, name in enumerate(STEP_INPUTS):
+    for i, name in enumerate(STEP_INPUTS[: function.n_in()]):
         if name in words:
             arguments.append(name)
             parameters.append(f"const {real} {name}[{function.numel_in(i)}]")

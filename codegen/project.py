@@ -46,7 +46,7 @@ class CProject:
     files : tuple of str
         Paths relative to the folder, sorted.
     sizes : mapping of str to int
-        Lengths of memory, u, y, x, f.
+        Lengths of memory, u, y, theta (scheduled observers), x, f.
     operations : int
         Instructions of the step.
     vectors : int
@@ -223,6 +223,7 @@ def _manifest(
     files: Mapping[str, str],
 ) -> str:
     observer = description.observer
+    kinds = ("u", "y", "theta", "x", "f") if description.theta else ("u", "y", "x", "f")
     data = {
         "kind": KIND,
         "format": _FORMAT,
@@ -238,7 +239,7 @@ def _manifest(
         "memory": {
             field.name: [field.start, field.start + field.size] for field in description.fields
         },
-        "signals": {kind: _signals(getattr(description, kind)) for kind in ("u", "y", "x", "f")},
+        "signals": {kind: _signals(getattr(description, kind)) for kind in kinds},
         "guarantee": {
             "claims": list(observer.guarantee.claims),
             "assumptions": list(observer.guarantee.assumptions),

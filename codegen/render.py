@@ -33,6 +33,7 @@ _ARGUMENTS = {
     "memory": "memory",
     "u": "in->u",
     "y": "in->y",
+    "theta": "in->theta",
     "next": "next",
     "status": "status",
 }
@@ -45,16 +46,19 @@ def generator_name() -> str:
     return f"obsynth {version('obsynth')}"
 
 
-def _example(description: Description) -> list[tuple[str, str]]:
-    """Return inputs and measurements of a plant that starts in its nominal state."""
+def _example(description: Description) -> list[tuple[str, str, str]]:
+    """Return u, y and theta of a plant that starts in its nominal state."""
     model = description.observer.model
     plant = Machine(model.function())
     x, u = nominal_values(model, "x"), nominal_values(model, "u")
     d, w, p, rho = (midpoints(model.box(kind)) for kind in ("d", "w", "p", "rho"))
+    if description.scheduling:
+        rho = nominal_values(model, "rho")
+    theta = rho[list(description.scheduling)]
     rows = []
     for _ in range(_EXAMPLE_STEPS):
         following, y = plant(x, u, d, np.zeros(len(model.f)), w, p, rho)
-        rows.append((_row(u), _row(y)))
+        rows.append((_row(u), _row(y), _row(theta)))
         x = following
     return rows
 
@@ -123,7 +127,8 @@ def _values(
     description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
 ) -> Mapping[str, Any]:
     observer, sizes = description.observer, description.sizes
-    signals = {"u": description.u, "y": description.y, "x": description.x, "f": description.f}
+    signals = {"u": description.u, "y": description.y, "theta": description.theta}
+    signals |= {"x": description.x, "f": description.f}
     outputs = [("xhat", sizes["x"]), ("fhat", sizes["f"])]
     outputs += [(f"{kind}_{end}", sizes[kind]) for kind in "xf" for end in ("lower", "upper")]
     start = nominal_values(observer.model, "x")
@@ -153,7 +158,8 @@ def _values(
         "call": ",\n        ".join(
             _ARGUMENTS.get(name, f"result.{name}") for name in kernel.arguments
         ),
-        "reads_in": bool({"u", "y"} & set(kernel.arguments)),
+        "reads_in": bool({"u", "y", "theta"} & set(kernel.arguments)),
+        "inputs": [kind for kind in ("u", "y", "theta") if signals[kind]],
         "library": kernel.library,
         "inexact": kernel.inexact,
         "outputs": [(name, length) for name, length in outputs if length],

@@ -22,7 +22,7 @@ def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
 
 
 class Drive:
-    """Inputs and measurements along random trajectories of the plant.
+    """Inputs, measurements and scheduling along random trajectories of the plant.
 
     Parameters
     ----------
@@ -49,6 +49,7 @@ class Drive:
         self._sequence = 0
         self._x = self._nominal
         self._levels = {kind: self._draw(kind) for kind in _KINDS}
+        self._scheduling = list(description.scheduling)
         self._u = np.empty((0, len(model.u)))
         self._ramp = np.empty((0, len(model.f)))
         self._measured = self._measure(self._x)
@@ -84,9 +85,10 @@ class Drive:
             return None
         return np.array(self._observer.memory0(self._x), dtype=float)
 
-    def sample(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Return (u_k, y_k) of the trajectory and move the plant on."""
-        for kind in ("d", "w", "rho"):
+    def sample(self, k: int) -> list[FloatArray]:
+        """Return u_k, y_k and, for scheduled observers, theta_k; move the plant on."""
+        # Measured scheduling moves slower than a sample, as do the inputs.
+        for kind in ("d", "w") if self._scheduling and k % _HOLD else ("d", "w", "rho"):
             self._levels[kind] = self._draw(kind)
         self._levels["u"] = self._u[k]
         self._levels["f"] = self._ramp[k]
@@ -94,13 +96,18 @@ class Drive:
         following = np.clip(self._following, self._x_box[:, 0], self._x_box[:, 1])
         self._x = following if np.isfinite(following).all() else self._nominal
         if np.isfinite(y).all():
-            self._measured = y
-        return self._u[k].copy(), y
+            self._measured = y.copy()
+        return [self._u[k].copy(), y, *self._theta(self._levels["rho"])]
 
-    def wide(self) -> tuple[FloatArray, FloatArray]:
+    def wide(self) -> list[FloatArray]:
         """Return inputs and measurements spread around those seen last, over many magnitudes."""
-        u, y = self._draw("u"), self._measured
-        return _spread(self.rng, u), _spread(self.rng, y)
+        values = [self._draw("u"), self._measured]
+        if self._scheduling:
+            values += self._theta(self._draw("rho"))
+        return [_spread(self.rng, value) for value in values]
+
+    def _theta(self, rho: FloatArray) -> list[FloatArray]:
+        return [rho[self._scheduling]] if self._scheduling else []
 
 
 def _spread(rng: np.random.Generator, values: FloatArray) -> FloatArray:

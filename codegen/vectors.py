@@ -122,9 +122,9 @@ class _Recorder:
         self.lines.append(f"{letter} {bits(memory)}")
         self.values += memory.size
 
-    def step(self, u: FloatArray, y: FloatArray) -> None:
-        """Record one step and carry the memory along."""
-        arrays = self._step(self.memory, u, y)
+    def step(self, inputs: list[FloatArray]) -> None:
+        """Record one step with u, y and theta where there is one; carry the memory along."""
+        arrays = self._step(self.memory, *inputs)
         status = float(arrays[-1][0])
         if not (status.is_integer() and 0 <= status <= _ALL_BITS):
             raise CodegenError(
@@ -132,13 +132,13 @@ class _Recorder:
                 f" {', '.join(map(str, STATUS.values()))}",
                 status=status,
                 memory=self.memory,
-                u=u,
-                y=y,
+                u=inputs[0],
+                y=inputs[1],
             )
         self.memory = arrays[STEP_OUTPUTS.index("memory")]
         self.statuses[int(status)] += 1
         self.values += sum(array.size for array in arrays)
-        numbers = np.concatenate([u, y, *arrays[:-1]])
+        numbers = np.concatenate([*inputs, *arrays[:-1]])
         self.lines.append(f"S {int(status)} {bits(numbers)}")
 
 
@@ -180,22 +180,21 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
     scale = _scale(visited)
     for i in range(kinds["random"]):
         recorder.load(random_memory(rng, visited[i % len(visited)], scale))
-        recorder.step(*drive.wide())
+        recorder.step(drive.wide())
     for i in range(kinds["extreme"]):
         memory = visited[i % len(visited)].copy()
-        u, y = drive.wide()
+        inputs = drive.wide()
         if i % 2:
             memory = random_memory(rng, memory, scale)
-        # Extremes in the memory would hide those in u and y: a step must cope with either.
-        _spoil(rng, [memory] if i % 3 == 0 else [u, y])
+        # Extremes in the memory would hide those in the inputs: a step must cope with either.
+        _spoil(rng, [memory] if i % 3 == 0 else inputs)
         recorder.load(memory)
-        recorder.step(u, y)
+        recorder.step(inputs)
     for length in _lengths(kinds["not initialised"], 4):
         recorder.forget()
         for _ in range(length):
-            recorder.step(*drive.wide())
-    sizes = description.sizes
-    head = [description.name, *(str(sizes[key]) for key in ("memory", "u", "y", "x", "f"))]
+            recorder.step(drive.wide())
+    head = [description.name, *(str(size) for size in description.sizes.values())]
     lines = [" ".join(("obsynth-vectors", "1", *head, str(count))), *recorder.lines]
     return Vectors(
         text="\n".join(lines) + "\n",
@@ -224,11 +223,11 @@ def _follow(recorder: _Recorder, drive: Drive, length: int, failing: bool) -> No
     else:
         recorder.load(guess)
     for k in range(length):
-        u, y = drive.sample(k)
+        inputs = drive.sample(k)
         # Whole stretches fail, so that what follows a failure is tested too.
         if failing and k % 25 in (7, 8, 9, 20):
-            _spoil(drive.rng, [u, y])
-        recorder.step(u, y)
+            _spoil(drive.rng, inputs)
+        recorder.step(inputs)
 
 
 def _spoil(rng: np.random.Generator, arrays: list[FloatArray]) -> None:

@@ -72,13 +72,6 @@ def test_a_step_of_other_sizes(
     refused(toy, tmp_path / "p", word)
 
 
-def test_a_scheduled_step(toy: Any, tmp_path: Path) -> None:
-    names = ("memory", "u", "y", "theta")
-    ports = [ca.SX.sym(name) for name in names]
-    toy.step = ca.Function("step", ports, [ports[0]] * 8, list(names), [f"o{i}" for i in range(8)])
-    refused(toy, tmp_path / "p", "theta")
-
-
 def test_a_step_with_other_outputs(toy: Any, tmp_path: Path) -> None:
     x = ca.SX.sym("x")
     toy.step = ca.Function("step", [x], [x])
