@@ -3,6 +3,7 @@
 from obsynth.designs.bounded_error import BoundedErrorUIO
 from obsynth.designs.certificate import Certificate, Claim, Guarantee
 from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.hinf import HinfUIO
 from obsynth.designs.observer import STATUS, Observer
 from obsynth.designs.storage import load, save
 
@@ -13,6 +14,7 @@ __all__ = [
     "CertificateError",
     "Claim",
     "Guarantee",
+    "HinfUIO",
     "InfeasibleDesign",
     "Observer",
     "SolverTrouble",

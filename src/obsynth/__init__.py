@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from obsynth.designs import BoundedErrorUIO as BoundedErrorUIO
     from obsynth.designs import Certificate as Certificate
     from obsynth.designs import CertificateError as CertificateError
+    from obsynth.designs import HinfUIO as HinfUIO
     from obsynth.designs import InfeasibleDesign as InfeasibleDesign
     from obsynth.designs import Observer as Observer
     from obsynth.designs import load as load
@@ -57,6 +58,7 @@ __all__ = [
     "Certificate",
     "CertificateError",
     "Equilibrium",
+    "HinfUIO",
     "InfeasibleDesign",
     "JacobianBounds",
     "Observer",
@@ -119,6 +121,7 @@ _ROOMS = {
         "BoundedErrorUIO",
         "Certificate",
         "CertificateError",
+        "HinfUIO",
         "InfeasibleDesign",
         "Observer",
         "load",

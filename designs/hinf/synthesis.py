@@ -1,0 +1,321 @@
+"""Gains and attenuation levels by linear matrix inequalities: solved here, proved elsewhere.
+
+All problems are stated in the units of `find_units`, where the entries are about one, so that
+caps and margins mean the same for every plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.hinf.lmis import (
+    Loop,
+    PrintedLoop,
+    decay_block,
+    dissipation_block,
+    loop_of_filter,
+    printed_block,
+    printed_bound,
+)
+from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units
+from obsynth.designs.lmi import (
+    Problem,
+    Solution,
+    full,
+    largest_margin,
+    scalar,
+    solve_lazily,
+    solve_with_retries,
+    symmetric,
+    trace,
+)
+
+__all__ = [
+    "Found",
+    "Structure",
+    "find_filter",
+    "find_level",
+    "find_storage",
+    "state_problem",
+    "unstable_vertex",
+]
+
+FloatArray = NDArray[np.float64]
+Values = Mapping[str, FloatArray]
+Structure = Literal["standard", "general", "printed"]
+
+# Several infima need one direction of P to go to infinity; within these limits, in units in
+# which the rest of P is about one, the least mu is off by less than 1e-6 of itself.
+CAP = 1e4
+FLOOR = 1e-3
+# Room between the solver's answer and the boundary: large against the solver's tolerance.
+MARGIN = 1e-7
+# Largest relative duality gap of an answer that the solver does not call solved.
+GAP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A storage function that shows a level, in the plant's units.
+
+    Attributes
+    ----------
+    P : ndarray of shape (n, n)
+    tau, tau_decay : ndarray of shape (n_groups,)
+    printed : ndarray of shape (0,) or (2 + n n,)
+        alpha, beta and Q of (45).
+    """
+
+    P: FloatArray
+    tau: FloatArray
+    tau_decay: FloatArray
+    printed: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Setting:
+    """A problem with what its unknowns mean."""
+
+    problem: Problem
+    data: FilterData
+    structure: Structure
+    free_gains: bool
+
+
+def state_problem(
+    data: FilterData,
+    structure: Structure,
+    mu: float | None,
+    decay: float | None = None,
+    gains: Filter | None = None,
+    margin: float = MARGIN,
+) -> Problem:
+    """State the design LMI, or with `gains` the analysis LMI.
+
+    Parameters
+    ----------
+    data : FilterData
+        In any units.
+    structure : {"standard", "general", "printed"}
+    mu : float or None
+        A level to keep at the smallest trace of P; None minimises ``mu2``, its square.
+    decay : float, optional
+        Also ask for V+ < decay V where w = 0.
+    gains : Filter, optional
+    margin : float
+        Smallest eigenvalue asked of the inequalities.
+
+    Returns
+    -------
+    Problem
+        With ``P``, ``N`` = P K, ``tau1``, ...; ``N2`` = P Z Pi, ``Y`` = Y Pi in coordinates of
+        the rows of `FilterData.null` and ``D`` for the general filter; ``Q``, ``alpha`` and
+        ``beta`` for (45).
+    """
+    name = "least mu" if mu is None else f"mu = {mu:.6g}"
+    problem = Problem(f"H-infinity {'analysis' if gains else 'design'}, {name}")
+    P = symmetric("P", len(data.A))
+    mu2: Any = scalar("mu2") if mu is None else mu**2
+    if structure == "printed":
+        _state_printed(problem, data, P, mu2, gains, margin)
+        loop = None
+    else:
+        loop = _loop(data, structure, P, gains)
+        tau = _multipliers("tau", data)
+        block = dissipation_block(loop, mu2, data.sector, tau)
+        problem.add_lmi("dissipation", block, ">>", margin=margin)
+    if decay is not None and loop is not None:
+        block = decay_block(loop, decay, data.sector, _multipliers("decay.tau", data))
+        problem.add_lmi("decay", block, ">>", margin=margin)
+    problem.add_lmi("P.cap", CAP * np.eye(len(data.A)) - P, ">>", strict=False)
+    problem.add_lmi("P.floor", P - FLOOR * np.eye(len(data.A)), ">>", strict=False)
+    problem.minimise(trace(P) if mu is not None else mu2)
+    return problem
+
+
+def _multipliers(name: str, data: FilterData) -> list[Any]:
+    groups = 0 if data.sector is None else data.sector.groups
+    return [scalar(f"{name}{k + 1}") for k in range(groups)]
+
+
+def _loop(data: FilterData, structure: Structure, P: Any, gains: Filter | None) -> Loop:
+    if gains is not None:
+        return loop_of_filter(data, gains, P)
+    n, m = len(data.A), len(data.C)
+    standard = data.standard_filter(np.zeros((n, m)))
+    PG: Any = P @ data.G
+    HC: Any = standard.H @ data.C
+    DC: Any = np.zeros((data.n_f, n))
+    if structure == "general":
+        r = len(data.null)
+        DC = full("D", data.n_f, m) @ data.C
+        if r:
+            PG = PG - full("N2", n, r) @ (data.null @ data.C)
+            HC = full("Y", data.n_f, r) @ (data.null @ data.C) + HC
+    return Loop(P, PG, full("N", n, m) @ data.C, HC, DC, data.dynamics(), data.W)
+
+
+def _state_printed(
+    problem: Problem, data: FilterData, P: Any, mu2: Any, gains: Filter | None, margin: float
+) -> None:
+    n, m = len(data.A), len(data.C)
+    loop = PrintedLoop.of(data)
+    N = full("N", n, m) if gains is None else P @ gains.K
+    Q, alpha, beta = symmetric("Q", n), scalar("alpha"), scalar("beta")
+    problem.add_lmi("(45)", printed_block(loop, P, N, Q, alpha, beta, mu2), ">>", margin=margin)
+    problem.add_lmi("(37)", printed_bound(loop, P, alpha), ">>", margin=margin)
+    problem.add_lmi("Q", Q, ">>", margin=margin)
+    # Not implied by (45): with beta < 0 the Lipschitz condition (35) would count backwards.
+    problem.add_lmi("beta", beta, ">>", margin=margin)
+
+
+def solve_reliably(problem: Problem) -> Solution:
+    """Solve lazily over the vertices, with retries; what it finds is proved afterwards."""
+
+    def solve(stated: Problem) -> Solution:
+        return solve_with_retries(
+            stated, second_solvers=(), good_enough=lambda found: 0 <= found.gap < GAP
+        )
+
+    return solve_lazily(problem, floor=-0.5 * MARGIN, solve=solve).solution
+
+
+def find_level(
+    data: FilterData,
+    structure: Structure,
+    decay: float | None = None,
+    gains: Filter | None = None,
+) -> float:
+    """Find the least mu, to the solver's accuracy.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no mu is feasible.
+    """
+    units = find_units(data, structure == "printed")
+    scaled = units.scaled(data)
+    given = None if gains is None else units.filter_from_plant(gains)
+    try:
+        solution = solve_reliably(state_problem(scaled, structure, None, decay, given))
+    except InfeasibleDesign as refusal:
+        raise _explained(scaled, structure, decay, given) from refusal
+    return float(np.sqrt(solution.number("mu2"))) * units.f
+
+
+def find_filter(
+    data: FilterData, structure: Structure, mu: float, decay: float | None = None
+) -> tuple[Filter, Found]:
+    """Find the gains with the smallest trace of P at a level.
+
+    Raises
+    ------
+    InfeasibleDesign
+        As the solver reports; the caller explains.
+    """
+    units = find_units(data, structure == "printed")
+    scaled = units.scaled(data)
+    solution = solve_reliably(state_problem(scaled, structure, mu / units.f, decay))
+    P = solution["P"]
+    m, n_f = len(data.C), data.n_f
+    K: FloatArray = np.asarray(np.linalg.solve(P, solution["N"]), dtype=float)
+    F, H, D = scaled.L @ scaled.H, scaled.H[:n_f], np.zeros((n_f, m))
+    if structure == "general":
+        D = solution["D"]
+        if len(scaled.null):
+            F = F + np.linalg.solve(P, solution["N2"]) @ scaled.null
+            H = H + solution["Y"] @ scaled.null
+    gains = units.filter_to_plant(Filter(K, F, H, D))
+    if structure != "general":
+        gains = data.standard_filter(gains.K)
+    return gains, _found(units, data, solution.values, decay)
+
+
+def _found(units: Units, data: FilterData, values: Values, decay: float | None) -> Found:
+    groups = 0 if data.sector is None else data.sector.groups
+    names = [str(k + 1) for k in range(groups)]
+    tau, tau_decay, printed = np.zeros(0), np.zeros(0), np.zeros(0)
+    if "alpha" in values:
+        size = units.f**2 / units.phi[0] ** 2
+        Q = values["Q"] * size
+        numbers = [float(values[key].item()) * size for key in ("alpha", "beta")]
+        printed = np.concatenate([numbers, (0.5 * (Q + Q.T)).ravel()])
+    elif groups:
+        tau = units.tau_to_plant(np.array([float(values[f"tau{k}"].item()) for k in names]))
+        if decay is not None:
+            raw = np.array([float(values[f"decay.tau{k}"].item()) for k in names])
+            tau_decay = units.tau_to_plant(raw)
+    return Found(units.P_to_plant(values["P"]), tau, tau_decay, printed)
+
+
+def find_storage(
+    data: FilterData,
+    structure: Structure,
+    mu: float,
+    gains: Filter,
+    decay: float | None = None,
+) -> Found:
+    """Find the storage function of given gains with the most room at a level.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If there is no room.
+    """
+    units = find_units(data, structure == "printed")
+    scaled = units.scaled(data)
+    given = units.filter_from_plant(gains)
+    problem = state_problem(scaled, structure, mu / units.f, decay, given, margin=0.0)
+    margin = largest_margin(problem, explain=False)
+    if not margin.feasible:
+        raise InfeasibleDesign(
+            f"mu = {mu:.6g} cannot be shown for these gains", margin.lines(), margin=margin.value
+        )
+    return _found(units, data, margin.found.solution.values, decay)
+
+
+def unstable_vertex(data: FilterData, gains: Filter) -> tuple[int, float] | None:
+    """Return the vertex with the largest spectral radius, if that is not below 1."""
+    radii = np.abs(np.linalg.eigvals(data.closed_loops(gains))).max(axis=-1)
+    worst = int(np.argmax(radii))
+    return None if radii[worst] < 1.0 else (worst, float(radii[worst]))
+
+
+def _explained(
+    scaled: FilterData, structure: Structure, decay: float | None, gains: Filter | None
+) -> InfeasibleDesign:
+    """Say what binds where no mu is feasible: the decay of V alone, a homogeneous problem."""
+    what = "these gains" if gains is not None else "any gain"
+    headline = f"no quadratic V decays along every error with {what}, so there is no level mu"
+    details = []
+    if structure != "printed":
+        problem = Problem("decay of V")
+        P = symmetric("P", len(scaled.A))
+        loop = _loop(scaled, structure, P, gains)
+        keep = 1.0 if decay is None else decay
+        block = decay_block(loop, keep, scaled.sector, _multipliers("tau", scaled))
+        problem.add_lmi("decay", block, ">>")
+        try:
+            margin = largest_margin(problem, caps={"size": P << np.eye(len(scaled.A))})
+            details += margin.lines()
+        except SolverTrouble as trouble:
+            details.append(str(trouble).splitlines()[0])
+    if decay is not None:
+        details.append(f"asked for: V+ < {decay:g} V; a larger decay= asks for less")
+    if scaled.sector is not None:
+        details.append(
+            'multipliers="per_entry" or method="polytopic" know more about the nonlinearity'
+        )
+    details.append("smaller ranges of the states make its Jacobian vary less")
+    return InfeasibleDesign(headline, details)
+
+
+def without_sector(data: FilterData) -> FilterData:
+    """Return the data with the vertices in place of the multipliers."""
+    return replace(data, sector=None)

@@ -1,0 +1,244 @@
+"""The error system of the filter as numbers: what every inequality and proof is formed from.
+
+With q = A e + s + L f + W w, the part of x_{k+1} that the prediction p does not know, the filter
+
+    xhat+ = p + F (y+ - C p) + K (y - C xhat) ,   fhat = H (y+ - C p) + D (y - C xhat)
+
+has the errors e+ = (I - F C) q - K C e and f - fhat = f - H C q - D C e, and f drops out of both
+where (I - F C) L = 0 and H C L = I.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.lmi import Enclosure, ExactMatrix
+
+__all__ = ["Arithmetic", "Filter", "FilterData", "Sector", "Units", "find_units", "lift"]
+
+FloatArray = NDArray[np.float64]
+Arithmetic = Literal["float", "enclosure", "exact"]
+# Smallest unit of a coordinate, as a share of the largest: a state that no disturbance reaches
+# within a few steps keeps a unit that is not zero.
+LEAST_UNIT = 1e-3
+HORIZON = 60
+
+
+def lift(value: FloatArray, arithmetic: Arithmetic, radius: FloatArray | float = 0.0) -> Any:
+    """Return doubles, with a radius where the arithmetic knows one, in an arithmetic."""
+    if arithmetic == "enclosure":
+        return Enclosure.of(value, radius)
+    return ExactMatrix.of(value) if arithmetic == "exact" else value
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
+
+    Attributes
+    ----------
+    E : ndarray of shape (n, k)
+        Where every phi enters.
+    group : tuple of int
+        Group of every phi, k of them; one multiplier per group.
+    R : ndarray of shape (n_groups, n)
+    """
+
+    E: FloatArray
+    group: tuple[int, ...]
+    R: FloatArray
+
+    @property
+    def groups(self) -> int:
+        """Number of multipliers."""
+        return len(self.R)
+
+    def mask(self, number: int) -> FloatArray:
+        """Return the diagonal matrix that picks the phi of one group."""
+        return np.diag([1.0 if g == number else 0.0 for g in self.group])
+
+
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """The gains that run, shapes (n, m), (n, m), (n_f, m), (n_f, m)."""
+
+    K: FloatArray
+    F: FloatArray
+    H: FloatArray
+    D: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FilterData:
+    """Matrices of the plant and what bounds its nonlinearity.
+
+    Attributes
+    ----------
+    A, C, L, W : ndarray
+        Shapes (n, n), (m, n), (n, s), (n, n_w); L stacks faults and unknown inputs.
+    H : ndarray of shape (s, m)
+        (C L)^+ in doubles.
+    n_f : int
+        The first n_f columns of L are faults; only their estimates count.
+    null : ndarray of shape (m - s, m)
+        Rows that see no fault: null C L = 0.
+    A_radius, W_radius : ndarray
+        How far the plant's own coefficients may be from the doubles.
+    vertices : ndarray of shape (N, n, n)
+        Of the Jacobian of g.
+    vertex_radius : ndarray of shape (N, n, n)
+    sector : Sector or None
+        Used in place of the vertices where it is there.
+    """
+
+    A: FloatArray
+    C: FloatArray
+    L: FloatArray
+    W: FloatArray
+    H: FloatArray
+    n_f: int
+    null: FloatArray
+    A_radius: FloatArray
+    W_radius: FloatArray
+    vertices: FloatArray
+    vertex_radius: FloatArray
+    sector: Sector | None = None
+
+    @property
+    def G(self) -> FloatArray:
+        """I - L H C, the projection of the paper."""
+        return np.eye(len(self.A)) - self.L @ self.H @ self.C
+
+    @property
+    def count(self) -> int:
+        """Number of matrix inequalities: 1 with multipliers, else one per vertex."""
+        return 1 if self.sector is not None else len(self.vertices)
+
+    def vertex(self, index: int) -> FilterData:
+        """Return the same data with one vertex."""
+        pick = slice(index, index + 1)
+        radius = self.vertex_radius[pick]
+        return replace(self, vertices=self.vertices[pick], vertex_radius=radius)
+
+    def dynamics(self, arithmetic: Arithmetic = "float") -> Any:
+        """Return A (with multipliers) or A + M at every vertex; at the first one if exact."""
+        A = lift(self.A, arithmetic)
+        if self.sector is not None:
+            return lift(self.A, arithmetic, self.A_radius)
+        if arithmetic == "exact":
+            return A + lift(self.vertices[0], arithmetic)
+        return A + lift(self.vertices, arithmetic, self.vertex_radius)
+
+    def standard_filter(self, K: FloatArray) -> Filter:
+        """Return the filter (18)-(19) of the paper with a gain."""
+        m = len(self.C)
+        return Filter(K, self.L @ self.H, self.H[: self.n_f], np.zeros((self.n_f, m)))
+
+    def closed_loops(self, gains: Filter) -> FloatArray:
+        """Return the error's matrix (I - F C)(A + M) - K C at every vertex, shape (N, n, n)."""
+        kept = np.eye(len(self.A)) - gains.F @ self.C
+        return np.asarray(kept @ (self.A + self.vertices) - gains.K @ self.C)
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """Sizes of one unit of x, y, f and phi, powers of two, in which all numbers are about one.
+
+    Attributes
+    ----------
+    x, y : ndarray of shape (n,), (m,)
+    f : float
+    phi : ndarray of shape (n_groups,)
+    """
+
+    x: FloatArray
+    y: FloatArray
+    f: float
+    phi: FloatArray
+
+    def scaled(self, data: FilterData) -> FilterData:
+        """Write the data in these units; w keeps its own, and only nominal values are used."""
+        x, y, f = self.x, self.y, self.f
+        sector = data.sector
+        if sector is not None:
+            size = self.phi[list(sector.group)]
+            E = sector.E * size / x[:, None]
+            sector = Sector(E, sector.group, sector.R * x**2 / self.phi[:, None] ** 2)
+        return replace(
+            data,
+            A=data.A * x / x[:, None],
+            C=data.C * x / y[:, None],
+            L=data.L * f / x[:, None],
+            W=data.W / x[:, None],
+            H=data.H * y / f,
+            null=data.null * y,
+            vertices=data.vertices * x / x[:, None],
+            sector=sector,
+        )
+
+    def filter_to_plant(self, gains: Filter) -> Filter:
+        """Write gains found in these units in the plant's."""
+        x, y, f = self.x, self.y, self.f
+        return Filter(
+            gains.K * x[:, None] / y,
+            gains.F * x[:, None] / y,
+            gains.H * f / y,
+            gains.D * f / y,
+        )
+
+    def filter_from_plant(self, gains: Filter) -> Filter:
+        """Write gains of the plant in these units."""
+        return Units(1.0 / self.x, 1.0 / self.y, 1.0 / self.f, self.phi).filter_to_plant(gains)
+
+    def P_to_plant(self, P: FloatArray) -> FloatArray:
+        """Write a matrix of V = e'Pe in the plant's units."""
+        scaled = self.f**2 * P / np.outer(self.x, self.x)
+        return 0.5 * (scaled + scaled.T)
+
+    def tau_to_plant(self, tau: FloatArray) -> FloatArray:
+        """Write multipliers in the plant's units."""
+        return tau * self.f**2 / self.phi**2
+
+
+def find_units(data: FilterData, uniform: bool = False) -> Units:
+    """Find typical sizes: the covariance of the error under white w of unit intensity.
+
+    Parameters
+    ----------
+    data : FilterData
+    uniform : bool
+        One unit for all states and for phi: the identities in (45) stand for |s|^2, which other
+        units of the states would weigh.
+
+    Returns
+    -------
+    Units
+    """
+    A = data.A + data.vertices.mean(axis=0)
+    A = A * min(1.0, 0.9 / max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9))
+    noise = data.W @ data.W.T
+    spread = noise
+    for _ in range(HORIZON):
+        spread = A @ spread @ A.T + noise
+    x = _rounded(np.sqrt(np.diag(spread)))
+    if uniform:
+        x = np.full(len(x), float(_rounded(np.array([np.exp(np.log(x).mean())]))[0]))
+    y = _rounded(np.sqrt(np.diag(data.C @ spread @ data.C.T)))
+    seen = data.H[: data.n_f] @ data.C
+    size = float(np.sqrt(np.trace(seen @ spread @ seen.T)))
+    f = float(_rounded(np.array([size]))[0])
+    phi = np.ones(0)
+    if data.sector is not None:
+        phi = _rounded(np.sqrt((data.sector.R * x**2).max(axis=1)), least=0.0)
+        phi = x[:1] if uniform else phi
+    return Units(x, y, f, phi)
+
+
+def _rounded(sizes: FloatArray, least: float = LEAST_UNIT) -> FloatArray:
+    largest = float(sizes.max(initial=0.0)) or 1.0
+    floor = np.maximum(sizes, least * largest)
+    return np.exp2(np.round(np.log2(np.where(floor > 0, floor, 1.0))))
