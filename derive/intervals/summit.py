@@ -36,6 +36,7 @@ def concave_bounds(
     start: Array,
     slope: Array,
     evaluate: Callable[[Rows], RowRanges],
+    is_open: Callable[[Rows], Mask],
 ) -> Array:
     """Bound goals that are concave over their boxes.
 
@@ -52,17 +53,26 @@ def concave_bounds(
         A point of every box and the gradient there.
     evaluate : callable
         Values and gradients at points (rows without width).
+    is_open : callable
+        Whether rows still matter.
 
     Returns
     -------
     ndarray, shape (N,)
         Upper bounds.
     """
-    at, bound = start, np.full(rows.count, np.inf)
+    bound, index = rows.bound.copy(), np.arange(rows.count)
+    at = start
     for _ in range(_STEPS):
         at = _newton(rows, hessians, at, slope)
-        found = evaluate(Rows(rows.goal, at, at, bound))
+        found = evaluate(Rows(rows.goal, at, at, rows.bound))
         ends = found.slope_lower, found.slope_upper
-        bound = np.fmin(bound, up(found.upper + tangent_rise(rows.lower, rows.upper, at, ends)))
-        slope = 0.5 * (ends[0] + ends[1])
+        top = up(found.upper + tangent_rise(rows.lower, rows.upper, at, ends))
+        bound[index] = np.fmin(bound[index], top)
+        rows = Rows(rows.goal, rows.lower, rows.upper, bound[index])
+        left = np.flatnonzero(is_open(rows))
+        if not len(left):
+            break
+        slope = 0.5 * (ends[0] + ends[1])[:, left]
+        rows, hessians, at, index = rows.take(left), hessians.take(left), at[:, left], index[left]
     return bound

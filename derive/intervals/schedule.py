@@ -1,0 +1,223 @@
+"""In which order a program is run: equal operations that are ready together are done as one.
+
+A call of NumPy costs as much as the work on some hundreds of boxes, and branch and bound mostly has
+fewer than that. So all products whose factors are known are taken in one call, on arrays with one
+row per product and one column per box, then all sums that have become possible, and so on.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.intervals.arithmetic import Array, Interval, Mask
+from obsynth.derive.intervals.graph import Graph
+from obsynth.derive.intervals.rules import PARTIAL, RULES, uncertain
+
+__all__ = ["Schedule", "Values"]
+
+Rows = slice | NDArray[np.int64]
+
+# Arrays of this many numbers stay in the fast part of the memory.
+_BLOCK = 16_384
+_NARROWEST, _WIDEST = 256, 4_096
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One operation on several rows at once."""
+
+    rule: Callable[..., Interval]
+    target: slice
+    operands: tuple[Rows, ...]
+    extra: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Ranges of all nodes over a batch.
+
+    Attributes
+    ----------
+    table : ndarray, shape (2, n_rows, N)
+        Lower and upper ends.
+    row : dict of int to int
+        Row of every node.
+    """
+
+    table: Array
+    row: dict[int, int]
+
+    def of(self, node: int) -> Interval:
+        """Return the range of a node, two arrays of shape (N,)."""
+        k = self.row[node]
+        return self.table[0, k], self.table[1, k]
+
+
+class Schedule:
+    """Order of the nodes behind some outputs.
+
+    Parameters
+    ----------
+    graph : Graph
+        The nodes.
+    live : sequence of int
+        Nodes that are needed, operands first.
+    breaks : sequence of sequence of int
+        For every output that is judged, the nodes under it that may jump or be undefined.
+
+    Attributes
+    ----------
+    count : int
+        Number of steps, each of them some calls of NumPy.
+
+    Examples
+    --------
+    >>> from obsynth.derive.intervals.graph import Node
+    >>> graph = Graph()
+    >>> x, y = (graph.append(Node("input", (), k)) for k in (0, 1))
+    >>> squares = [graph.append(Node("power_int", (k,), 2)) for k in (x, y)]
+    >>> total = graph.plain("add", squares)
+    >>> schedule = Schedule(graph, [x, y, *squares, total], [])
+    >>> schedule.count
+    2
+    >>> schedule.run(np.array([[1.0], [2.0]]), np.array([[2.0], [3.0]])).of(total)
+    (array([5.]), array([13.]))
+    """
+
+    def __init__(self, graph: Graph, live: Sequence[int], breaks: Sequence[Sequence[int]]) -> None:
+        constants = [k for k in live if k in graph.constants]
+        inputs = [k for k in live if graph.nodes[k].op == "input"]
+        self.row = {node: k for k, node in enumerate([*constants, *inputs])}
+        self._constants = np.array(
+            [[float(graph.constants[k][side][0]) for k in constants] for side in (0, 1)]
+        ).reshape(2, len(constants), 1)
+        self._inputs = np.array([graph.nodes[k].number for k in inputs], dtype=np.int64)
+        self._steps = [self._step(graph, group) for group in _groups(graph, live, set(self.row))]
+        self.count = len(self._steps)
+        widest = max((s.target.stop - s.target.start for s in self._steps), default=1)
+        self._block = min(max(_BLOCK // widest, _NARROWEST), _WIDEST)
+        self._judge(graph, breaks)
+
+    def _step(self, graph: Graph, group: list[int]) -> _Step:
+        start = len(self.row)
+        for node in group:
+            self.row[node] = len(self.row)
+        first = graph.nodes[group[0]]
+        operands = tuple(
+            _rows([self.row[graph.nodes[node].args[k]] for node in group])
+            for k in range(len(first.args))
+        )
+        extra = (first.number,) if first.op == "power_int" else ()
+        return _Step(RULES[first.op], slice(start, len(self.row)), operands, extra)
+
+    def _judge(self, graph: Graph, breaks: Sequence[Sequence[int]]) -> None:
+        """Note which nodes decide whether an output is smooth."""
+        nodes = sorted({k for some in breaks for k in some})
+        partial = [k for k in nodes if graph.nodes[k].op in PARTIAL]
+        others = [k for k in nodes if graph.nodes[k].op not in PARTIAL]
+        self._partial = np.array([self.row[k] for k in partial], dtype=np.int64)
+        self._others = [
+            (graph.nodes[k].op, self.row[k], [self.row[a] for a in graph.nodes[k].args])
+            for k in others
+        ]
+        position = {k: n for n, k in enumerate([*partial, *others])}
+        self._under = [np.array([position[k] for k in some], dtype=np.int64) for some in breaks]
+
+    def run(self, lower: Array, upper: Array) -> Values:
+        """Enclose all nodes over every box of a batch.
+
+        Parameters
+        ----------
+        lower, upper : ndarray, shape (n_variables, N)
+            The boxes, one per column.
+
+        Returns
+        -------
+        Values
+            With ``nan`` where nothing is known.
+        """
+        n = lower.shape[1]
+        table = np.empty((2, len(self.row), n))
+        first = self._constants.shape[1]
+        table[:, :first] = self._constants
+        table[0, first : first + len(self._inputs)] = lower[self._inputs]
+        table[1, first : first + len(self._inputs)] = upper[self._inputs]
+        with np.errstate(all="ignore"):
+            for start in range(0, n, self._block):
+                self._fill(table[:, :, start : start + self._block])
+        return Values(table, self.row)
+
+    def _fill(self, table: Array) -> None:
+        for step in self._steps:
+            operands = [table[:, rows] for rows in step.operands]
+            found = step.rule(*((a[0], a[1]) for a in operands), *step.extra)
+            table[0, step.target], table[1, step.target] = found
+
+    def rough(self, values: Values) -> Mask:
+        """Tell where an output may jump or be undefined in a box.
+
+        Parameters
+        ----------
+        values : Values
+            What `run` has found.
+
+        Returns
+        -------
+        ndarray of bool, shape (n_judged, N)
+        """
+        n = values.table.shape[2]
+        result = np.zeros((len(self._under), n), dtype=bool)
+        if not len(self._partial) and not self._others:
+            return result
+        table = values.table
+        doubtful = np.empty((len(self._partial) + len(self._others), n), dtype=bool)
+        doubtful[: len(self._partial)] = ~np.isfinite(table[:, self._partial]).all(axis=0)
+        for k, (op, row, args) in enumerate(self._others, len(self._partial)):
+            operands = [(table[0, a], table[1, a]) for a in args]
+            doubtful[k] = uncertain(op, (table[0, row], table[1, row]), operands)
+        if doubtful.any():
+            for k, under in enumerate(self._under):
+                result[k] = doubtful[under].any(axis=0)
+        return result
+
+
+def _rows(rows: list[int]) -> Rows:
+    """Take rows that follow each other as a view, others as a copy."""
+    if rows == list(range(rows[0], rows[0] + len(rows))):
+        return slice(rows[0], rows[0] + len(rows))
+    return np.array(rows, dtype=np.int64)
+
+
+def _groups(graph: Graph, live: Sequence[int], done: set[int]) -> list[list[int]]:
+    """Arrange nodes in groups of one operation, always the largest group that is ready."""
+    missing: dict[int, int] = {}
+    users: dict[int, list[int]] = {}
+    ready: dict[tuple[str, int], list[int]] = {}
+
+    def offer(node: int) -> None:
+        found = graph.nodes[node]
+        number = found.number if found.op == "power_int" else 0
+        ready.setdefault((found.op, number), []).append(node)
+
+    for node in live:
+        if node in done:
+            continue
+        awaited = {a for a in graph.nodes[node].args if a not in done}
+        for argument in awaited:
+            users.setdefault(argument, []).append(node)
+        missing[node] = len(awaited)
+        if not awaited:
+            offer(node)
+    result = []
+    while ready:
+        key = max(ready, key=lambda k: len(ready[k]))
+        group = ready.pop(key)
+        result.append(group)
+        for node in group:
+            for user in users.get(node, ()):
+                missing[user] -= 1
+                if not missing[user]:
+                    offer(user)
+    return result
