@@ -17,7 +17,7 @@ from obsynth.codegen.interface import FloatArray, ObserverLike, PlantLike
 from obsynth.codegen.kernel import STEP_INPUTS
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import project_name, unique
-from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
 
 __all__ = ["Description", "Field", "Port", "describe", "midpoints", "nominal_values"]
 
@@ -84,6 +84,11 @@ class Description:
     scheduling: tuple[int, ...]
     start: FloatArray
     model_hash: str
+
+    @property
+    def alarms(self) -> bool:
+        """Whether the step is a fault detector's, with one alarm per fault."""
+        return bool(self.observer.step.n_out() > len(STEP_OUTPUTS))
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -202,15 +207,17 @@ def _check_step(step: ca.Function, model: PlantLike, n_memory: int, n_theta: int
     inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
     names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
     expected_in = (n_memory, len(model.u), len(model.output_names)) + (n_theta,) * bool(n_theta)
-    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1)
+    alarms = len(outputs) == len(STEP_OUTPUTS) + 1 and outputs[-1] == ALARM_OUTPUT
+    results = (*STEP_OUTPUTS, ALARM_OUTPUT) if alarms else STEP_OUTPUTS
+    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1) + (n_f,) * alarms
     found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
     found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
-    if len(inputs) != len(names) or len(outputs) != len(STEP_OUTPUTS):
+    if len(inputs) != len(names) or len(outputs) != len(results):
         raise CodegenError(
-            f"the step maps {inputs} to {outputs}; it has to map {names} to {STEP_OUTPUTS}"
+            f"the step maps {inputs} to {outputs}; it has to map {names} to {results}"
         )
     for name, found, expected in zip(
-        (*names, *(f"the returned {name}" for name in STEP_OUTPUTS)),
+        (*names, *(f"the returned {name}" for name in results)),
         (*found_in, *found_out),
         (*expected_in, *expected_out),
         strict=True,
@@ -260,7 +267,7 @@ def _start(observer: ObserverLike, memory: FloatArray | None, n_memory: int) -> 
 def _check_not_initialised(observer: ObserverLike) -> None:
     """Make sure that a state nobody has initialised is told apart by the step itself."""
     zeros = [np.zeros(observer.step.numel_in(i)) for i in range(observer.step.n_in())]
-    status = float(Machine(observer.step)(*zeros)[-1][0])
+    status = float(Machine(observer.step)(*zeros)[STEP_OUTPUTS.index("status")][0])
     if not (status.is_integer() and int(status) & 1):
         raise CodegenError(
             f"the step returns status {status:g} for a memory of zeros; bit 1 (not initialised)"

@@ -9,14 +9,14 @@ import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.names import c_number
-from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
 
 __all__ = ["STEP_INPUTS", "Kernel", "generate_kernel"]
 
 STEP_INPUTS = ("memory", "u", "y", "theta")
 """Inputs of a step, in their order; the last one of scheduled observers only."""
 
-_RESULTS = ("next", *STEP_OUTPUTS[1:])
+_RESULTS = ("next", *STEP_OUTPUTS[1:], ALARM_OUTPUT)
 
 # CasADi wraps these to serve C89 as well; the wrapped C99 function is what its VM calls.
 _WRAPPED = frozenset({"expm1", "fabs", "fmax", "fmin", "hypot", "log1p"})
@@ -226,7 +226,7 @@ def _enclose(function: ca.Function, prefix: str, body: str) -> tuple[str, tuple[
         if name in words:
             arguments.append(name)
             parameters.append(f"const {real} {name}[{function.numel_in(i)}]")
-    for i, name in enumerate(_RESULTS):
+    for i, name in enumerate(_RESULTS[: function.n_out()]):
         if name in words:
             arguments.append(name)
             parameters.append(f"{real} {name}[{function.numel_out(i)}]")

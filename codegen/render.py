@@ -131,6 +131,7 @@ def _values(
     signals |= {"x": description.x, "f": description.f}
     outputs = [("xhat", sizes["x"]), ("fhat", sizes["f"])]
     outputs += [(f"{kind}_{end}", sizes[kind]) for kind in "xf" for end in ("lower", "upper")]
+    outputs += [("alarm", sizes["f"])] if description.alarms else []
     start = nominal_values(observer.model, "x")
     return {
         "name": description.name,
@@ -162,6 +163,7 @@ def _values(
         "inputs": [kind for kind in ("u", "y", "theta") if signals[kind]],
         "library": kernel.library,
         "inexact": kernel.inexact,
+        "alarms": description.alarms,
         "outputs": [(name, length) for name, length in outputs if length],
         "example": _example(description),
         "count": vectors.count,

@@ -32,6 +32,7 @@ SHARES: Mapping[str, float] = {
 
 _SEQUENCE = 250
 _ALL_BITS = sum(STATUS.values())
+_STATUS = STEP_OUTPUTS.index("status")
 _EXTREMES = np.array(
     [
         0.0,
@@ -125,7 +126,7 @@ class _Recorder:
     def step(self, inputs: list[FloatArray]) -> None:
         """Record one step with u, y and theta where there is one; carry the memory along."""
         arrays = self._step(self.memory, *inputs)
-        status = float(arrays[-1][0])
+        status = float(arrays.pop(_STATUS)[0])
         if not (status.is_integer() and 0 <= status <= _ALL_BITS):
             raise CodegenError(
                 f"the step returns status {status!r}, which is no mask of the bits"
@@ -137,8 +138,8 @@ class _Recorder:
             )
         self.memory = arrays[STEP_OUTPUTS.index("memory")]
         self.statuses[int(status)] += 1
-        self.values += sum(array.size for array in arrays)
-        numbers = np.concatenate([*inputs, *arrays[:-1]])
+        self.values += 1 + sum(array.size for array in arrays)
+        numbers = np.concatenate([*inputs, *arrays])
         self.lines.append(f"S {int(status)} {bits(numbers)}")
 
 

@@ -2,7 +2,14 @@
 
 from obsynth.designs.bounded_error import BoundedErrorUIO
 from obsynth.designs.certificate import Certificate, Claim, Guarantee
-from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.detection import Detection, FaultEvent
+from obsynth.designs.errors import (
+    CertificateError,
+    DetectorError,
+    InfeasibleDesign,
+    SolverTrouble,
+)
+from obsynth.designs.fault_detector import FaultDetector
 from obsynth.designs.hinf import HinfUIO
 from obsynth.designs.observer import STATUS, Observer
 from obsynth.designs.storage import load, save
@@ -13,6 +20,10 @@ __all__ = [
     "Certificate",
     "CertificateError",
     "Claim",
+    "Detection",
+    "DetectorError",
+    "FaultDetector",
+    "FaultEvent",
     "Guarantee",
     "HinfUIO",
     "InfeasibleDesign",

@@ -5,7 +5,7 @@ from typing import Any
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["CertificateError", "InfeasibleDesign", "SolverTrouble"]
+__all__ = ["CertificateError", "DetectorError", "InfeasibleDesign", "SolverTrouble"]
 
 
 class _Refusal(ObsynthError):
@@ -53,6 +53,10 @@ class CertificateError(_Refusal):
     >>> CertificateError("decay is not proved", vertex=3).vertex
     3
     """
+
+
+class DetectorError(ObsynthError):
+    """A fault detector that cannot be built over this observer, or a run that is not its own."""
 
 
 class SolverTrouble(_Refusal):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from obsynth.symbolic import Plant
 
-__all__ = ["STATUS", "STEP_OUTPUTS", "Observer"]
+__all__ = ["ALARM_OUTPUT", "STATUS", "STEP_OUTPUTS", "Observer"]
 
 STATUS: Mapping[str, int] = {
     "not_initialised": 1,
@@ -39,6 +39,9 @@ STEP_OUTPUTS = (
     "status",
 )
 """Names of the outputs of `Observer.step`, in their order."""
+
+ALARM_OUTPUT = "alarm"
+"""Name of the output that a fault detector's step has behind them."""
 
 FloatArray = NDArray[np.float64]
 

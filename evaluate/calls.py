@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant, Scenario
@@ -23,10 +23,10 @@ def step_function(observer: StepObserver, model: Plant) -> ca.Function:
     step: ca.Function = observer.step
     scheduling_columns(step, model, "step")
     # CasADi accepts one name on both sides only on request, so the first output is left free.
-    if tuple(step.name_out())[1:] != STEP_OUTPUTS[1:]:
+    if tuple(step.name_out())[1:] not in (STEP_OUTPUTS[1:], (*STEP_OUTPUTS[1:], ALARM_OUTPUT)):
         raise SimulationError(
             f"the observer's step returns ({', '.join(step.name_out())}); "
-            f"({', '.join(STEP_OUTPUTS)}) is needed.",
+            f"({', '.join(STEP_OUTPUTS)}[, {ALARM_OUTPUT}]) is needed.",
             given=tuple(step.name_out()),
         )
     return step

@@ -7,7 +7,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import STEP_OUTPUTS
 from obsynth.evaluate.calls import (
     first_memory,
     refuse_algebraic_loop,
@@ -182,7 +181,7 @@ def _claims(
         )
     results = [_mapped(step, part)[1:] for part in _parts(*arguments)]
     columns = [np.concatenate(pieces) for pieces in zip(*results, strict=True)]
-    return dict(zip(STEP_OUTPUTS[1:], columns, strict=True))
+    return dict(zip(step.name_out()[1:], columns, strict=True))
 
 
 def _samples(fields: dict[str, Array]) -> Array:

@@ -118,6 +118,8 @@ class Run:
         columns at k speak of instant k - 1, and ``run[name]`` aligns them.
     status : (N + 1,) int
         Bit mask of the step, explained by :attr:`domain`.
+    alarm : (N + 1, n_f) bool or None
+        Alarms of a fault detector; None where an observer ran alone.
     names, units : dict
         Signal names and units by group ("x", "y", "u", "d", "f", "w", "rho").
     box : (n_x, 2)
@@ -157,6 +159,7 @@ class Run:
     method: str
     truth: str
     outside: tuple[str, ...]
+    alarm: NDArray[np.bool_] | None = None
 
     @classmethod
     def collect(
@@ -179,10 +182,13 @@ class Run:
         names["y"] = tuple(model.output_names)
         units["y"] = tuple(getattr(model, "output_units", ("",) * len(names["y"])))
         status = np.asarray(claims["status"], dtype=np.int64).reshape(-1)
-        arrays = {key: value for key, value in claims.items() if key != "status"}
+        arrays = {key: value for key, value in claims.items() if key not in ("status", "alarm")}
         arrays |= truths
+        alarm = np.asarray(claims["alarm"] > 0.5) if "alarm" in claims else None
         for array in (t, status, *arrays.values()):
             array.setflags(write=False)
+        if alarm is not None:
+            alarm.setflags(write=False)
         half_widths = observer.half_widths
         return cls(
             t=t,
@@ -198,6 +204,7 @@ class Run:
             method=observer.method,
             truth=truth,
             outside=outside,
+            alarm=alarm,
             **arrays,
         )
 
@@ -327,6 +334,8 @@ class Run:
             key: (("time", dims[group]), getattr(self, key)) for key, group in groups.items()
         }
         data["status"] = (("time",), self.status)
+        if self.alarm is not None:
+            data["alarm"] = (("time", "fault"), self.alarm)
         attrs = {
             "model": self.model,
             "scenario": self.scenario,

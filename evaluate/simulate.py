@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import STEP_OUTPUTS
 from obsynth.evaluate.calls import (
     first_memory,
     refuse_algebraic_loop,
@@ -162,5 +161,5 @@ def _loop(
         outside=(*truth.outside, *broken_assumptions(observer.model, scenario, fields)),
         t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
         truths={"x": x, "y": y, **fields},
-        claims=dict(zip(STEP_OUTPUTS[1:], logs, strict=True)),
+        claims=dict(zip(function.name_out()[1:], logs, strict=True)),
     )

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from obsynth.designs import BoundedErrorUIO as BoundedErrorUIO
     from obsynth.designs import Certificate as Certificate
     from obsynth.designs import CertificateError as CertificateError
+    from obsynth.designs import FaultDetector as FaultDetector
     from obsynth.designs import HinfUIO as HinfUIO
     from obsynth.designs import InfeasibleDesign as InfeasibleDesign
     from obsynth.designs import Observer as Observer
@@ -58,6 +59,7 @@ __all__ = [
     "Certificate",
     "CertificateError",
     "Equilibrium",
+    "FaultDetector",
     "HinfUIO",
     "InfeasibleDesign",
     "JacobianBounds",
@@ -121,6 +123,7 @@ _ROOMS = {
         "BoundedErrorUIO",
         "Certificate",
         "CertificateError",
+        "FaultDetector",
         "HinfUIO",
         "InfeasibleDesign",
         "Observer",

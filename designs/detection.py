@@ -1,0 +1,214 @@
+"""What a fault detector did in a run: events, delays, false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Detection", "FaultEvent", "compare"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FaultEvent:
+    """A stretch of instants at which one fault was there.
+
+    Attributes
+    ----------
+    fault : str
+    onset, end : int
+        First and last instant of the fault.
+    peak : float
+        Its largest magnitude.
+    alarm : int or None
+        Instant at which the alarm was first raised for it; None: missed.
+    delay : float or None
+        Seconds from the onset to the alarm.
+    level : float or None
+        Magnitude of the fault at the instant that the alarm speaks of.
+    promised : int or None
+        Instant up to which an alarm was promised: by then the fault had been larger than its
+        interval is long at as many consecutive valid samples as the alarm takes. None: it never
+        was, so it may be missed.
+    others : tuple of str
+        Faults that were not there but whose alarm was raised together with it.
+    """
+
+    fault: str
+    onset: int
+    end: int
+    peak: float
+    alarm: int | None
+    delay: float | None
+    level: float | None
+    promised: int | None
+    others: tuple[str, ...]
+
+    @property
+    def isolated(self) -> bool:
+        """Whether the alarm pointed at this fault and at none that was not there."""
+        return self.alarm is not None and not self.others
+
+    def __str__(self) -> str:
+        head = f"{self.fault} from k = {self.onset} to {self.end} (peak {self.peak:.4g})"
+        if self.alarm is None:
+            promise = "" if self.promised is None else f", promised at k = {self.promised}"
+            return f"{head}: no alarm{promise}"
+        others = f", together with {', '.join(self.others)}" if self.others else ""
+        return (
+            f"{head}: alarm at k = {self.alarm}, {self.delay:.6g} s after its onset, at "
+            f"{self.level:.4g}{others}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Alarms of a run compared with the faults that were there.
+
+    Attributes
+    ----------
+    alarm : (N + 1, n_f) bool
+        The alarms that the detector raised at each instant.
+    names : tuple of str
+        The faults.
+    events : tuple of FaultEvent
+        In order of their onset.
+    false_alarms : mapping of str to int
+        Instants with an alarm for a fault that had not been there up to then.
+    lingering : mapping of str to int
+        Instants with an alarm for a fault that had been there and was zero again. Bounds of a
+        fault at one instant never do that; bounds of its mean over a window may.
+    """
+
+    alarm: BoolArray
+    names: tuple[str, ...]
+    events: tuple[FaultEvent, ...]
+    false_alarms: Mapping[str, int]
+    lingering: Mapping[str, int]
+
+    @property
+    def delays(self) -> dict[str, float | None]:
+        """Delay in seconds of the first event of every fault; None where it was missed.
+
+        Faults without an event are left out.
+        """
+        first: dict[str, float | None] = {}
+        for event in self.events:
+            first.setdefault(event.fault, event.delay)
+        return first
+
+    @property
+    def missed(self) -> tuple[FaultEvent, ...]:
+        """Events without an alarm."""
+        return tuple(event for event in self.events if event.alarm is None)
+
+    def __str__(self) -> str:
+        lines = [str(event) for event in self.events] or ["no fault was there"]
+        for count, words in ((self.false_alarms, "false"), (self.lingering, "after its end")):
+            lines += [f"{name}: {n} instants of alarm {words}" for name, n in count.items() if n]
+        if not any(self.false_alarms.values()):
+            lines.append("no false alarm")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return "<br>".join(escape(line) for line in str(self).splitlines())
+
+
+def compare(
+    alarm: BoolArray,
+    truth: FloatArray,
+    t: FloatArray,
+    names: Sequence[str],
+    fault_delay: int,
+    *,
+    threshold: float,
+    width: FloatArray,
+    valid: BoolArray,
+    persistence: Sequence[int],
+) -> Detection:
+    """Compare alarms with the true faults.
+
+    Parameters
+    ----------
+    alarm : (N + 1, n_f) bool
+        Row k was raised at instant k and speaks of instant k - `fault_delay`.
+    truth : (N + 1, n_f)
+    t : (N + 1,)
+        Seconds.
+    names : sequence of str
+    fault_delay : int
+    threshold : float
+        Magnitude up to which a fault counts as not there.
+    width : (N + 1, n_f)
+        Lengths of the intervals that the alarms were decided from.
+    valid : (N + 1,) bool
+        Which samples count.
+    persistence : sequence of int
+        Samples that each alarm takes.
+
+    Returns
+    -------
+    Detection
+    """
+    there: BoolArray = np.abs(truth) > threshold
+    # Row k of `spoken` is about the same instant as row k of the alarms.
+    spoken = np.zeros_like(there)
+    spoken[fault_delay:] = there[: len(there) - fault_delay]
+    size = np.zeros_like(truth)
+    size[fault_delay:] = np.abs(truth[: len(truth) - fault_delay])
+    before: BoolArray = np.logical_or.accumulate(spoken, axis=0)
+    events = []
+    for i, name in enumerate(names):
+        for onset, end in _stretches(there[:, i]):
+            first, stop = onset + fault_delay, end + fault_delay + 1
+            raised = np.flatnonzero(alarm[first:stop, i])
+            at = first + int(raised[0]) if raised.size else None
+            counting = first + np.flatnonzero(valid[first:stop])
+            large = _first_run(size[counting, i] > width[counting, i], persistence[i])
+            events.append(
+                FaultEvent(
+                    fault=name,
+                    onset=onset,
+                    end=end,
+                    peak=float(np.abs(truth[onset : end + 1, i]).max()),
+                    alarm=at,
+                    delay=None if at is None else float(t[at] - t[onset]),
+                    level=None if at is None else float(size[at, i]),
+                    promised=None if large is None else int(counting[large]),
+                    others=()
+                    if at is None
+                    else tuple(
+                        other
+                        for j, other in enumerate(names)
+                        if alarm[at, j] and not spoken[at, j] and j != i
+                    ),
+                )
+            )
+    events.sort(key=lambda event: event.onset)
+    false = (alarm & ~before).sum(axis=0)
+    after = (alarm & before & ~spoken).sum(axis=0)
+    return Detection(
+        alarm=alarm,
+        names=tuple(names),
+        events=tuple(events),
+        false_alarms={name: int(n) for name, n in zip(names, false, strict=True)},
+        lingering={name: int(n) for name, n in zip(names, after, strict=True)},
+    )
+
+
+def _stretches(there: BoolArray) -> list[tuple[int, int]]:
+    """Return first and last index of every run of True."""
+    edges = np.diff(np.concatenate([[0], there.astype(np.int8), [0]]))
+    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    return [(int(a), int(b) - 1) for a, b in zip(starts, stops, strict=True)]
+
+
+def _first_run(there: BoolArray, length: int) -> int | None:
+    """Return where `length` values True in a row are complete for the first time."""
+    return next((a + length - 1 for a, b in _stretches(there) if b - a + 1 >= length), None)
