@@ -1,0 +1,194 @@
+"""From a stored design to an observer: proofs first, then ode and step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.errors import CertificateError
+from obsynth.designs.observer import Observer
+from obsynth.designs.set_adaptive.design import METHOD, SetDesign
+from obsynth.designs.set_adaptive.equations import memory_layout
+from obsynth.designs.set_adaptive.ode import build_ode
+from obsynth.designs.set_adaptive.proof import prove_design
+from obsynth.designs.set_adaptive.step import ROUNDING, build_step, initial_memory
+from obsynth.designs.set_adaptive.structure import Structure
+from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
+from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.symbolic import Plant
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["assemble", "prove", "to_record"]
+
+FloatArray = NDArray[np.float64]
+
+
+def to_record(design: SetDesign) -> dict[str, Any]:
+    """Return the JSON-able record of a design, with the header that `load` reads."""
+    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+
+
+def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
+    """Prove everything that the guarantee of a stored design rests on.
+
+    Parameters
+    ----------
+    record : mapping
+        Of `to_record`.
+    level : {"full", "lmi"}
+        Whether the form and its elementwise bounds are derived again.
+    """
+    return prove_design(SetDesign.from_record(record), level)
+
+
+def assemble(
+    record_or_design: Mapping[str, Any] | SetDesign,
+    derived: Structure | None = None,
+    level: Level = "lmi",
+) -> Observer:
+    """Prove a design and make its observer.
+
+    Parameters
+    ----------
+    record_or_design : mapping or SetDesign
+    derived : Structure, optional
+        What was just derived from the plant; proved too, without deriving it again.
+    level : {"full", "lmi"}
+
+    Raises
+    ------
+    CertificateError
+        If a claim does not hold.
+    """
+    if isinstance(record_or_design, SetDesign):
+        design = record_or_design
+    else:
+        design = SetDesign.from_record(record_or_design)
+    claims = prove_design(design, level, derived)
+    certificate = Certificate(claims, to_record(design)).require()
+    n, q = len(design.plant.x), len(design.plant.f)
+    return Observer(
+        method=METHOD,
+        model=design.plant.discretise("rk4", design.Ts),
+        step=build_step(design),
+        ode=build_ode(design),
+        step_covered=True,
+        memory_layout=memory_layout(n, q),
+        gains={"L": design.L, "p": design.p, "Gamma": design.Gamma},
+        performance=_performance(design),
+        half_widths=None,
+        certificate=certificate,
+        guarantee=_guarantee(design),
+        start=_make_start(design),
+    )
+
+
+def _performance(design: SetDesign) -> dict[str, float]:
+    fastest = float((-np.diag(design.A_lower - design.L @ design.C)).max())
+    return {
+        "decay": design.alpha,
+        "decay_step": design.alpha_step,
+        "alpha": design.alpha,
+        "euler_step": 1.0 / fastest,
+        "longest_step": LARGEST_PRODUCT / design.mu,
+    }
+
+
+def _make_start(design: SetDesign) -> Callable[..., FloatArray]:
+    """Return the function behind `Observer.memory0`."""
+    plant = design.plant
+
+    def start(
+        guess: ArrayLike,
+        x_range: ArrayLike | None = None,
+        f_range: ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Start from boxes of the state and of the constant faults; guess and y0 are not used."""
+        read_vector(guess, plant)
+        x_box = read_box(x_range, plant.box("x"), "x_range", plant.names("x"))
+        f_box = read_box(f_range, plant.box("f"), "f_range", plant.names("f"))
+        if np.any(x_box[:, 0] < 0.0):
+            raise ObsynthError("x_range reaches below zero, which the method excludes")
+        return initial_memory(design, x_box, f_box)
+
+    return start
+
+
+def read_vector(value: Any, plant: Plant) -> FloatArray:
+    """Check the guess of `memory0`."""
+    array = np.asarray(value, dtype=float)
+    names = plant.names("x")
+    if array.shape != (len(names),) or not np.all(np.isfinite(array)):
+        raise ObsynthError(
+            f"guess has to be {len(names)} finite numbers ({', '.join(names)}); got {value!r}"
+        )
+    return array
+
+
+def read_box(value: Any, default: FloatArray, what: str, names: tuple[str, ...]) -> FloatArray:
+    """Check a box of `memory0`, or take the declared one."""
+    box = default if value is None else np.asarray(value, dtype=float)
+    if box.shape != default.shape or not np.all(np.isfinite(box)) or np.any(box[:, 0] > box[:, 1]):
+        raise ObsynthError(
+            f"{what} has to be {len(names)} finite pairs lower <= upper ({', '.join(names)}); got "
+            f"{value!r}",
+            option=what,
+        )
+    return box
+
+
+def _guarantee(design: SetDesign) -> Guarantee:
+    plant = design.plant
+    x, f = ", ".join(plant.names("x")), ", ".join(plant.names("f"))
+    where = ", ".join(
+        f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}" for s in plant.x
+    )
+    shown = ", ".join(s.name for s in design.bounds.states)
+    if design.law == "cooperative":
+        claims = [
+            f"{f}, constant, lie in [f_lower, f_upper] at every sample; so a constant fault of "
+            "zero is never excluded (no false alarm)",
+            f"{x} lie in [x_lower, x_upper] at every sample",
+            "after a fault has changed, its interval holds the new value again up to an error "
+            f"that decays (rate {design.alpha_step:.3g} per second of the states, then Gamma); "
+            "during that time it need not",
+            f"the step is exact for the bounding systems: no discretisation error, for every Ts up "
+            f"to {LARGEST_PRODUCT / design.mu:.3g} s",
+        ]
+    else:
+        claims = [
+            "zeta, Omega and xi stay bounded; neither fault bounds nor state bounds are "
+            "guaranteed by the printed law, so infinite ones are returned",
+        ]
+    assumptions = [
+        f"the plant is {plant.name} in continuous time, its inputs held between the samples "
+        f"(Ts = {design.Ts:g} s)",
+        f"the states stay in {where} at all times [monitored for {shown}: status bit 4; after it "
+        "the method starts again from these ranges]",
+        "the faults are constant and lie in the box given to memory0",
+        f"a fault within {', '.join(f'[{s.lower:g}, {s.upper:g}]' for s in plant.f)} moves the "
+        "outputs between the samples",
+    ]
+    if plant.w:
+        noise = ", ".join(
+            f"{name} in [{low:g}, {high:g}]"
+            for name, (low, high) in zip(plant.names("w"), plant.box("w"), strict=True)
+        )
+        if design.options["noise"]:
+            assumptions.append(f"{noise} [monitored in part: status bit 8]")
+        else:
+            assumptions.append(f"the disturbances {', '.join(plant.names('w'))} are zero")
+    assumptions.append(
+        f"rounding errors of one step stay below {ROUNDING:.1e} of the size of its terms, which "
+        "is added to the bounds"
+    )
+    return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def _refuse_unknown(kind: Any) -> CertificateError:
+    return CertificateError(f"kind = {kind!r} in the stored design")

@@ -1,0 +1,225 @@
+"""Elementwise bounds of the state matrix between the ends of what the outputs show.
+
+The arguments are a lower and an upper end for every measured state. Equal ends are the paper's
+bounds as functions of the output; ends y - v and y + v include the noise, and ends moved further
+apart include what the output does between two samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.derive.exact import substitute
+from obsynth.derive.intervals import bound_ranges
+from obsynth.derive.quasi_lpv import QuasiLPV
+from obsynth.derive.quasi_lpv.elementwise import bound_elements
+from obsynth.derive.quasi_lpv.known import Known
+from obsynth.derive.quasi_lpv.measured import readings
+from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text
+
+__all__ = ["BLOCKS", "EndBounds", "derive_bounds", "end_symbols"]
+
+FloatArray = NDArray[np.float64]
+BLOCKS = ("A", "B", "offset")
+_SIDES = ("lower", "upper")
+
+
+@dataclass(frozen=True, eq=False)
+class EndBounds:
+    """Bounds of A, B and the offset as functions of ends of the measured states.
+
+    Attributes
+    ----------
+    states : tuple of Signal
+        The measured states.
+    exact : tuple of Signal
+        Inputs and measured scheduling variables, known exactly.
+    lower, upper : dict of str to sympy.Matrix
+        Bounds of the blocks ``"A"`` (n, n), ``"B"`` (n, n_u) and ``"offset"`` (n, 1), for states
+        that lie between their ends and inside their declared ranges.
+    """
+
+    states: tuple[Signal, ...]
+    exact: tuple[Signal, ...]
+    lower: dict[str, sp.Matrix]
+    upper: dict[str, sp.Matrix]
+
+    def function(self) -> ca.Function:
+        """Return (lower ends, upper ends, exact) -> (A_lower, A_upper, B_lower, ...)."""
+        low, high = (_columns(len(self.states)) for _ in _SIDES)
+        known = _columns(len(self.exact))
+        table = {}
+        for i, state in enumerate(self.states):
+            first, second = end_symbols(state)
+            table[first], table[second] = low[i], high[i]
+        table |= {s.symbol: known[i] for i, s in enumerate(self.exact)}
+        results, names = [], []
+        for block in BLOCKS:
+            for side, matrices in zip(_SIDES, (self.lower, self.upper), strict=True):
+                results.append(_matrix(matrices[block], table, f"{block}_{side}"))
+                names.append(f"{block}_{side}")
+        return ca.Function(
+            "end_bounds", [low, high, known], results, ["lower", "upper", "exact"], names
+        )
+
+    def extremes(self, reach: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the least A_lower and the largest A_upper over the declared ranges.
+
+        Parameters
+        ----------
+        reach : array_like of shape (number of measured states,)
+            How far the ends lie from the middle of their interval at most; infinite for ends
+            anywhere in the range.
+
+        Returns
+        -------
+        (ndarray, ndarray)
+            Shape (n, n) each, guaranteed for ends clipped to the ranges of the states.
+        """
+        width = np.broadcast_to(np.asarray(reach, dtype=float), (len(self.states),))
+        known = _columns(len(self.exact))
+        variables = [known[i] for i in range(len(self.exact))]
+        box = [(s.lower, s.upper) for s in self.exact]
+        low, high = [], []
+        for state, wide in zip(self.states, width, strict=True):
+            span = state.upper - state.lower
+            symbols = [ca.SX.sym("end") for _ in range(1 if wide < span else 2)]
+            variables += symbols
+            box += [(state.lower, state.upper)] * len(symbols)
+            if wide == 0.0 or wide >= span:
+                low.append(symbols[0])
+                high.append(symbols[-1])
+            else:
+                low.append(ca.fmax(symbols[0] - wide, state.lower))
+                high.append(ca.fmin(symbols[0] + wide, state.upper))
+        A_lower, A_upper = self.function()(ca.vertcat(*low), ca.vertcat(*high), known)[:2]
+        n = A_lower.shape[0]
+        rows = ca.vertcat(ca.vec(A_lower.T), ca.vec(A_upper.T))
+        used = [k for k, variable in enumerate(variables) if ca.depends_on(rows, variable)]
+        if not used:
+            values = np.array(ca.DM(ca.evalf(rows))).ravel()
+            return values[: n * n].reshape(n, n), values[n * n :].reshape(n, n)
+        found = bound_ranges(
+            rows, ca.vertcat(*[variables[k] for k in used]), np.array([box[k] for k in used])
+        )
+        return found.lower[: n * n].reshape(n, n), found.upper[n * n :].reshape(n, n)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the bounds as text."""
+        return {
+            "states": [s.name for s in self.states],
+            "exact": [s.name for s in self.exact],
+            **{
+                side: {
+                    block: [[write_text(e) for e in row] for row in matrices[block].tolist()]
+                    for block in BLOCKS
+                }
+                for side, matrices in zip(_SIDES, (self.lower, self.upper), strict=True)
+            },
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any], plant: Plant) -> EndBounds:
+        """Read the text of `to_record` with the signals of a plant."""
+        states = tuple(_signal(plant.x, name) for name in record["states"])
+        exact = tuple(_signal((*plant.u, *plant.rho), name) for name in record["exact"])
+        symbols = {str(e): e for s in states for e in end_symbols(s)}
+        symbols |= {s.name: s.symbol for s in exact}
+        sides = []
+        for side in _SIDES:
+            stored = record[side]
+            sides.append(
+                {
+                    block: sp.ImmutableMatrix(
+                        len(plant.x),
+                        _width(plant, block),
+                        [read_text(text, symbols) for row in stored[block] for text in row],
+                    )
+                    for block in BLOCKS
+                }
+            )
+        return cls(states, exact, *sides)
+
+
+def end_symbols(state: Signal) -> tuple[sp.Symbol, sp.Symbol]:
+    """Return the symbols of the two ends of a measured state."""
+    return (
+        sp.Symbol(f"{state.name}_lower", real=True),
+        sp.Symbol(f"{state.name}_upper", real=True),
+    )
+
+
+def derive_bounds(form: QuasiLPV) -> EndBounds:
+    """Bound the blocks of a quasi-LPV form elementwise between ends of the measured states.
+
+    Parameters
+    ----------
+    form : QuasiLPV
+        Of a plant whose outputs show states.
+
+    Returns
+    -------
+    EndBounds
+
+    Raises
+    ------
+    UnboundedError
+        An entry has no finite bound; entry and signal are named.
+
+    Examples
+    --------
+    >>> from obsynth.derive import quasi_lpv
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> bounds = derive_bounds(quasi_lpv(three_tanks()))
+    >>> low, high = bounds.function()([0.5, 0.1], [0.5, 0.1], [6e-5, 3e-6])[:2]
+    >>> round(float(low[0, 0]), 8), round(float(high[0, 0]), 8)
+    (-0.0230643, -0.01692457)
+    """
+    plant = form.model
+    shown = {r.state for r in readings(plant)}
+    states = tuple(s for s in plant.x if s.symbol in shown)
+    exact = (*plant.u, *(s for s in plant.rho if s.measured))
+    way = form.ranging
+    blocks = {name: substitute_all(way.matrix[form.layout.place(name)], plant) for name in BLOCKS}
+    known = [Known(s.symbol, end_symbols(s)[0], end_symbols(s), s.lower, s.upper) for s in states]
+    known += [Known(s.symbol, s.symbol, (s.symbol, s.symbol), s.lower, s.upper) for s in exact]
+    more = [lift.signal for lift in way.lifts]
+    lower, upper = {}, {}
+    for name, block in blocks.items():
+        places = {(i, j): block[i, j] for i in range(block.rows) for j in range(block.cols)}
+        found = bound_elements(places, plant, known, more)
+        lower[name] = sp.ImmutableMatrix(*block.shape, list(found.lower.values()))
+        upper[name] = sp.ImmutableMatrix(*block.shape, list(found.upper.values()))
+    used = {s for side in (lower, upper) for m in side.values() for s in m.free_symbols}
+    return EndBounds(states, tuple(s for s in exact if s.symbol in used), lower, upper)
+
+
+def substitute_all(matrix: sp.Matrix, plant: Plant) -> sp.Matrix:
+    """Put the values of a plant's constants into a matrix."""
+    values = plant.constant_values
+    return matrix.applyfunc(lambda e: substitute(e, values))
+
+
+def _columns(count: int) -> ca.SX:
+    return ca.vertcat(*[ca.SX.sym(f"s{i}") for i in range(count)]) if count else ca.SX(0, 1)
+
+
+def _matrix(matrix: sp.Matrix, table: Mapping[sp.Symbol, ca.SX], label: str) -> ca.SX:
+    entries = to_sx(list(matrix.T), table, [label] * len(matrix))
+    column = ca.vertcat(*entries) if entries else ca.SX(0, 1)
+    return ca.densify(ca.reshape(column, *matrix.shape))
+
+
+def _signal(signals: tuple[Signal, ...], name: str) -> Signal:
+    return next(s for s in signals if s.name == name)
+
+
+def _width(plant: Plant, block: str) -> int:
+    return {"A": len(plant.x), "B": len(plant.u), "offset": 1}[block]

@@ -1,0 +1,187 @@
+"""The equations (6)-(8), (14) in symbols, shared by the continuous form and the step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.set_adaptive.design import SetDesign
+
+__all__ = ["Drive", "Memory", "drives", "ends", "memory_layout", "residuals", "theta_rates"]
+
+FloatArray = NDArray[np.float64]
+_PARTS = (
+    ("zeta_m", "n"),
+    ("zeta_M", "n"),
+    ("Omega_m", "nq"),
+    ("Omega_M", "nq"),
+    ("theta_m", "q"),
+    ("theta_M", "q"),
+    ("xi_m", "n"),
+    ("xi_M", "n"),
+    ("R_m", "qq"),
+    ("R_M", "qq"),
+    ("b_m", "q"),
+    ("b_M", "q"),
+    ("weight", "1"),
+    ("left", "1"),
+    ("initialised", "1"),
+)
+
+
+def memory_layout(n: int, q: int) -> dict[str, slice]:
+    """Return the parts of the memory vector; matrices are stored row by row.
+
+    ``zeta`` (6), ``Omega`` (7), ``theta`` (8) and ``xi`` (14), each with the index m, then M: in
+    case (a) of Theorem 1, which applies, theta_m is the upper and theta_M the lower bound of the
+    fault. ``R``, ``b`` and ``weight`` are the integrals of the monitors (13), ``left`` is 1 from
+    an output outside its range until the method has started again.
+    """
+    sizes = {"n": n, "q": q, "1": 1}
+    layout, at = {}, 0
+    for name, letters in _PARTS:
+        size = int(np.prod([sizes[letter] for letter in letters]))
+        layout[name] = slice(at, at + size)
+        at += size
+    return layout
+
+
+class Memory:
+    """The memory taken apart: vectors as columns, matrices in their shape."""
+
+    def __init__(self, vector: ca.SX, n: int, q: int) -> None:
+        self.parts: dict[str, ca.SX] = {}
+        sizes = {"n": n, "q": q, "1": 1}
+        for (name, letters), part in zip(_PARTS, memory_layout(n, q).values(), strict=True):
+            value = vector[part]
+            if len(letters) == 2:
+                rows, columns = (sizes[letter] for letter in letters)
+                value = ca.reshape(value, columns, rows).T
+            self.parts[name] = value
+
+    def __getitem__(self, name: str) -> ca.SX:
+        return self.parts[name]
+
+    def packed(self, **changed: ca.SX) -> ca.SX:
+        """Return the vector with the parts given exchanged."""
+        values = {**self.parts, **changed}
+        return ca.vertcat(
+            *(
+                ca.vec(values[name].T) if len(letters) == 2 else values[name]
+                for name, letters in _PARTS
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What drives one of the two bounding systems.
+
+    Attributes
+    ----------
+    M : casadi.SX of shape (n, n)
+        A_o - L C.
+    c : casadi.SX of shape (n, 1)
+        Inputs, offset, disturbances and outputs.
+    size : casadi.SX of shape (n, 1)
+        Sum of the magnitudes of what c is made of.
+    """
+
+    M: ca.SX
+    c: ca.SX
+    size: ca.SX
+
+
+def ends(design: SetDesign, low: ca.SX, high: ca.SX, clipped: bool) -> tuple[ca.SX, ca.SX]:
+    """Turn ends of the outputs C x into ends of the measured states, in the order of the bounds."""
+    names = design.plant.names("x")
+    first, second = [], []
+    for state in design.bounds.states:
+        i = names.index(state.name)
+        k = int(np.argmax(design.C[:, i]))
+        scale = float(design.C[k, i])
+        a, b = low[k] / scale, high[k] / scale
+        if clipped:
+            a = ca.fmin(ca.fmax(a, state.lower), state.upper)
+            b = ca.fmin(ca.fmax(b, state.lower), state.upper)
+        first.append(a)
+        second.append(b)
+    return ca.vertcat(*first), ca.vertcat(*second)
+
+
+def drives(
+    design: SetDesign,
+    states: tuple[ca.SX, ca.SX],
+    outputs: tuple[ca.SX, ca.SX],
+    u: ca.SX,
+    exact: ca.SX,
+) -> tuple[Drive, Drive]:
+    """Return the lower and the upper bounding system.
+
+    Parameters
+    ----------
+    design : SetDesign
+    states : tuple of casadi.SX
+        Lower and upper ends of the measured states, which the bounds are functions of.
+    outputs : tuple of casadi.SX
+        Lower and upper ends of C x, which the gain is fed with.
+    u, exact : casadi.SX
+        Inputs; arguments of the bounds that are known exactly.
+    """
+    values = design.bounds.function()(*states, exact)
+    A, B, offset = (values[2 * i : 2 * i + 2] for i in range(3))
+    L = design.L
+    up, down = np.maximum(L, 0.0), np.minimum(L, 0.0)
+    push, pull = ca.fmax(u, 0.0), ca.fmin(u, 0.0)
+    bias = ca.DM(design.W1 @ design.w_centre)
+    spread = ca.DM(np.abs(design.W1) @ design.w_radius)
+    made = []
+    for o in (0, 1):
+        fed = ca.DM(up) @ outputs[o] + ca.DM(down) @ outputs[1 - o]
+        forced = ca.mtimes(B[o], push) + ca.mtimes(B[1 - o], pull)
+        c = forced + offset[o] + bias + (spread if o else -spread) + fed
+        size = (
+            ca.mtimes(ca.fmax(ca.fabs(B[0]), ca.fabs(B[1])), ca.fabs(u))
+            + ca.fabs(offset[o])
+            + ca.fabs(bias)
+            + spread
+            + ca.DM(np.abs(L)) @ ca.fmax(ca.fabs(outputs[0]), ca.fabs(outputs[1]))
+        )
+        made.append(Drive(A[o] - ca.DM(L @ design.C), ca.densify(c), ca.densify(size)))
+    return made[0], made[1]
+
+
+def residuals(design: SetDesign, memory: Memory, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return r_m = y_high - C zeta_m and r_M = y_low - C zeta_M, shape (m, 1) each."""
+    C = ca.DM(design.C)
+    return high - C @ memory["zeta_m"], low - C @ memory["zeta_M"]
+
+
+def theta_rates(design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Return the derivatives of theta_m and theta_M.
+
+    Printed, (8): -Gamma Omega'C'(r + C Omega theta). Cooperative, with N = -C Omega >= 0: every
+    component goes towards what its own output leaves when the other faults are at their opposite
+    bounds, so that the order is kept for every Gamma:
+    theta_m,i' = Gamma_i N_ki (r_m,k - sum_{j != i} N_kj theta_M,j - N_ki theta_m,i).
+    """
+    C, q = ca.DM(design.C), len(design.Gamma)
+    rates = []
+    for o, other, residual in (("m", "M", r[0]), ("M", "m", r[1])):
+        N = -C @ memory[f"Omega_{o}"]
+        own, opposite = memory[f"theta_{o}"], memory[f"theta_{other}"]
+        if design.law == "printed":
+            rates.append(ca.DM(design.Gamma) * (N.T @ (residual - N @ own)))
+            continue
+        parts = []
+        for i in range(q):
+            k = int(design.fault_outputs[i])
+            rest = residual[k]
+            for j in range(q):
+                rest = rest - N[k, j] * (own[i] if j == i else opposite[j])
+            parts.append(float(design.Gamma[i]) * N[k, i] * rest)
+        rates.append(ca.vertcat(*parts))
+    return rates[0], rates[1]

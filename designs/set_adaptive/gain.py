@@ -1,0 +1,212 @@
+"""The gain by linear programming: A_m - L C and A_M - L C Metzler and Hurwitz with one p.
+
+With W = diag(p) L the conditions
+
+    diag(p) A_lower - W C + diag(r) >= 0   (elementwise, r >= 0),
+    p'A_upper - 1'W C <= -alpha p' ,        p > 0, sum(p) = 1
+
+are linear for a fixed decay alpha; A_lower is the least A_m and A_upper the largest A_M over the
+range of the outputs. The largest alpha is found by a ratio iteration in which every iterate is a
+design. (The paper's L = p w' solves neither p'L = w' nor the Metzler condition.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+
+__all__ = ["Gain", "analyse_gain", "design_gain", "off_diagonal"]
+
+FloatArray = NDArray[np.float64]
+_ITERATIONS = 40
+_SHIFT = 1e-12
+# Rounds gains down to a grid: a smaller entry only raises the off-diagonal entries of A - L C.
+_GRID = 2.0**40
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """A gain with the vector and the decay that certify it.
+
+    Attributes
+    ----------
+    L : ndarray of shape (n, m)
+    p : ndarray of shape (n,)
+        Positive, its sum about 1.
+    alpha : float
+        p'(A_upper - L C) <= -alpha p'.
+    """
+
+    L: FloatArray
+    p: FloatArray
+    alpha: float
+
+
+def design_gain(
+    A_lower: FloatArray,
+    A_upper: FloatArray,
+    C: FloatArray,
+    cap: float,
+    names: tuple[str, ...] = (),
+) -> Gain:
+    """Return the gain of the fastest decay with entries of size at most `cap`.
+
+    Without a cap the supremum need not be attained.
+
+    Raises
+    ------
+    InfeasibleDesign
+        No gain makes the bounds Metzler and Hurwitz.
+
+    Examples
+    --------
+    >>> A = np.array([[-1.0, 0.5], [0.2, -1.0]])
+    >>> gain = design_gain(A, A, np.array([[1.0, 0.0]]), cap=2.0)
+    >>> gain.L.round(6).ravel().tolist(), round(gain.alpha, 6)
+    ([2.0, 0.2], 1.0)
+    """
+    alpha, best = -np.inf, None
+    bound = float(np.abs(A_upper).sum() + cap * np.abs(C).sum())
+    guess = -bound
+    for _ in range(_ITERATIONS):
+        p, W = _feasible(A_lower, A_upper, C, cap, guess)
+        gain = analyse_gain(A_lower, A_upper, C, _make_metzler(W / p[:, None], A_lower, C))
+        if best is None or gain.alpha > alpha:
+            step, alpha, best = gain.alpha - alpha, gain.alpha, gain
+            if step <= _SHIFT * bound:
+                break
+            guess = alpha
+        else:
+            break
+    if best is None or best.alpha <= 0.0:
+        raise _refusal(A_upper, C, cap, alpha, names)
+    return best
+
+
+def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: FloatArray) -> Gain:
+    """Return p and the largest decay of a given gain; a negative decay shows that it is unstable.
+
+    A_upper - L C is a Metzler matrix, so its left Perron vector is the best p. For a reducible
+    matrix a small coupling keeps p positive.
+
+    Raises
+    ------
+    InfeasibleDesign
+        A_lower - L C is not Metzler.
+    """
+    lacking = off_diagonal(A_lower - L @ C)
+    if lacking.min(initial=0.0) < 0.0:
+        i, j = np.unravel_index(np.argmin(lacking), lacking.shape)
+        raise InfeasibleDesign(
+            "A_m - L C is not Metzler for this gain",
+            [f"entry ({i + 1}, {j + 1}) is as low as {lacking[i, j]:.6g}: lower L there"],
+            entry=(int(i), int(j)),
+        )
+    M = A_upper - L @ C
+    size = float(np.abs(M).max(initial=1e-300))
+    best: Gain | None = None
+    for coupling in (0.0, 1e-12, 1e-9, 1e-6):
+        values, vectors = np.linalg.eig(M.T + coupling * size)
+        p = np.real(vectors[:, int(np.argmax(values.real))])
+        p = p / p.sum()
+        if p.min() <= 1e-12:
+            continue
+        alpha = float((-(p @ M) / p).min())
+        found = Gain(L, p, alpha - 1e-12 * (size + abs(alpha)))
+        if best is None or found.alpha > best.alpha:
+            best = found
+    if best is None:
+        raise SolverTrouble("no positive vector p was found for the Metzler matrix A_M - L C")
+    return best
+
+
+def off_diagonal(matrix: FloatArray) -> FloatArray:
+    """Return a copy with zeros on the diagonal."""
+    result = matrix.copy()
+    np.fill_diagonal(result, 0.0)
+    return result
+
+
+def _feasible(
+    A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, cap: float, alpha: float
+) -> tuple[FloatArray, FloatArray]:
+    """Solve max t with p'A_upper - 1'W C + alpha p' <= -t p_j-independent margin, p normalised."""
+    from scipy.optimize import linprog
+
+    n, m = A_lower.shape[0], C.shape[0]
+    size = n + n * m + 1
+    rows, limits = [], []
+
+    W = np.arange(n, n + n * m).reshape(n, m)
+    for i in range(n):
+        for j in range(n):
+            if i == j:
+                continue
+            row = np.zeros(size)
+            row[i] = -A_lower[i, j]
+            for k in range(m):
+                row[W[i, k]] = C[k, j]
+            rows.append(row)
+            limits.append(0.0)
+        for k in range(m):
+            for sign in (1.0, -1.0):
+                row = np.zeros(size)
+                row[W[i, k]], row[i] = sign, -cap
+                rows.append(row)
+                limits.append(0.0)
+    for j in range(n):
+        row = np.zeros(size)
+        row[:n] = A_upper[:, j]
+        row[j] += alpha
+        for i in range(n):
+            for k in range(m):
+                row[W[i, k]] -= C[k, j]
+        row[-1] = 1.0
+        rows.append(row)
+        limits.append(0.0)
+    total = np.zeros((1, size))
+    total[0, :n] = 1.0
+    objective = np.zeros(size)
+    objective[-1] = -1.0
+    bounds = [(1e-9, None)] * n + [(None, None)] * (n * m) + [(None, None)]
+    found = linprog(objective, np.array(rows), limits, total, [1.0], bounds, method="highs-ds")
+    if found.x is None:
+        raise SolverTrouble(f"the gain program was not solved: {found.message}")
+    x = np.asarray(found.x)
+    return x[:n], x[n:-1].reshape(n, m)
+
+
+def _make_metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArray:
+    """Lower a gain by what the solver's tolerance left of the Metzler condition."""
+    L = np.where(np.abs(L) < 1e-9 * np.abs(L).max(initial=0.0), 0.0, L)
+    L = np.floor(L * _GRID) / _GRID
+    n = len(A_lower)
+    for i in range(n):
+        for j in range(n):
+            excess = float(L[i] @ C[:, j]) - float(A_lower[i, j])
+            if i != j and excess > 0.0:
+                k = int(np.argmax(C[:, j]))
+                L[i, k] -= (excess / C[k, j]) * (1.0 + 1e-9) + 2.0**-50 * abs(L[i, k])
+    return L
+
+
+def _refusal(
+    A_upper: FloatArray, C: FloatArray, cap: float, alpha: float, names: tuple[str, ...]
+) -> InfeasibleDesign:
+    hidden = [i for i in range(len(A_upper)) if not C[:, i].any()]
+    block = A_upper[np.ix_(hidden, hidden)]
+    lines = [f"with |L| <= {cap:g} the best decay is {alpha:.6g}"]
+    if hidden:
+        own = float(np.linalg.eigvals(block).real.max())
+        shown = ", ".join(names[i] for i in hidden) if names else str(hidden)
+        lines.append(
+            f"no gain acts on the unmeasured states ({shown}) alone; the bound of their block has "
+            f"the eigenvalue {own:.6g}"
+        )
+        if own >= 0.0:
+            lines.append("narrow the declared ranges, or measure one of these states")
+    return InfeasibleDesign("no gain makes A_M - L C Hurwitz", lines, alpha=alpha)

@@ -1,0 +1,168 @@
+"""The fault indicators (16)-(18) and the monitors (13) of an observer's memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.designs.set_adaptive.design import SetDesign
+from obsynth.symbolic.errors import ObsynthError
+
+if TYPE_CHECKING:
+    from obsynth.designs.observer import Observer
+
+__all__ = ["Indicators", "Monitors", "fault_indicators", "monitors"]
+
+FloatArray = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Indicators:
+    """Which outputs and faults raise an alarm.
+
+    Attributes
+    ----------
+    s : ndarray of bool, shape (..., m)
+        (16): the output is outside of what a plant without fault may show.
+    d : ndarray of bool, shape (..., q)
+        (17): zero is outside of the interval of the fault.
+    z : ndarray of bool, shape (..., m)
+        (18): the output is outside of what any constant fault explains.
+    """
+
+    s: Flags
+    d: Flags
+    z: Flags
+
+    @property
+    def S(self) -> Flags:
+        """Any of s."""
+        return np.asarray(self.s.any(axis=-1))
+
+    @property
+    def D(self) -> Flags:
+        """Any of d."""
+        return np.asarray(self.d.any(axis=-1))
+
+    @property
+    def Z(self) -> Flags:
+        """Any of z."""
+        return np.asarray(self.z.any(axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Monitors:
+    """Means over the window, (13), and what they tell.
+
+    Attributes
+    ----------
+    R_m, R_M : ndarray of shape (q, q)
+    b_m, b_M : ndarray of shape (q,)
+    limit_m, limit_M : ndarray of shape (q,)
+        R^-1 b, where the printed law would settle; NaN while R is singular.
+    excitation : float
+        Smallest eigenvalue of R_m and R_M: persistent excitation keeps it positive.
+    weight : float
+        Length of the window that is filled, in seconds.
+    """
+
+    R_m: FloatArray
+    R_M: FloatArray
+    b_m: FloatArray
+    b_M: FloatArray
+    limit_m: FloatArray
+    limit_M: FloatArray
+    excitation: float
+    weight: float
+
+
+def fault_indicators(
+    observer: Observer,
+    memory: ArrayLike,
+    y: ArrayLike,
+    form: Literal["corrected", "printed"] = "corrected",
+) -> Indicators:
+    """Evaluate the tests (16)-(18) for one memory or many.
+
+    Parameters
+    ----------
+    observer : Observer
+        Of `SetAdaptiveObserver` (not of the bank).
+    memory : array_like of shape (..., n_memory)
+        At the instants of y.
+    y : array_like of shape (..., m)
+        Measurements.
+    form : {"corrected", "printed"}
+        ``"printed"`` reads (17) literally, theta_m as the lower bound; in case (a) of Theorem 1,
+        which applies, theta_m is the upper one, so the printed test always alarms.
+
+    Raises
+    ------
+    ObsynthError
+        If the observer is of another kind.
+    """
+    design = _design(observer)
+    parts = np.asarray(memory, dtype=float)
+    layout = observer.memory_layout
+    shown = np.asarray(y, dtype=float) - design.W2 @ design.w_centre
+    low, high = shown - design.noise, shown + design.noise
+
+    def outside(name: str) -> Flags:
+        first = parts[..., layout[f"{name}_m"]] @ design.C.T
+        second = parts[..., layout[f"{name}_M"]] @ design.C.T
+        return np.asarray((high < first) | (low > second))
+
+    first, second = parts[..., layout["theta_m"]], parts[..., layout["theta_M"]]
+    if form == "corrected":
+        first, second = np.minimum(first, second), np.maximum(first, second)
+    elif form != "printed":
+        raise ObsynthError(f'form is {form!r}; it has to be "corrected" or "printed"')
+    return Indicators(outside("zeta"), np.asarray((first > 0.0) | (second < 0.0)), outside("xi"))
+
+
+def monitors(observer: Observer, memory: ArrayLike) -> Monitors:
+    """Return the monitors (13) of a memory.
+
+    Parameters
+    ----------
+    observer : Observer
+        Of `SetAdaptiveObserver` (not of the bank).
+    memory : array_like of shape (n_memory,)
+
+    Raises
+    ------
+    ObsynthError
+        If the observer is of another kind, or nothing has been measured yet.
+    """
+    design = _design(observer)
+    q = len(design.Gamma)
+    parts = np.asarray(memory, dtype=float)
+    layout = observer.memory_layout
+    weight = float(parts[layout["weight"]][0])
+    if weight <= 0.0:
+        raise ObsynthError("nothing has been measured yet: the monitors have no window")
+    found: dict[str, FloatArray] = {}
+    for o in ("m", "M"):
+        R = parts[layout[f"R_{o}"]].reshape(q, q) / weight
+        b = parts[layout[f"b_{o}"]] / weight
+        found[f"R_{o}"], found[f"b_{o}"] = R, b
+        limit = np.full(q, np.nan)
+        if np.linalg.matrix_rank(R) == q:
+            limit[:] = np.linalg.solve(R, b)
+        found[f"limit_{o}"] = limit
+    smallest = min(float(np.linalg.eigvalsh(found[f"R_{o}"])[0]) for o in ("m", "M"))
+    return Monitors(**found, excitation=smallest, weight=weight)
+
+
+def _design(observer: Observer) -> SetDesign:
+    if observer.record.get("kind") != "adaptive":
+        raise ObsynthError(
+            f"an observer of the method {observer.method!r} and kind "
+            f"{observer.record.get('kind')!r} has no indicators (16)-(18)",
+            method=observer.method,
+        )
+    return SetDesign.from_record(observer.record)

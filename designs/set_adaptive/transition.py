@@ -1,0 +1,91 @@
+"""The exact exponential of a Metzler matrix as a sum of nonnegative terms (uniformisation)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["LARGEST_PRODUCT", "Weights", "apply", "uniformisation"]
+
+FloatArray = NDArray[np.float64]
+LARGEST_PRODUCT = 64.0
+"""Largest h mu: beyond it the sum has too many terms for one step."""
+# What is left out stays below the rounding of the sum itself.
+_TAIL = 2.0**-64
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Weights of the powers of Q = I + M / mu.
+
+    Attributes
+    ----------
+    h, mu : float
+    state : ndarray of shape (J + 1,)
+        Of the terms of e^{hM}: the Poisson probabilities of h mu.
+    drive : ndarray of shape (J + 1,)
+        Of the terms of the integral of e^{sM} from 0 to h: their tails, divided by mu.
+    """
+
+    h: float
+    mu: float
+    state: FloatArray
+    drive: FloatArray
+
+
+def uniformisation(h: float, mu: float) -> Weights:
+    """Return the weights for a step h and a mu that no diagonal entry of -M exceeds.
+
+    e^{hM} = e^{-h mu} sum (h (M + mu I))^j / j!, all terms nonnegative.
+
+    Raises
+    ------
+    ObsynthError
+        If h mu is above `LARGEST_PRODUCT`.
+
+    Examples
+    --------
+    >>> weights = uniformisation(0.1, 2.0)
+    >>> bool(abs(weights.state.sum() - 1.0) < 1e-15), bool(abs(weights.drive.sum() - 0.1) < 1e-15)
+    (True, True)
+    """
+    product = h * mu
+    if not 0.0 < product <= LARGEST_PRODUCT:
+        raise ObsynthError(
+            f"Ts = {h:g} is too long for this observer: its fastest mode is {mu:g} per second, so "
+            f"take Ts <= {LARGEST_PRODUCT / mu:.3g}",
+            option="Ts",
+            largest=LARGEST_PRODUCT / mu,
+        )
+    chances: list[float] = []
+    j = 0
+    while j <= product or chances[-1] > _TAIL * 2.0**-20:
+        chances.append(math.exp(j * math.log(product) - product - math.lgamma(j + 1)))
+        j += 1
+    tails = [math.fsum(chances[j + 1 :]) for j in range(len(chances))]
+    kept = next(j for j, tail in enumerate(tails) if tail <= _TAIL) + 1
+    return Weights(h, mu, np.array(chances[:kept]), np.array(tails[:kept]) / mu)
+
+
+def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
+    """Return e^{hM} state + (integral of e^{sM}) drive by Horner's scheme.
+
+    Parameters
+    ----------
+    weights : Weights
+    M : casadi.SX of shape (n, n)
+        Metzler, its diagonal not below -mu.
+    state, drive : casadi.SX of shape (n, c)
+    """
+    Q = M / weights.mu + ca.SX.eye(M.shape[0])
+    result = weights.state[-1] * state + weights.drive[-1] * drive
+    for chance, tail in zip(weights.state[-2::-1], weights.drive[-2::-1], strict=True):
+        result = Q @ result + chance * state + tail * drive
+    moved: ca.SX = ca.densify(result)
+    return moved
