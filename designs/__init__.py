@@ -11,6 +11,7 @@ from obsynth.designs.errors import (
 )
 from obsynth.designs.fault_detector import FaultDetector
 from obsynth.designs.hinf import HinfUIO
+from obsynth.designs.interval import IntervalObserver
 from obsynth.designs.observer import STATUS, Observer
 from obsynth.designs.storage import load, save
 
@@ -27,6 +28,7 @@ __all__ = [
     "Guarantee",
     "HinfUIO",
     "InfeasibleDesign",
+    "IntervalObserver",
     "Observer",
     "SolverTrouble",
     "load",

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from obsynth.designs import FaultDetector as FaultDetector
     from obsynth.designs import HinfUIO as HinfUIO
     from obsynth.designs import InfeasibleDesign as InfeasibleDesign
+    from obsynth.designs import IntervalObserver as IntervalObserver
     from obsynth.designs import Observer as Observer
     from obsynth.designs import load as load
     from obsynth.evaluate import Run as Run
@@ -62,6 +63,7 @@ __all__ = [
     "FaultDetector",
     "HinfUIO",
     "InfeasibleDesign",
+    "IntervalObserver",
     "JacobianBounds",
     "Observer",
     "ObsynthError",
@@ -126,6 +128,7 @@ _ROOMS = {
         "FaultDetector",
         "HinfUIO",
         "InfeasibleDesign",
+        "IntervalObserver",
         "Observer",
         "load",
     ),

@@ -1,0 +1,185 @@
+"""From a stored design to an observer: proofs first, then the step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.interval.design import METHOD, IntervalDesign
+from obsynth.designs.interval.exact_arrays import Exact, FloatArray, exact, nearest
+from obsynth.designs.interval.model import LARGEST_SIGNAL, IntervalModel
+from obsynth.designs.interval.proof import prove_design, prove_model
+from obsynth.designs.interval.step import build_step, first_box, memory_layout
+from obsynth.designs.observer import Observer
+from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.symbolic import ObsynthError
+
+__all__ = ["assemble", "prove", "to_record"]
+
+
+def to_record(design: IntervalDesign) -> dict[str, Any]:
+    """Return the JSON-able record of a design, with the header that `load` reads."""
+    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+
+
+def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
+    """Prove everything that the guarantee of a stored design rests on.
+
+    Parameters
+    ----------
+    record : mapping
+        Of `to_record`.
+    level : {"full", "lmi"}
+        Whether the quasi-LPV form is derived again from the stored equations.
+    """
+    return _prove(IntervalDesign.from_record(record), level)
+
+
+def _prove(design: IntervalDesign, level: Level) -> tuple[Claim, ...]:
+    claims = prove_design(design)
+    return (*claims, *prove_model(design)) if level == "full" else claims
+
+
+def assemble(
+    record_or_design: Mapping[str, Any] | IntervalDesign,
+    level: Level = "lmi",
+    derived: IntervalModel | None = None,
+) -> Observer:
+    """Prove a design and make its observer.
+
+    Parameters
+    ----------
+    record_or_design : mapping or IntervalDesign
+    level : {"full", "lmi"}
+    derived : IntervalModel, optional
+        What was just derived from the plant; compared, without deriving it again.
+
+    Raises
+    ------
+    CertificateError
+        If a claim does not hold.
+    """
+    if isinstance(record_or_design, IntervalDesign):
+        design = record_or_design
+    else:
+        design = IntervalDesign.from_record(record_or_design)
+    claims = _prove(design, level)
+    if derived is not None:
+        claims += prove_model(design, derived)
+    certificate = Certificate(claims, to_record(design)).require()
+    plant = design.model.plant
+    return Observer(
+        method=METHOD,
+        model=plant,
+        step=build_step(design),
+        memory_layout=memory_layout(len(plant.x), len(design.P), design.n_f),
+        gains=_gains(design),
+        performance=_performance(design),
+        half_widths=design.half_widths,
+        certificate=certificate,
+        guarantee=_guarantee(design),
+        start=_make_start(design),
+        fault_delay=1,
+    )
+
+
+def _gains(design: IntervalDesign) -> dict[str, FloatArray]:
+    """Gains and transformations by the paper's letters."""
+    chosen, q = design.chosen, design.model.q
+    E = chosen.K1 @ np.linalg.inv(chosen.R1) @ chosen.N[:, :q].T
+    middle = exact(design.model.middle)
+    letters = {name: getattr(chosen, name) for name in ("H", "R0", "K0", "N", "R1", "K1")}
+    R = nearest(design.prediction.on_r(middle))
+    return {"P": design.P, "L": design.L, "R": R, "E": E, **letters}
+
+
+def radius_of(matrix: Exact) -> float:
+    """Return the spectral radius of a nonnegative exact matrix, in doubles."""
+    return float(np.abs(np.linalg.eigvals(nearest(matrix))).max(initial=0.0))
+
+
+def _performance(design: IntervalDesign) -> dict[str, float]:
+    return {
+        "sum_half_widths": float(design.half_widths.sum()),
+        "spectral_radius": radius_of(design.width_map.part.E),
+        "vertices": float(len(design.model.vertices)),
+    }
+
+
+def _make_start(design: IntervalDesign) -> Callable[..., FloatArray]:
+    plant = design.model.plant
+    n, n_f = len(plant.x), design.n_f
+    layout = memory_layout(n, len(design.P), n_f)
+
+    def start(
+        guess: ArrayLike,
+        x_range: ArrayLike | None = None,
+        f_range: ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Start from a box of states; neither the first fault nor y0 are needed."""
+        names = ", ".join(plant.names("x"))
+        point = np.asarray(guess, dtype=float)
+        if point.shape != (n,) or not np.isfinite(point).all():
+            raise ObsynthError(f"guess has to be {n} finite numbers ({names}); got {guess!r}")
+        box = plant.box("x") if x_range is None else np.asarray(x_range, dtype=float)
+        if box.shape != (n, 2) or not np.all(box[:, 0] <= box[:, 1]):
+            raise ObsynthError(
+                f"x_range has to have the shape ({n}, 2), lower before upper ({names})"
+            )
+        if not np.isfinite(box).all():
+            raise ObsynthError(
+                "x_range is needed: the states have no finite declared range, so the first set "
+                "has no bound"
+            )
+        memory = np.zeros(layout["initialised"].stop)
+        memory[layout["r_lower"]], memory[layout["r_upper"]] = first_box(design, box)
+        memory[layout["prediction"]] = point
+        memory[layout["initialised"]] = 1.0
+        return memory
+
+    return start
+
+
+def _guarantee(design: IntervalDesign) -> Guarantee:
+    plant = design.model.plant
+    claims = [f"{', '.join(plant.names('x'))} lie inside the returned intervals at every k >= 0"]
+    if plant.f:
+        claims.append(
+            f"{', '.join(plant.names('f'))} of the instant before lie inside theirs at every k >= 1"
+        )
+    free = (*plant.names("f"), *plant.names("d"))
+    if free:
+        claims.append(f"whatever {', '.join(free)} do, however fast")
+    words = {"double": "IEEE double", "single": "IEEE single"}
+    claims.append(f"all of this with the step evaluated in {words[design.precision]} precision")
+    assumptions = [
+        f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
+        "the first state lies in the box given to memory0",
+    ]
+    loose = (*plant.rho, *plant.p)
+    ranges = [f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in loose]
+    if ranges:
+        assumptions.append(", ".join(ranges))
+    watched = [
+        f"{s.name} in [{s.lower:g}, {s.upper:g}]"
+        for s in (*plant.x, *plant.u)
+        if s.name in design.model.scheduled
+    ]
+    if watched:
+        assumptions.append(f"{', '.join(watched)} [monitored: status bit 4]")
+    noise = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in plant.w)
+    if noise:
+        tail = " [monitored in part: status bit 8]" if design.contraction_rows else ""
+        assumptions.append(noise + tail)
+    assumptions.append(
+        "the half widths hold in the limit while states and inputs keep to their ranges "
+        f"(up to {LARGEST_SIGNAL:g} where none is declared)"
+    )
+    assumptions.append("after a missing sample the state lies in its declared range once")
+    assumptions.append("rounding to nearest; sums are not reordered by the compiler")
+    return Guarantee(tuple(claims), tuple(assumptions))

@@ -1,0 +1,149 @@
+"""Rational arrays: what the guarantee is computed with before anything is rounded."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.lmi import ExactMatrix
+
+__all__ = [
+    "Exact",
+    "FloatArray",
+    "above",
+    "exact",
+    "from_text",
+    "hull",
+    "inverse",
+    "magnitude",
+    "nearest",
+    "negative",
+    "positive",
+    "to_text",
+]
+
+Exact = NDArray[np.object_]
+FloatArray = NDArray[np.float64]
+
+
+def exact(values: Any) -> Exact:
+    """Return the rational numbers (`flint.fmpq`) that doubles, fractions or SymPy rationals are.
+
+    Examples
+    --------
+    >>> exact([[0.5, 3]]).tolist()
+    [[1/2, 3]]
+    """
+    from flint import fmpq
+
+    def read(value: Any) -> Any:
+        if isinstance(value, fmpq):
+            return value
+        if isinstance(value, float):
+            return fmpq(*value.as_integer_ratio())
+        if isinstance(value, int):
+            return fmpq(value)
+        if isinstance(value, Fraction):
+            return fmpq(value.numerator, value.denominator)
+        return fmpq(int(value.p), int(value.q))
+
+    array = np.asarray(values)
+    if array.dtype != np.object_:
+        array = array.astype(float)
+    result = np.empty(array.shape, dtype=object)
+    for place, value in np.ndenumerate(array):
+        result[place] = read(value if array.dtype == np.object_ else float(value))
+    return result
+
+
+def _fraction(value: Any) -> Fraction:
+    return Fraction(value) if isinstance(value, int) else Fraction(int(value.p), int(value.q))
+
+
+def nearest(values: Exact) -> FloatArray:
+    """Return the nearest doubles.
+
+    Examples
+    --------
+    >>> nearest(exact([Fraction(1, 3)])).tolist()
+    [0.3333333333333333]
+    """
+    result = np.zeros(values.shape)
+    for place, value in np.ndenumerate(values):
+        result[place] = float(_fraction(value))
+    return result
+
+
+def above(values: Exact) -> FloatArray:
+    """Return the smallest doubles that are not below the values.
+
+    Examples
+    --------
+    >>> float(above(exact([Fraction(1, 3)]))[0]) > 1 / 3
+    True
+    """
+    result = nearest(values)
+    for place, value in np.ndenumerate(values):
+        if Fraction(float(result[place])) < _fraction(value):
+            result[place] = math.nextafter(result[place], math.inf)
+    return result
+
+
+def inverse(matrix: Exact) -> Exact:
+    """Return the exact inverse of a square matrix; a singular one raises `ObsynthError`."""
+    if matrix.size == 0:
+        return matrix.copy()
+    n = len(matrix)
+    entries = ExactMatrix.of(matrix).inverse().entries.tolist()
+    return np.array(entries, dtype=object).reshape(n, n)
+
+
+def positive(matrix: Any) -> Any:
+    """Return M+ = max(M, 0) elementwise."""
+    return np.maximum(matrix, 0)
+
+
+def negative(matrix: Any) -> Any:
+    """Return M- = max(-M, 0) elementwise, so that M = M+ - M-."""
+    return np.maximum(-matrix, 0)
+
+
+def hull(matrix: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
+    """Return the smallest box that holds M a for every a in a box, as (lower, upper).
+
+    Examples
+    --------
+    >>> low, high = hull(np.array([[1.0, -2.0]]), np.array([0.0, 0.0]), np.array([1.0, 1.0]))
+    >>> low.tolist(), high.tolist()
+    ([-2.0], [1.0])
+    """
+    plus, minus = positive(matrix), negative(matrix)
+    return plus @ lower - minus @ upper, plus @ upper - minus @ lower
+
+
+def magnitude(matrix: Any) -> Any:
+    """Return |M| elementwise."""
+    return np.abs(matrix)
+
+
+def to_text(values: Exact) -> list[Any]:
+    """Return a nested list of texts as ``-1/3``."""
+    flat = [str(_fraction(value)) for value in values.ravel()]
+    nested: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
+    return nested
+
+
+def from_text(nested: Any, shape: tuple[int, ...]) -> Exact:
+    """Read what `to_text` wrote; empty arrays get their shape from the caller.
+
+    Raises
+    ------
+    ValueError
+        If a text is no rational number, or their number does not fit.
+    """
+    flat = np.array(nested, dtype=object).ravel()
+    return exact(np.array([Fraction(str(v)) for v in flat], dtype=object).reshape(shape))

@@ -1,0 +1,249 @@
+"""Gains P and L of the observer: linear programme, Sylvester equation, pole placement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.derive.errors import StructureError
+from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.interval.decoupling import Decoupled
+from obsynth.designs.interval.exact_arrays import FloatArray, nearest
+from obsynth.designs.interval.model import IntervalModel, columns_of
+from obsynth.designs.lmi import Problem, diagonal, full
+from obsynth.symbolic import ObsynthError
+
+__all__ = ["Reduced", "check_detectable", "lp_gain", "lp_problem", "placed_gains", "sylvester_gain"]
+
+MODE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The plant without its faults, in doubles, one matrix per vertex.
+
+    Attributes
+    ----------
+    A : ndarray, shape (N, n - q, n - q)
+        T2 A_i W.
+    D : ndarray, shape (N, n - q, m)
+        T2 A_i Phi.
+    C2, N12 : ndarray, shapes (m - q, n - q), (m - q, m)
+    W1, W2 : ndarray, shapes (n - q, n_w), (m, n_w)
+        T2 W1, and W2.
+    w_width : ndarray, shape (n_w,)
+    y_size : ndarray, shape (m,)
+        Largest |y| over the declared boxes.
+    """
+
+    A: FloatArray
+    D: FloatArray
+    C2: FloatArray
+    N12: FloatArray
+    W1: FloatArray
+    W2: FloatArray
+    w_width: FloatArray
+    y_size: FloatArray
+
+    @classmethod
+    def of(cls, model: IntervalModel, plant: Decoupled) -> Reduced:
+        """Round the exact matrices."""
+        a, _, _ = columns_of(model)
+        n2, m = plant.T2.shape[0], len(model.C)
+        A = [nearest(plant.T2 @ v[:, a] @ plant.W) for v in model.vertices]
+        D = [nearest(plant.T2 @ v[:, a] @ plant.Phi) for v in model.vertices]
+        box = nearest(model.box("w")).reshape(-1, 2)
+        C, W2 = nearest(model.C), nearest(model.W2)
+        size = np.abs(C) @ nearest(model.size("x")) + np.abs(W2) @ np.abs(box).max(
+            axis=1, initial=0.0
+        )
+        return cls(
+            np.array(A).reshape(-1, n2, n2),
+            np.array(D).reshape(-1, n2, m),
+            nearest(plant.C2),
+            nearest(plant.N12),
+            nearest(plant.T2 @ model.W1),
+            W2,
+            box[:, 1] - box[:, 0],
+            size,
+        )
+
+
+def check_detectable(model: IntervalModel, plant: Decoupled) -> None:
+    """Refuse a pair (A2, C2) with a mode that does not decay and is not seen, Assumption 4.
+
+    Raises
+    ------
+    StructureError
+        With the mode, the states that move and the vertex.
+    """
+    data = Reduced.of(model, plant)
+    names = model.plant.names("x")
+    for number, A in enumerate(data.A):
+        for mode in np.linalg.eigvals(A):
+            if abs(mode) < 1.0 - MODE:
+                continue
+            pencil = np.vstack([mode * np.eye(len(A)) - A, data.C2.astype(complex)])
+            size = np.linalg.norm(pencil, axis=0)
+            size = np.where(size > 0.0, size, 1.0)
+            _, values, vectors = np.linalg.svd(pencil / size)
+            if values[-1] > MODE:
+                continue
+            motion = np.abs(nearest(plant.W) @ (vectors[-1].conj() / size))
+            moving = tuple(
+                name for name, v in zip(names, motion, strict=True) if v > 1e-6 * motion.max()
+            )
+            text = f"{mode.real:.6g}" if abs(mode.imag) < 1e-12 else f"{mode:.6g}"
+            raise StructureError(
+                f"the pair (A2, C2) is not detectable: once the faults are removed, a motion of "
+                f"{', '.join(moving)} with the mode {text}, which does not decay, leaves the "
+                f"outputs {', '.join(model.plant.output_names)} unchanged (vertex {number + 1}). "
+                f"Measure {moving[0]} as well",
+                condition="detectability",
+                symbols=moving,
+                states=moving,
+                mode=complex(mode),
+                vertex_index=number,
+            )
+
+
+def lp_problem(data: Reduced, P: FloatArray) -> Problem:
+    """Return the programme whose solution L makes the bounds for a fixed P narrow.
+
+    With Lambda = diag(lambda), Y = Lambda P L and S = P^-1: T >= |Lambda P A_i S - Y C2 S| and
+    U >= |Lambda P W1 - (Lambda P D_i + Y N12) W2| at every vertex, lambda >= 0 and
+    1'T <= lambda' - 1'|S|; minimise 1'U (w_upper - w_lower) + 1'|Lambda P (D_i - D_j)| |y|, an
+    upper bound of the sum of the steady widths of z2.
+
+    Parameters
+    ----------
+    data : Reduced
+    P : ndarray, shape (n - q, n - q)
+        Regular.
+
+    Returns
+    -------
+    Problem
+        With the variables ``lambda``, ``Y``, ``T`` and ``U``.
+    """
+    n2, m2 = len(P), len(data.C2)
+    S = np.linalg.inv(P)
+    Lambda, T = diagonal("lambda", n2), full("T", n2, n2)
+    U = full("U", n2, len(data.w_width)) if data.w_width.size else None
+    Y = full("Y", n2, m2) if m2 else None
+    moved = Lambda @ (P @ data.A @ S)
+    driven = Lambda @ (P @ data.W1 - P @ data.D @ data.W2)
+    if Y is not None:
+        moved = moved - Y @ (data.C2 @ S)
+        driven = driven - Y @ (data.N12 @ data.W2)
+    problem = Problem("gain of the interval observer")
+    problem.add("T above", T - moved >= 0)
+    problem.add("T below", T + moved >= 0)
+    ones = np.ones((1, n2))
+    problem.add("decay", ones @ Lambda - ones @ T - ones @ np.abs(S) >= 0)
+    objective = 0.0 * (ones @ T @ ones.T)
+    if U is not None:
+        problem.add("U above", U - driven >= 0)
+        problem.add("U below", U + driven >= 0)
+        objective = objective + ones @ U @ data.w_width[:, None]
+    varies = (P @ data.D).max(axis=0) - (P @ data.D).min(axis=0)
+    if varies.any():
+        objective = objective + ones @ Lambda @ (varies @ data.y_size[:, None])
+    problem.minimise(objective)
+    return problem
+
+
+def lp_gain(data: Reduced, P: FloatArray) -> FloatArray:
+    """Solve `lp_problem` and return L.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no L makes the errors of this P decay at all vertices in common.
+    """
+    if not len(data.C2):
+        return np.zeros((len(P), 0))
+    try:
+        solution = lp_problem(data, P).solve(tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
+    except SolverTrouble:
+        solution = lp_problem(data, P).solve()
+    Y, weights = solution["Y"], np.diag(solution["lambda"])
+    return np.asarray(np.linalg.solve(P, Y / weights[:, None]), dtype=float)
+
+
+def sylvester_gain(
+    A2: FloatArray, C2: FloatArray, R: FloatArray, Q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Solve P A2 - R P = Q C2 and return P and L = P^-1 Q, so that P (A2 - L C2) P^-1 = R.
+
+    Parameters
+    ----------
+    A2, C2 : ndarray, shapes (n2, n2), (m2, n2)
+    R : ndarray, shape (n2, n2)
+        Nonnegative, without a common eigenvalue with A2.
+    Q : ndarray, shape (n2, m2)
+
+    Raises
+    ------
+    InfeasibleDesign
+        If the equation has no regular solution.
+
+    Examples
+    --------
+    The paper's P and L:
+
+    >>> A2, C2 = np.array([[0.0, 0.0], [-1.0, -1.0]]), np.array([[0.0, 1.0]])
+    >>> P, L = sylvester_gain(A2, C2, np.diag([0.5, 0.6]), np.array([[7.5], [-9.6]]))
+    >>> P.round(9).tolist(), L.round(9).ravel().tolist()
+    ([[10.0, -5.0], [-10.0, 6.0]], [-0.3, -2.1])
+    """
+    from scipy.linalg import solve_sylvester
+
+    n2, m2 = len(A2), len(C2)
+    if R.shape != (n2, n2) or Q.shape != (n2, m2):
+        raise ObsynthError(
+            f"R has shape {R.shape} and Q {Q.shape}; this plant needs {(n2, n2)} and {(n2, m2)}",
+            option="R",
+        )
+    gap = np.abs(np.linalg.eigvals(R)[:, None] - np.linalg.eigvals(A2)[None, :])
+    if gap.min(initial=np.inf) < MODE:
+        raise InfeasibleDesign(
+            "R and A2 have an eigenvalue in common, so P A2 - R P = Q C2 has no unique solution",
+            ["choose other eigenvalues for R"],
+        )
+    P = np.asarray(solve_sylvester(-R, A2, Q @ C2), dtype=float)
+    if np.linalg.cond(P) > 1e10:
+        raise InfeasibleDesign(
+            "P A2 - R P = Q C2 has no regular solution",
+            ["(R, Q) has to be controllable and (A2, C2) observable"],
+        )
+    return P, np.linalg.solve(P, Q)
+
+
+def placed_gains(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield (P, L) that make P (A2 - L C2) P^-1 diagonal with several sets of real poles.
+
+    A2 is the mean of the vertices; sets of poles that cannot be placed are left out.
+    """
+    from scipy.signal import place_poles
+
+    A2, C2 = data.A.mean(axis=0), data.C2
+    n2 = len(A2)
+    if not n2 or not len(C2):
+        return
+    steps = np.arange(n2) - 0.5 * (n2 - 1)
+    for middle in (0.0, 0.15, 0.3, 0.5, 0.7):
+        for apart in (0.05, 0.2):
+            poles = middle + apart * steps
+            if np.abs(poles).max() >= 1.0:
+                continue
+            try:
+                L = place_poles(A2.T, C2.T, poles).gain_matrix.T
+            except ValueError:
+                continue
+            values, vectors = np.linalg.eig(A2 - L @ C2)
+            if np.abs(values.imag).max() > 0 or np.linalg.cond(vectors) > 1e6:
+                continue
+            yield np.linalg.inv(vectors.real), np.asarray(L, dtype=float)

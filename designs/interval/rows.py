@@ -1,0 +1,330 @@
+"""Guaranteed bounds as largest and smallest of finitely many linear functions.
+
+Every bound of the observer has the form upper = max_i U_i s, lower = min_i L_i s, with s a stack
+of what is known at run time (bounds of r, the measurement, the input, 1). The matrices are exact;
+`Rows.slack` says by how much a bound has to be widened so that it also holds when the coefficients
+are rounded and the sums are evaluated in floating point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from obsynth.designs.interval.decoupling import Decoupled
+from obsynth.designs.interval.exact_arrays import (
+    Exact,
+    FloatArray,
+    above,
+    exact,
+    hull,
+    magnitude,
+    negative,
+    positive,
+)
+from obsynth.designs.interval.model import IntervalModel, columns_of
+
+__all__ = [
+    "UNIT",
+    "Part",
+    "Precision",
+    "Remainder",
+    "Rows",
+    "estimate_rows",
+    "measured_rows",
+    "state_rows",
+]
+
+Precision = Literal["double", "single"]
+UNIT: Mapping[Precision, float] = {"double": 2.0**-53, "single": 2.0**-24}
+SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120}
+"""Above what many underflows of a sum can cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """upper = max_i U_i s and lower = min_i L_i s.
+
+    Attributes
+    ----------
+    sizes : mapping of str to int
+        The parts of s in their order; ``"one"`` is the constant 1.
+    upper, lower : tuple of exact arrays, shape (rows, len(s))
+    radius : exact array, shape (rows, len(s))
+        What the matrices may be off, as a coefficient of |s|.
+    """
+
+    sizes: Mapping[str, int]
+    upper: tuple[Exact, ...]
+    lower: tuple[Exact, ...]
+    radius: Exact
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return int(self.radius.shape[0])
+
+    def slack(self, precision: Precision) -> FloatArray:
+        """Coefficients of |s| by which a bound is widened at run time, shape (rows, len(s)).
+
+        A sum of t products whose coefficients are rounded, and whose data are rounded to the
+        working precision first, is off by less than (t + 3) u times the sum of the absolute
+        terms, the addition of the widening included; three more units cover the rounding of the
+        widening itself and the terms of second order, for t up to about a thousand.
+        """
+        unit = UNIT[precision]
+        every = np.stack([*self.upper, *self.lower])
+        largest = np.abs(every).max(axis=0)
+        terms = (every != 0).sum(axis=2).max(axis=0)
+        counts = exact(np.asarray(terms + 6, dtype=float))[:, None]
+        table = above(largest * counts * exact(unit) + self.radius)
+        start = list(self.sizes).index("one")
+        place = sum(list(self.sizes.values())[:start])
+        table[:, place] += SMALLEST[precision]
+        return table * (1.0 + 2.0**-50)
+
+
+def _stack(sizes: Mapping[str, int], count: int, parts: Mapping[str, Any]) -> Exact:
+    """Put named blocks side by side; a missing block is zero."""
+    zero = exact(0.0).item()
+    blocks = []
+    for name, size in sizes.items():
+        block = np.full((count, size), zero, dtype=object)
+        if name in parts:
+            block[:] = np.asarray(parts[name], dtype=object).reshape(count, size)
+        blocks.append(block)
+    return np.hstack(blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The quantity X (A x + B u + o + W1 w) + Y (N12 (y - W2 w) - C2 z2) of one instant.
+
+    With X = P T2 and Y = P L it is r of the next instant, with X = -F_left and Y = 0 the share of
+    the fault that is known one instant before the rest.
+
+    Attributes
+    ----------
+    model : IntervalModel
+    plant : Decoupled
+    S : exact array, shape (n - q, n - q)
+        z2 = S r.
+    X, Y : exact arrays, shapes (rows, n), (rows, m - q)
+    """
+
+    model: IntervalModel
+    plant: Decoupled
+    S: Exact
+    X: Exact
+    Y: Exact
+
+    def on_r(self, A: Exact) -> Exact:
+        """Return the coefficients of r for a matrix A."""
+        value: Exact = (self.X @ A @ self.plant.W - self.Y @ self.plant.C2) @ self.S
+        return value
+
+    def on_y(self, A: Exact) -> Exact:
+        """Return the coefficients of y for a matrix A."""
+        value: Exact = self.X @ A @ self.plant.Phi + self.Y @ self.plant.N12
+        return value
+
+    def on_w(self, A: Exact) -> Exact:
+        """Return the coefficients of w for a matrix A."""
+        value: Exact = self.X @ self.model.W1 - self.on_y(A) @ self.model.W2
+        return value
+
+    @property
+    def radius(self) -> tuple[Exact, Exact, Exact, Exact]:
+        """What rounding in the family may add to the coefficients of r, y, u and 1."""
+        a, b, o = columns_of(self.model)
+        rho = exact(self.model.family.radius)
+        X = magnitude(self.X)
+        r = X @ rho[:, a] @ magnitude(self.plant.W @ self.S)
+        y = X @ rho[:, a] @ magnitude(self.plant.Phi)
+        noise = y @ magnitude(self.model.W2) @ self.model.size("w")
+        return r, y, X @ rho[:, b], X @ rho[:, o] + noise[:, None]
+
+    def vertex_rows(self) -> Rows:
+        """Bound at the vertices of the polytope: one vertex for y, w and r together."""
+        a, b, o = columns_of(self.model)
+        low, high = self.model.box("w").T
+        sizes = _sizes(self, ("r_upper", "r_lower", "y", "u", "one"))
+        count = len(self.X)
+        upper, lower = [], []
+        for vertex in self.model.vertices:
+            M, N = self.on_r(vertex[:, a]), self.on_y(vertex[:, a])
+            least, largest = hull(self.on_w(vertex[:, a]), low, high)
+            rest = self.X @ vertex[:, o]
+            known = {"y": N, "u": self.X @ vertex[:, b]}
+            up = {"r_upper": positive(M), "r_lower": -negative(M)}
+            down = {"r_lower": positive(M), "r_upper": -negative(M)}
+            upper.append(_stack(sizes, count, {**known, **up, "one": rest + largest[:, None]}))
+            lower.append(_stack(sizes, count, {**known, **down, "one": rest + least[:, None]}))
+        r, y, u, one = self.radius
+        radius = {"r_upper": r, "r_lower": r, "y": y, "u": u, "one": one}
+        return Rows(sizes, tuple(upper), tuple(lower), _stack(sizes, count, radius))
+
+    def split(self, nominal: Exact) -> Remainder:
+        """Return nominal coefficients and elementwise bounds of what varies around them."""
+        return Remainder.of(self, nominal)
+
+    def paper_rows(self, nominal: Exact) -> Rows:
+        """Bound of (13)-(15) and (32): every term apart, positive and negative parts of r and y.
+
+        The input matrix and the offset have to be constant.
+        """
+        _, b, o = columns_of(self.model)
+        names = ("r_upper+", "r_upper-", "r_lower+", "r_lower-", "r_upper", "r_lower")
+        sizes = _sizes(self, (*names, "y+", "y-", "u", "one"))
+        count, parts = len(self.X), self.split(nominal)
+        lo, hi = parts.sigma_lower, parts.sigma_upper
+        low, high = parts.noise
+        R = parts.R
+        constant = self.model.vertices[0]
+        rest, known = self.X @ constant[:, o], {"u": self.X @ constant[:, b]}
+        up = {
+            "r_upper+": positive(hi),
+            "r_upper-": -positive(lo),
+            "r_lower+": -negative(hi),
+            "r_lower-": negative(lo),
+            "r_upper": positive(R),
+            "r_lower": -negative(R),
+            "y+": parts.M_upper,
+            "y-": -parts.M_lower,
+            "one": rest + high[:, None],
+        }
+        down = {
+            "r_lower+": positive(lo),
+            "r_lower-": -positive(hi),
+            "r_upper+": -negative(lo),
+            "r_upper-": negative(hi),
+            "r_lower": positive(R),
+            "r_upper": -negative(R),
+            "y+": parts.M_lower,
+            "y-": -parts.M_upper,
+            "one": rest + low[:, None],
+        }
+        r, y, u, one = self.radius
+        radius = {"r_upper": r, "r_lower": r, "y+": y, "y-": y, "u": u, "one": one}
+        return Rows(
+            sizes,
+            (_stack(sizes, count, {**known, **up}),),
+            (_stack(sizes, count, {**known, **down}),),
+            _stack(sizes, count, radius),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """Nominal coefficients of a `Part` and elementwise bounds of what varies, (14)-(15).
+
+    Attributes
+    ----------
+    R : coefficients of r for the nominal A
+    sigma_lower, sigma_upper : bounds of the rest of the coefficients of r
+    M_lower, M_upper : bounds of the coefficients of y
+    noise : tuple of two exact arrays
+        Box of everything that the disturbances add.
+    """
+
+    R: Exact
+    sigma_lower: Exact
+    sigma_upper: Exact
+    M_lower: Exact
+    M_upper: Exact
+    noise: tuple[Exact, Exact]
+
+    @classmethod
+    def of(cls, part: Part, nominal: Exact) -> Remainder:
+        """Bound every coefficient apart over the elementwise box of A - nominal."""
+        a, _, _ = columns_of(part.model)
+        around = np.stack([vertex[:, a] - nominal for vertex in part.model.vertices])
+        low, high = around.min(axis=0), around.max(axis=0)
+        sigma = _image(part.X, low, high, part.plant.W @ part.S)
+        change = _image(part.X, low, high, part.plant.Phi)
+        M = part.on_y(nominal)
+        M_lower, M_upper = M + change[0], M + change[1]
+        w_low, w_high = part.model.box("w").T
+        v_low, v_high = hull(part.model.W2, w_low, w_high)
+        products = [m * v for m in (M_lower, M_upper) for v in (v_low, v_high)]
+        stacked = np.stack(products) if products[0].size else np.zeros((1, *M.shape), dtype=object)
+        own = hull(part.X @ part.model.W1, w_low, w_high)
+        noise = (
+            own[0] - stacked.max(axis=0).sum(axis=1),
+            own[1] - stacked.min(axis=0).sum(axis=1),
+        )
+        return cls(part.on_r(nominal), *sigma, M_lower, M_upper, noise)
+
+
+def _image(left: Exact, low: Exact, high: Exact, right: Exact) -> tuple[Exact, Exact]:
+    """Return elementwise bounds of left D right over low <= D <= high, every entry bounded once."""
+    rows, columns = left.shape[0], right.shape[1]
+    lower = np.full((rows, columns), exact(0.0).item(), dtype=object)
+    upper = lower.copy()
+    for i in range(rows):
+        for j in range(columns):
+            weights = np.outer(left[i], right[:, j])
+            plus, minus = positive(weights), negative(weights)
+            lower[i, j] = lower[i, j] + (plus * low - minus * high).sum()
+            upper[i, j] = upper[i, j] + (plus * high - minus * low).sum()
+    return lower, upper
+
+
+def _sizes(part: Part, names: tuple[str, ...]) -> dict[str, int]:
+    n2, m, n_u = part.S.shape[0], len(part.model.C), len(part.model.plant.u)
+    known: Mapping[str, Callable[[], int]] = {"y": lambda: m, "u": lambda: n_u, "one": lambda: 1}
+    return {name: known.get(name.rstrip("+-"), lambda: n2)() for name in names}
+
+
+def _linear(
+    sizes: Mapping[str, int],
+    r: Exact,
+    y: Exact,
+    noise: tuple[Exact, Exact],
+    more: Mapping[str, Any],
+) -> Rows:
+    """One linear function of r and y with a box of noise."""
+    count = len(r)
+    up = {"r_upper": positive(r), "r_lower": -negative(r), "y": y, "one": noise[1][:, None]}
+    down = {"r_lower": positive(r), "r_upper": -negative(r), "y": y, "one": noise[0][:, None]}
+    upper = {**up, **{k: v for k, v in more.items() if k.endswith("upper")}}
+    lower = {**down, **{k: v for k, v in more.items() if k.endswith("lower")}}
+    nothing = _stack(sizes, count, {})
+    return Rows(sizes, (_stack(sizes, count, upper),), (_stack(sizes, count, lower),), nothing)
+
+
+def state_rows(part: Part) -> Rows:
+    """Bounds of x from r and y of the same instant, (26)."""
+    low, high = part.model.box("w").T
+    noise = hull(-part.plant.Phi @ part.model.W2, low, high)
+    sizes = _sizes(part, ("r_upper", "r_lower", "y", "one"))
+    return _linear(sizes, part.plant.W @ part.S, part.plant.Phi, noise, {})
+
+
+def estimate_rows(part: Part, faults: int) -> Rows:
+    """Bounds of the first faults from their earlier share and r and y of the next instant, (32)."""
+    left = part.plant.F_left[:faults]
+    low, high = part.model.box("w").T
+    noise = hull(-left @ part.plant.Phi @ part.model.W2, low, high)
+    sizes = {
+        "share_upper": faults,
+        "share_lower": faults,
+        **_sizes(part, ("r_upper", "r_lower", "y", "one")),
+    }
+    same = exact(np.eye(faults))
+    more = {"share_upper": same, "share_lower": same}
+    return _linear(sizes, left @ part.plant.W @ part.S, left @ part.plant.Phi, noise, more)
+
+
+def measured_rows(part: Part, output: int, component: int) -> Rows:
+    """Bounds of one component of r from one row of N12 y = C2 S r + N12 W2 w."""
+    Q = part.plant.C2 @ part.S
+    row = part.plant.N12[output : output + 1] / Q[output, component]
+    others = -Q[output : output + 1] / Q[output, component]
+    others[0, component] = exact(0.0).item()
+    low, high = part.model.box("w").T
+    noise = hull(-row @ part.model.W2, low, high)
+    return _linear(_sizes(part, ("r_upper", "r_lower", "y", "one")), others, row, noise, {})

@@ -1,0 +1,140 @@
+"""From a model to gains whose bounds are proved to stay bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.interval.design import IntervalDesign
+from obsynth.designs.interval.exact_arrays import FloatArray, exact, nearest
+from obsynth.designs.interval.gains import Reduced, lp_gain, placed_gains, sylvester_gain
+from obsynth.designs.interval.theorem import NEGATIVE, divergence
+from obsynth.designs.interval.widths import steady, steady_holds
+from obsynth.symbolic import ObsynthError
+
+__all__ = ["complete", "given_gains", "lp_design", "sylvester_design", "with_gains"]
+
+
+def with_gains(design: IntervalDesign, P: FloatArray, L: FloatArray) -> IntervalDesign:
+    """Return the design with other gains, its steady widths not yet known."""
+    return replace(design, P=P, L=L, error=np.zeros(0), width=np.zeros(0))
+
+
+def complete(design: IntervalDesign) -> IntervalDesign | None:
+    """Find the steady widths; None if the bounds diverge or the paper's R is not nonnegative."""
+    if design.bound == "paper":
+        R = nearest(design.prediction.on_r(exact(design.nominal)))
+        if R.min(initial=0.0) < -NEGATIVE:
+            return None
+    found = steady(design.width_map)
+    if found is None or not steady_holds(design.width_map, *found)[0]:
+        return None
+    return replace(design, error=found[0], width=found[1])
+
+
+def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign:
+    """Complete a design with given P and L; for L = None the linear programme chooses it.
+
+    Raises
+    ------
+    ObsynthError
+        If a shape is wrong or P singular.
+    InfeasibleDesign
+        If the bounds diverge.
+    """
+    n2, m2 = design.plant.C2.shape[1], design.plant.C2.shape[0]
+    P = np.asarray(P, dtype=float)
+    if P.shape != (n2, n2) or not np.isfinite(P).all() or np.linalg.matrix_rank(P) < n2:
+        raise ObsynthError(f"P has to be regular with shape {(n2, n2)}", option="gains")
+    if L is None:
+        L = lp_gain(Reduced.of(design.model, design.plant), P)
+    L = np.asarray(L, dtype=float)
+    L = L[:, None] if L.ndim == 1 and m2 == 1 else L
+    if L.shape != (n2, m2) or not np.isfinite(L).all():
+        raise ObsynthError(f"L has to be finite with shape {(n2, m2)}", option="gains")
+    chosen = with_gains(design, P, L)
+    done = complete(chosen)
+    if done is None:
+        raise divergence(chosen)
+    return done
+
+
+def lp_design(design: IntervalDesign) -> IntervalDesign:
+    """Gains by the linear programme: P = I where that works, else the best of several P.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no P that was tried gives bounds that stay bounded.
+    """
+    data = Reduced.of(design.model, design.plant)
+    identity = np.eye(data.A.shape[1])
+    first = _try(design, identity, _programme(data, identity))
+    if first is not None:
+        return first
+    done = [d for d in (_try(design, P, L) for P, L in _candidates(data)) if d is not None]
+    if not done:
+        gains = next(_candidates(data), (identity, np.zeros((len(identity), len(data.C2)))))
+        raise divergence(with_gains(design, *gains), "no P was found whose bounds stay bounded")
+    return min(done, key=lambda d: float(d.half_widths.sum()))
+
+
+def _programme(data: Reduced, P: FloatArray) -> FloatArray | None:
+    try:
+        return lp_gain(data, P)
+    except InfeasibleDesign:
+        return None
+
+
+def _candidates(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
+    identity = np.eye(data.A.shape[1])
+    for P, L in placed_gains(data):
+        yield P, L
+        better = _programme(data, P)
+        if better is not None:
+            yield P, better
+        yield identity, L
+
+
+def _try(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign | None:
+    return None if L is None else complete(with_gains(design, P, L))
+
+
+def sylvester_design(
+    design: IntervalDesign, R: FloatArray | None, Q: FloatArray | None
+) -> IntervalDesign:
+    """Gains by P A2 - R P = Q C2 for a nonnegative R: given, or the best of several diagonal ones.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If the equation has no regular solution, or the bounds diverge.
+    """
+    data = Reduced.of(design.model, design.plant)
+    A2 = nearest(design.plant.T2 @ exact(design.nominal) @ design.plant.W)
+    n2, m2 = len(A2), len(data.C2)
+    if R is not None:
+        P, L = sylvester_gain(A2, data.C2, R, np.ones((n2, m2)) if Q is None else Q)
+        return given_gains(design, P, L)
+    done, last = [], None
+    for start in (0.0, 0.1, 0.2, 0.3, 0.5):
+        poles = start + 0.1 * np.arange(n2) / max(n2 - 1, 1)
+        try:
+            P, L = sylvester_gain(A2, data.C2, np.diag(poles), np.ones((n2, m2)))
+        except InfeasibleDesign:
+            continue
+        last = with_gains(design, P, L)
+        found = complete(last)
+        if found is not None:
+            done.append(found)
+    if done:
+        return min(done, key=lambda d: float(d.half_widths.sum()))
+    if last is None:
+        raise InfeasibleDesign(
+            "P A2 - R P = Q C2 has no regular solution for the R that were tried",
+            ['give R= and Q=, or use gains="lp"'],
+        )
+    raise divergence(last, "the bounds diverge for every R that was tried")
