@@ -13,6 +13,7 @@ from obsynth.designs.fault_detector import FaultDetector
 from obsynth.designs.hinf import HinfUIO
 from obsynth.designs.interval import IntervalObserver
 from obsynth.designs.observer import STATUS, Observer
+from obsynth.designs.set_adaptive import SetAdaptiveObserver
 from obsynth.designs.storage import load, save
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "InfeasibleDesign",
     "IntervalObserver",
     "Observer",
+    "SetAdaptiveObserver",
     "SolverTrouble",
     "load",
     "save",

@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.errors import CertificateError
 from obsynth.designs.observer import Observer
+from obsynth.designs.set_adaptive.bank import BankDesign
+from obsynth.designs.set_adaptive.bank_assembly import assemble_bank, prove_bank
 from obsynth.designs.set_adaptive.design import METHOD, SetDesign
 from obsynth.designs.set_adaptive.equations import memory_layout
+from obsynth.designs.set_adaptive.inputs import read_box, read_vector
 from obsynth.designs.set_adaptive.ode import build_ode
 from obsynth.designs.set_adaptive.proof import prove_design
 from obsynth.designs.set_adaptive.step import ROUNDING, build_step, initial_memory
 from obsynth.designs.set_adaptive.structure import Structure
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 from obsynth.designs.storage import FORMAT, VERSION
-from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]
@@ -42,11 +43,13 @@ def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]
     level : {"full", "lmi"}
         Whether the form and its elementwise bounds are derived again.
     """
+    if record.get("kind") == "bank":
+        return prove_bank(BankDesign.from_record(record), level)
     return prove_design(SetDesign.from_record(record), level)
 
 
 def assemble(
-    record_or_design: Mapping[str, Any] | SetDesign,
+    record_or_design: Mapping[str, Any] | SetDesign | BankDesign,
     derived: Structure | None = None,
     level: Level = "lmi",
 ) -> Observer:
@@ -54,7 +57,7 @@ def assemble(
 
     Parameters
     ----------
-    record_or_design : mapping or SetDesign
+    record_or_design : mapping, SetDesign or BankDesign
     derived : Structure, optional
         What was just derived from the plant; proved too, without deriving it again.
     level : {"full", "lmi"}
@@ -64,8 +67,12 @@ def assemble(
     CertificateError
         If a claim does not hold.
     """
+    if isinstance(record_or_design, BankDesign):
+        return assemble_bank(record_or_design, level)
     if isinstance(record_or_design, SetDesign):
         design = record_or_design
+    elif record_or_design.get("kind") == "bank":
+        return assemble_bank(BankDesign.from_record(record_or_design), level)
     else:
         design = SetDesign.from_record(record_or_design)
     claims = prove_design(design, level, derived)
@@ -119,29 +126,6 @@ def _make_start(design: SetDesign) -> Callable[..., FloatArray]:
     return start
 
 
-def read_vector(value: Any, plant: Plant) -> FloatArray:
-    """Check the guess of `memory0`."""
-    array = np.asarray(value, dtype=float)
-    names = plant.names("x")
-    if array.shape != (len(names),) or not np.all(np.isfinite(array)):
-        raise ObsynthError(
-            f"guess has to be {len(names)} finite numbers ({', '.join(names)}); got {value!r}"
-        )
-    return array
-
-
-def read_box(value: Any, default: FloatArray, what: str, names: tuple[str, ...]) -> FloatArray:
-    """Check a box of `memory0`, or take the declared one."""
-    box = default if value is None else np.asarray(value, dtype=float)
-    if box.shape != default.shape or not np.all(np.isfinite(box)) or np.any(box[:, 0] > box[:, 1]):
-        raise ObsynthError(
-            f"{what} has to be {len(names)} finite pairs lower <= upper ({', '.join(names)}); got "
-            f"{value!r}",
-            option=what,
-        )
-    return box
-
-
 def _guarantee(design: SetDesign) -> Guarantee:
     plant = design.plant
     x, f = ", ".join(plant.names("x")), ", ".join(plant.names("f"))
@@ -188,7 +172,3 @@ def _guarantee(design: SetDesign) -> Guarantee:
         "is added to the bounds"
     )
     return Guarantee(tuple(claims), tuple(assumptions))
-
-
-def _refuse_unknown(kind: Any) -> CertificateError:
-    return CertificateError(f"kind = {kind!r} in the stored design")

@@ -34,11 +34,13 @@ if TYPE_CHECKING:
     from obsynth.designs import InfeasibleDesign as InfeasibleDesign
     from obsynth.designs import IntervalObserver as IntervalObserver
     from obsynth.designs import Observer as Observer
+    from obsynth.designs import SetAdaptiveObserver as SetAdaptiveObserver
     from obsynth.designs import load as load
     from obsynth.evaluate import Run as Run
     from obsynth.evaluate import SimulationError as SimulationError
     from obsynth.evaluate import Table as Table
     from obsynth.evaluate import coverage_table as coverage_table
+    from obsynth.evaluate import plot_alarms as plot_alarms
     from obsynth.evaluate import plot_errors as plot_errors
     from obsynth.evaluate import plot_run as plot_run
     from obsynth.evaluate import plot_signal as plot_signal
@@ -71,6 +73,7 @@ __all__ = [
     "PlantError",
     "Run",
     "Scenario",
+    "SetAdaptiveObserver",
     "SimulationError",
     "Split",
     "StructureError",
@@ -89,6 +92,7 @@ __all__ = [
     "load",
     "majorant",
     "plants",
+    "plot_alarms",
     "plot_errors",
     "plot_run",
     "plot_signal",
@@ -130,6 +134,7 @@ _ROOMS = {
         "InfeasibleDesign",
         "IntervalObserver",
         "Observer",
+        "SetAdaptiveObserver",
         "load",
     ),
     "codegen": ("CProject", "generate_c"),
@@ -138,6 +143,7 @@ _ROOMS = {
         "SimulationError",
         "Table",
         "coverage_table",
+        "plot_alarms",
         "plot_errors",
         "plot_run",
         "plot_signal",
