@@ -13,6 +13,7 @@ from obsynth.designs.fault_detector import FaultDetector
 from obsynth.designs.hinf import HinfUIO
 from obsynth.designs.interval import IntervalObserver
 from obsynth.designs.observer import STATUS, Observer
+from obsynth.designs.qpv import Ellipsoid, QPVObserver
 from obsynth.designs.set_adaptive import SetAdaptiveObserver
 from obsynth.designs.storage import load, save
 
@@ -24,6 +25,7 @@ __all__ = [
     "Claim",
     "Detection",
     "DetectorError",
+    "Ellipsoid",
     "FaultDetector",
     "FaultEvent",
     "Guarantee",
@@ -31,6 +33,7 @@ __all__ = [
     "InfeasibleDesign",
     "IntervalObserver",
     "Observer",
+    "QPVObserver",
     "SetAdaptiveObserver",
     "SolverTrouble",
     "load",

@@ -29,11 +29,13 @@ if TYPE_CHECKING:
     from obsynth.designs import BoundedErrorUIO as BoundedErrorUIO
     from obsynth.designs import Certificate as Certificate
     from obsynth.designs import CertificateError as CertificateError
+    from obsynth.designs import Ellipsoid as Ellipsoid
     from obsynth.designs import FaultDetector as FaultDetector
     from obsynth.designs import HinfUIO as HinfUIO
     from obsynth.designs import InfeasibleDesign as InfeasibleDesign
     from obsynth.designs import IntervalObserver as IntervalObserver
     from obsynth.designs import Observer as Observer
+    from obsynth.designs import QPVObserver as QPVObserver
     from obsynth.designs import SetAdaptiveObserver as SetAdaptiveObserver
     from obsynth.designs import load as load
     from obsynth.evaluate import Run as Run
@@ -61,6 +63,7 @@ __all__ = [
     "CProject",
     "Certificate",
     "CertificateError",
+    "Ellipsoid",
     "Equilibrium",
     "FaultDetector",
     "HinfUIO",
@@ -71,6 +74,7 @@ __all__ = [
     "ObsynthError",
     "Plant",
     "PlantError",
+    "QPVObserver",
     "Run",
     "Scenario",
     "SetAdaptiveObserver",
@@ -129,11 +133,13 @@ _ROOMS = {
         "BoundedErrorUIO",
         "Certificate",
         "CertificateError",
+        "Ellipsoid",
         "FaultDetector",
         "HinfUIO",
         "InfeasibleDesign",
         "IntervalObserver",
         "Observer",
+        "QPVObserver",
         "SetAdaptiveObserver",
         "load",
     ),

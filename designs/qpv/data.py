@@ -1,0 +1,124 @@
+"""The numbers of a design problem: matrices at the vertices of the scheduling variables, sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.affine_family import AffineFamily
+from obsynth.derive.qpv import QPVLayout, QPVVertices
+from obsynth.designs.qpv.members import ErrorSets, psi_kept
+from obsynth.designs.qpv.polya import PolyaTerm, collapsed_terms, polya_terms
+
+__all__ = ["VertexData", "read_vertices"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class VertexData:
+    """Matrices of the augmented plant at the V vertices of the scheduling variables.
+
+    Attributes
+    ----------
+    A, G, C, H : ndarray
+        Shapes (V, n, n), (V, n, n_v), (V, m, n), (V, m, n_v), n with the faults; disturbances
+        first, then the rates of faults that have one.
+    N : ndarray of shape (V, n, n, n)
+        N[l, i] is N_i.
+    Cz : ndarray of shape (V, n_z, n)
+        Performance output.
+    A_radius, G_radius, C_radius, H_radius, N_radius : ndarray
+        What rounding may add, the same at every vertex.
+    """
+
+    A: FloatArray
+    G: FloatArray
+    C: FloatArray
+    H: FloatArray
+    N: FloatArray
+    Cz: FloatArray
+    A_radius: FloatArray
+    G_radius: FloatArray
+    C_radius: FloatArray
+    H_radius: FloatArray
+    N_radius: FloatArray
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of states with faults, outputs, disturbances."""
+        return self.A.shape[1], self.C.shape[1], self.G.shape[2]
+
+    @property
+    def collapses(self) -> bool:
+        """Whether C and H are the same at all vertices, so that double sums are single ones."""
+        return bool((self.C[0] == self.C).all() and (self.H[0] == self.H).all())
+
+    def terms(self, polya: int | None) -> tuple[PolyaTerm, ...]:
+        """Terms of the relaxation; collapsed where that is exact, of order 2 by default."""
+        count = len(self.A)
+        if self.collapses or count == 1:
+            return collapsed_terms(count)
+        return polya_terms(count, 2 if polya is None else polya)
+
+    def scaled(self, half: FloatArray) -> VertexData:
+        """Rewrite for errors in units of `half`; radii are dropped, since this only guides."""
+        return replace(
+            self,
+            A=self.A * half / half[:, None],
+            G=self.G / half[:, None],
+            C=self.C * half,
+            Cz=self.Cz * half,
+        )
+
+    def psi(self, sets: ErrorSets) -> FloatArray:
+        """Extreme values of Psi, shape (V, kept, n, n)."""
+        return psi_kept(self.N, sets)
+
+    def with_rates(self, faults: list[int]) -> VertexData:
+        """Add one disturbance for the rate of change of each of some states."""
+        vertices, n = self.A.shape[:2]
+        m = self.C.shape[1]
+        more = np.eye(n)[:, faults]
+        still = np.zeros((vertices, m, len(faults)))
+        return replace(
+            self,
+            G=np.concatenate([self.G, np.broadcast_to(more, (vertices, *more.shape))], axis=2),
+            H=np.concatenate([self.H, still], axis=2),
+            G_radius=np.hstack([self.G_radius, np.zeros_like(more)]),
+            H_radius=np.hstack([self.H_radius, np.zeros((m, len(faults)))]),
+        )
+
+
+def read_vertices(family: AffineFamily, layout: QPVLayout, Cz: FloatArray) -> VertexData:
+    """Take the blocks from a stacked family.
+
+    Parameters
+    ----------
+    family : AffineFamily
+        Columns [c A N M B D B_f G] over the rows of dynamics and outputs.
+    layout : QPVLayout
+    Cz : ndarray of shape (V, n_z, n)
+    """
+    corners = QPVVertices(family, layout)
+    n = layout.states
+
+    def radius(name: str, outputs: bool = False) -> FloatArray:
+        rows = layout.measurement if outputs else layout.dynamics
+        return family.radius[rows, layout.columns(name)]
+
+    return VertexData(
+        A=corners.A,
+        G=corners.G,
+        C=corners.C,
+        H=corners.H,
+        N=corners.N,
+        Cz=Cz,
+        A_radius=radius("A"),
+        G_radius=radius("G"),
+        C_radius=radius("A", outputs=True),
+        H_radius=radius("G", outputs=True),
+        N_radius=radius("N").reshape(n, n, n),
+    )

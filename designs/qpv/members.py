@@ -1,0 +1,230 @@
+"""The matrix Psi of the error dynamics over the polytopes of state and error.
+
+With x' = A x + [x'N_i x] and e = x - xhat follows e' = (A - L C + Psi(x, e)) e, where row i of Psi
+is x'(N_i + N_i') - e'N_i: equations (8)-(10), (30) and (24) of Rotondo, Buciakowski and Witczak.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.lmi import Enclosure, extreme_points
+from obsynth.designs.qpv.polytopes import Shape
+
+__all__ = ["ErrorSets", "entering", "psi_family", "psi_kept"]
+
+FloatArray = NDArray[np.float64]
+
+# Hulls in more coordinates have too many facets.
+_HULL_DIMENSION = 7
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSets:
+    """The sets over which the inequalities are stated.
+
+    Attributes
+    ----------
+    centre : ndarray of shape (n,)
+        c of the region.
+    state : Shape
+        Of x - c, all coordinates; it holds the region.
+    error : Shape
+        Of e in the coordinates `error_coordinates`; it holds {e : e'P e <= 1}.
+    error_coordinates : tuple of int
+        At least those that enter Psi.
+    start : ndarray of shape (r, n)
+        Corners of the polytope of e(0), one of every pair v, -v; it lies in {e : e'P e <= 1}.
+    state_entering, error_entering : tuple of int
+        The coordinates that enter Psi.
+    """
+
+    centre: FloatArray
+    state: Shape
+    error: Shape
+    error_coordinates: tuple[int, ...]
+    start: FloatArray
+    state_entering: tuple[int, ...]
+    error_entering: tuple[int, ...]
+
+    @cached_property
+    def _projected(self) -> tuple[Shape, Shape]:
+        places = [self.error_coordinates.index(k) for k in self.error_entering]
+        return self.state.onto(self.state_entering), self.error.onto(places)
+
+    @cached_property
+    def pairs(self) -> FloatArray:
+        """Offsets of all pairs of vertices, shape (p q, number of entering coordinates)."""
+        x, e = (shape.vertices for shape in self._projected)
+        return np.hstack([np.repeat(x, len(e), axis=0), np.tile(e, (len(x), 1))])
+
+    @property
+    def pair_radius(self) -> FloatArray:
+        """What rounding may add to the offsets, by coordinate."""
+        places = [self.error_coordinates.index(k) for k in self.error_entering]
+        x, e = self._projected
+        return np.concatenate(
+            [
+                x.radius + self.state.radius[list(self.state_entering)],
+                e.radius + self.error.radius[places],
+            ]
+        )
+
+    @property
+    def normals(self) -> Enclosure:
+        """Half-spaces of the error's polytope, one of every pair a, -a, shape (K, 1, n)."""
+        known = self.error.normals
+        places = list(self.error_coordinates)
+        mid = np.zeros((len(known.mid), 1, self.centre.size))
+        rad = np.zeros_like(mid)
+        mid[:, :, places], rad[:, :, places] = known.mid, known.rad
+        return Enclosure(mid, rad)
+
+
+def entering(N: FloatArray) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Find the coordinates of x and of e on which Psi depends.
+
+    Parameters
+    ----------
+    N : ndarray of shape (V, n, n, n)
+        N_i at every vertex of the scheduling variables.
+
+    Returns
+    -------
+    state, error : tuple of int
+
+    Examples
+    --------
+    A fault x[1] that multiplies the state x[0]: with N above the diagonal, e enters through the
+    state's error only.
+
+    >>> N = np.zeros((1, 2, 2, 2))
+    >>> N[0, 0, 0, 1] = 1.0
+    >>> entering(N)
+    ((0, 1), (0,))
+    """
+    symmetric = N + np.swapaxes(N, -1, -2)
+    state = np.flatnonzero(symmetric.any(axis=(0, 1, 3)))
+    error = np.flatnonzero(N.any(axis=(0, 1, 3)))
+    return tuple(map(int, state)), tuple(map(int, error))
+
+
+def _directions(N: FloatArray, sets: ErrorSets, radius: FloatArray) -> tuple[Enclosure, Enclosure]:
+    """Psi at the centre, and its slope for every entering coordinate (K, n, n)."""
+    enclosed = Enclosure.of(N, radius)
+    both = enclosed + enclosed.T
+    # entry (i, a, b) of N is the slope of Psi[i, b] by coordinate a
+    slope = Enclosure(np.swapaxes(both.mid, 0, 1), np.swapaxes(both.rad, 0, 1))
+    error = Enclosure(-np.swapaxes(enclosed.mid, 0, 1), np.swapaxes(enclosed.rad, 0, 1))
+    centre = Enclosure(np.zeros(N.shape[1:]), np.zeros(N.shape[1:]))
+    for a in np.flatnonzero(sets.centre):
+        centre = centre + Enclosure.of(sets.centre[a]) * slope.member(a)
+    s, t = list(sets.state_entering), list(sets.error_entering)
+    mid = np.concatenate([slope.mid[s], error.mid[t]])
+    rad = np.concatenate([slope.rad[s], error.rad[t]])
+    return centre, Enclosure(mid, rad)
+
+
+def psi_family(
+    N: FloatArray, sets: ErrorSets, radius: FloatArray | None = None, rows: FloatArray | None = None
+) -> Enclosure:
+    """Enclose Psi at pairs of vertices.
+
+    Parameters
+    ----------
+    N : ndarray of shape (n, n, n)
+        At one vertex of the scheduling variables.
+    sets : ErrorSets
+    radius : ndarray of shape (n, n, n), optional
+        Rounding of N.
+    rows : ndarray of shape (k, K), optional
+        Offsets; all pairs of vertices by default.
+
+    Returns
+    -------
+    Enclosure, shape (k, n, n)
+    """
+    offsets = sets.pairs if rows is None else rows
+    n = N.shape[0]
+    if not offsets.shape[1]:
+        return Enclosure(np.zeros((1, n, n)), np.zeros((1, n, n)))
+    centre, directions = _directions(N, sets, np.zeros_like(N) if radius is None else radius)
+    family = Enclosure.combine(centre, directions, offsets)
+    spread = sets.pair_radius
+    if not spread.any():
+        return family
+    largest = np.abs(directions.mid) + directions.rad
+    added = np.tensordot(spread, largest, axes=1) * (1.0 + 2.0**-40)
+    return Enclosure(family.mid, family.rad + added)
+
+
+def psi_kept(N: FloatArray, sets: ErrorSets) -> FloatArray:
+    """Return the distinct extreme values of Psi among all pairs.
+
+    An inequality that is affine in Psi holds at all pairs if it holds at these. What enters only
+    through a difference, such as x_j - e_i, is merged, and what enters nowhere disappears.
+
+    Parameters
+    ----------
+    N : ndarray of shape (V, n, n, n)
+    sets : ErrorSets
+
+    Returns
+    -------
+    ndarray of shape (V, kept, n, n)
+        The same pairs at every vertex of the scheduling variables; one matrix of zeros where
+        nothing is quadratic.
+    """
+    families = np.stack([psi_family(block, sets).mid for block in N], axis=1)
+    count = len(families)
+    flat = families.reshape(count, -1)
+    varying = np.flatnonzero(np.ptp(flat, axis=0) > 0)
+    independent = _independent(flat[:, varying])
+    kept = _extreme(_tidy(independent)) if independent.size else np.zeros(1, dtype=np.intp)
+    return np.swapaxes(families[kept], 0, 1)
+
+
+def _extreme(points: FloatArray) -> NDArray[np.intp]:
+    """Rows that are extreme, up to rounding; the hull grows by what lies outside it."""
+    dimension = points.shape[1]
+    if dimension == 1:
+        return np.unique([points[:, 0].argmin(), points[:, 0].argmax()])
+    if dimension > _HULL_DIMENSION:
+        return extreme_points(points).kept
+    from scipy.spatial import ConvexHull
+
+    directions = np.random.default_rng(0).normal(size=(dimension, 64 * dimension))
+    chosen = np.unique((points @ directions).argmax(axis=0))
+    while True:
+        hull = ConvexHull(points[chosen])
+        heights = points @ hull.equations[:, :-1].T + hull.equations[:, -1]
+        beyond = np.flatnonzero(heights.max(axis=0) > 1e-9)
+        if not len(beyond):
+            return np.sort(chosen[hull.vertices])
+        chosen = np.union1d(chosen, heights[:, beyond].argmax(axis=0))
+
+
+def _independent(columns: FloatArray) -> FloatArray:
+    """Columns of which the others are affine functions, so that they tell the points apart."""
+    chosen: list[int] = []
+    rank = 0
+    centred = columns - columns.mean(axis=0, keepdims=True)
+    for j in range(columns.shape[1]):
+        trial = np.linalg.matrix_rank(centred[:, [*chosen, j]], tol=1e-9)
+        if trial > rank:
+            chosen, rank = [*chosen, j], int(trial)
+    return columns[:, chosen]
+
+
+def _tidy(points: FloatArray) -> FloatArray:
+    """Round to 30 bits of the half range of each column, so that exact tests see patterns.
+
+    The result only chooses what the solver is told; the proof covers all pairs.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    centred = (points - 0.5 * (low + high)) / np.where(high > low, 0.5 * (high - low), 1.0)
+    return np.asarray(np.round(centred * 2.0**30) / 2.0**30)

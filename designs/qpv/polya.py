@@ -1,0 +1,84 @@
+"""Double polytopic sums as finitely many terms: Polya's relaxation, and its exact collapse.
+
+sum_l sum_m mu_l mu_m F_lm < 0 on the simplex follows from the coefficients of (sum mu)^(s-2) times
+it, one for every multi-index of s vertices. With k_l the multiplicity of vertex l the coefficient
+is, up to a positive factor, sum_lm k_l (k_m - [l = m]) / (s (s - 1)) F_lm. This is (47)-(49) of
+Rotondo, Buciakowski and Witczak with the sum over the distinct permutations, the range 1..N of the
+indices and alpha P inside the sum.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["PolyaTerm", "collapsed_terms", "polya_terms"]
+
+
+@dataclass(frozen=True, eq=False)
+class PolyaTerm:
+    """Integer weights of one term.
+
+    Attributes
+    ----------
+    total : int
+        s (s - 1), the sum of either kind of weights; 1 for collapsed terms.
+    single : ndarray of int, shape (N,)
+        Weights of what depends on one index.
+    double : ndarray of int, shape (N, N)
+        Weights of products, [r_1, r_2].
+    """
+
+    total: int
+    single: NDArray[np.int64]
+    double: NDArray[np.int64]
+
+
+def collapsed_terms(vertices: int) -> tuple[PolyaTerm, ...]:
+    """One term per vertex: exact when the second factor of the products does not vary.
+
+    Examples
+    --------
+    >>> len(collapsed_terms(4))
+    4
+    """
+    units = np.eye(vertices, dtype=np.int64)
+    return tuple(PolyaTerm(1, unit, np.diag(unit)) for unit in units)
+
+
+def polya_terms(vertices: int, order: int) -> tuple[PolyaTerm, ...]:
+    """All terms of order s, C(N + s - 1, s) of them.
+
+    Parameters
+    ----------
+    vertices : int
+        N.
+    order : int
+        s, at least 2.
+
+    Raises
+    ------
+    ObsynthError
+        If s is no integer from 2 on.
+
+    Examples
+    --------
+    >>> [len(polya_terms(4, s)) for s in (2, 3, 4)]
+    [10, 20, 35]
+    """
+    if isinstance(order, bool) or not isinstance(order, int) or order < 2:
+        raise ObsynthError(
+            f"polya is {order!r}; the order s of the relaxation is an integer from 2 on",
+            option="polya",
+        )
+    terms = []
+    for chosen in itertools.combinations_with_replacement(range(vertices), order):
+        k = np.bincount(chosen, minlength=vertices).astype(np.int64)
+        double = np.outer(k, k) - np.diag(k)
+        terms.append(PolyaTerm(order * (order - 1), k * (order - 1), double))
+    return tuple(terms)

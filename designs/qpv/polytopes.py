@@ -1,0 +1,177 @@
+"""Polytopes about the origin, with half-spaces and vertices that are proved to belong together."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive import polytope_from_halfspaces, polytope_from_vertices
+from obsynth.derive.errors import DerivationError
+from obsynth.designs.lmi import Enclosure
+from obsynth.symbolic.errors import ObsynthError
+
+__all__ = ["KINDS", "Shape", "box", "cross", "hull"]
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["box", "cross", "hull"]
+KINDS: tuple[Kind, ...] = ("box", "cross", "hull")
+_MOST = 2**14
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The polytope {e : a_k' e <= 1}, a_k in the rows of `normals`, which holds the origin.
+
+    Attributes
+    ----------
+    kind : {"box", "cross", "hull"}
+        ``"box"``: |e_i| <= r_i. ``"cross"``: sum |e_i| / r_i <= 1. ``"hull"``: by half-spaces.
+    data : ndarray
+        r of shape (N,), or the half-spaces of shape (K, N) for ``"hull"``.
+    """
+
+    kind: Kind
+    data: FloatArray
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates N."""
+        return int(self.data.shape[-1])
+
+    @cached_property
+    def _corners(self) -> tuple[FloatArray, FloatArray]:
+        n = self.dimension
+        if self.kind == "box":
+            _check_count(2**n, f"a box of {n} coordinates")
+            return _signs(n) * self.data, np.zeros(n)
+        if self.kind == "cross":
+            return np.vstack([-np.diag(self.data), np.diag(self.data)]) + 0.0, np.zeros(n)
+        found = polytope_from_halfspaces(self.data, np.ones(len(self.data)))
+        return found.vertices, found.radius
+
+    @property
+    def vertices(self) -> FloatArray:
+        """Corners, shape (p, N)."""
+        return self._corners[0]
+
+    @property
+    def radius(self) -> FloatArray:
+        """What rounding may add to the corners, by coordinate, shape (N,)."""
+        return self._corners[1]
+
+    @cached_property
+    def normals(self) -> Enclosure:
+        """All a_k, shape (K, 1, N)."""
+        n = self.dimension
+        if self.kind == "hull":
+            return Enclosure.of(self.data[:, None, :])
+        one, sides = Enclosure.of(np.ones((1, 1))), Enclosure.of(self.data[None, :])
+        inverse = one / sides
+        if self.kind == "box":
+            unit = np.eye(n)[:, None, :]
+            return Enclosure(unit * inverse.mid, unit * inverse.rad)
+        _check_count(2 ** (n - 1), f"the half-spaces of a cross-polytope of {n} coordinates")
+        half = _signs(n)[2 ** (n - 1) :, None, :]
+        return Enclosure(half * inverse.mid, np.abs(half) * inverse.rad)
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """Half widths of the bounding box, shape (N,)."""
+        if self.kind != "hull":
+            return self.data
+        return np.asarray(np.abs(self.vertices).max(axis=0))
+
+    def scaled(self, factor: float) -> Shape:
+        """Return the shape times a positive number."""
+        return Shape(self.kind, self.data / factor if self.kind == "hull" else self.data * factor)
+
+    def onto(self, coordinates: Sequence[int]) -> Shape:
+        """Project onto some coordinates: what enters an inequality through these only."""
+        chosen = list(coordinates)
+        if chosen == list(range(self.dimension)):
+            return self
+        if self.kind != "hull":
+            return Shape(self.kind, self.data[chosen])
+        return hull(self.vertices[:, chosen])
+
+    def to_record(self) -> dict[str, Any]:
+        """Return JSON-able data."""
+        return {"kind": self.kind, "data": self.data.tolist()}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Shape:
+        """Read what `to_record` returned; a ValueError says what does not fit."""
+        data = np.asarray(record["data"], dtype=float)
+        kind = record["kind"]
+        if kind not in KINDS or data.ndim != (2 if kind == "hull" else 1):
+            raise ValueError(f"no polytope: kind {kind!r}, data of shape {data.shape}")
+        if not np.isfinite(data).all() or (kind != "hull" and np.any(data <= 0)):
+            raise ValueError(f"the data of a {kind} are not positive and finite")
+        return cls(kind, data)
+
+
+def box(half_widths: FloatArray) -> Shape:
+    """Return the box |e_i| <= half_widths_i.
+
+    Examples
+    --------
+    >>> box(np.array([1.0, 2.0])).vertices.tolist()
+    [[-1.0, -2.0], [-1.0, 2.0], [1.0, -2.0], [1.0, 2.0]]
+    """
+    return Shape("box", np.asarray(half_widths, dtype=float))
+
+
+def cross(semi_axes: FloatArray) -> Shape:
+    """Return the cross-polytope sum |e_i| / semi_axes_i <= 1.
+
+    Examples
+    --------
+    >>> len(cross(np.ones(3)).normals.mid), len(cross(np.ones(3)).vertices)
+    (4, 6)
+    """
+    return Shape("cross", np.asarray(semi_axes, dtype=float))
+
+
+def hull(vertices: FloatArray) -> Shape:
+    """Return a polytope that holds given points, the origin inside.
+
+    Raises
+    ------
+    ObsynthError
+        If the points are flat, or the origin is not in the interior.
+
+    Examples
+    --------
+    >>> hull(np.array([[-1.0, -1.0], [2.0, 0.0], [0.0, 2.0]])).data.shape
+    (3, 2)
+    """
+    try:
+        found = polytope_from_vertices(vertices)
+    except DerivationError as error:
+        raise ObsynthError(f"polytope: {error}", vertices=np.shape(vertices)) from error
+    if np.any(found.offsets <= 0):
+        raise ObsynthError(
+            "polytope: the points are offsets from the centre c of the region, and the origin has "
+            "to lie inside their hull",
+            offset=float(found.offsets.min()),
+        )
+    return Shape("hull", found.normals / found.offsets[:, None])
+
+
+def _signs(n: int) -> FloatArray:
+    return np.array(list(itertools.product((-1.0, 1.0), repeat=n))).reshape(-1, n)
+
+
+def _check_count(count: int, what: str) -> None:
+    if count > _MOST:
+        raise ObsynthError(
+            f"{what}: {count} are more than the {_MOST} that a design can state; use "
+            'polytope="cross" or give few vertices',
+            count=count,
+        )
