@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.certificate import Guarantee
+from obsynth.designs.certificate import Certificate, Guarantee
 from obsynth.designs.detection import Detection, compare
 from obsynth.designs.errors import DetectorError
 from obsynth.designs.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS
@@ -178,6 +178,21 @@ class FaultDetector:
     def half_widths(self) -> FloatArray | None:
         """The observer's steady half widths."""
         return self.observer.half_widths
+
+    @property
+    def gains(self) -> Mapping[str, FloatArray]:
+        """The observer's gains."""
+        return self.observer.gains
+
+    @property
+    def performance(self) -> Mapping[str, float]:
+        """The observer's performance."""
+        return self.observer.performance
+
+    @property
+    def certificate(self) -> Certificate:
+        """The observer's certificate; an alarm rests on nothing else."""
+        return self.observer.certificate
 
     @property
     def smallest_detectable(self) -> FloatArray | None:

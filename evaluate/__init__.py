@@ -1,5 +1,6 @@
 """What it is worth: simulation, coverage, plots, report."""
 
+from obsynth.evaluate.alarms import plot_alarms
 from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.domain import Domain, StatusCount
 from obsynth.evaluate.errors import ReportError, SimulationError
@@ -21,6 +22,7 @@ __all__ = [
     "Trace",
     "Violation",
     "coverage_table",
+    "plot_alarms",
     "plot_errors",
     "plot_run",
     "plot_signal",

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from obsynth.evaluate.run import Run, percent
+from obsynth.evaluate.run import Run, covered, percent
 from obsynth.evaluate.table import Table
 
 __all__ = ["coverage_summary", "coverage_table"]
@@ -29,7 +29,7 @@ def coverage_table(runs: Mapping[str, Sequence[Run]]) -> Table:
             run.scenario,
             label,
             run.seed,
-            *(percent(run.coverage.get(name, float("nan"))) for name in names),
+            *(covered(run, name) for name in names),
             run.domain.ok and not run.outside,
         ]
         for label, run in sorted(every, key=lambda entry: scenarios.index(entry[1].scenario))
@@ -41,6 +41,11 @@ def coverage_table(runs: Mapping[str, Sequence[Run]]) -> Table:
         note="Fraction of all instants, the first included, at which the truth is inside its "
         "interval; counted at tolerance zero.",
     )
+
+
+def _smallest(group: Sequence[Run], name: str) -> str:
+    found = [run.coverage[name] for run in group if name in run.bounded]
+    return percent(min(found)) if found else "n/a"
 
 
 def coverage_summary(runs: Mapping[str, Sequence[Run]]) -> Table:
@@ -56,7 +61,7 @@ def coverage_summary(runs: Mapping[str, Sequence[Run]]) -> Table:
             scenario,
             label,
             len(group),
-            *(percent(min(run.coverage[name] for run in group)) for name in names),
+            *(_smallest(group, name) for name in names),
             all(run.domain.ok and not run.outside for run in group),
         ]
         for (scenario, label), group in sorted(groups.items(), key=lambda g: order.index(g[0][0]))

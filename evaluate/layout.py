@@ -9,7 +9,7 @@ from obsynth.evaluate.errors import ReportError
 
 __all__ = ["grid", "name_lines", "new_figure", "panels"]
 
-_ORDER = {"truth": 0, "estimate": 1, "interval": 2}
+_ORDER = {"truth": 0, "estimate": 1, "interval": 2, "alarm": 3}
 
 
 def new_figure(size: tuple[float, float]) -> Any:
@@ -46,7 +46,11 @@ def panels(figure: Any, count: int) -> Any:
 
 def name_lines(axes: Sequence[Any], source: Any) -> None:
     """Name the lines once: above all axes where the layout makes room, else above the first."""
-    handles, words = source.get_legend_handles_labels()
+    named: dict[str, Any] = {}
+    for ax in (source, *axes):
+        for handle, word in zip(*ax.get_legend_handles_labels(), strict=True):
+            named.setdefault(word, handle)
+    handles, words = list(named.values()), list(named)
     order = sorted(range(len(words)), key=lambda i: _ORDER.get(words[i], len(_ORDER)))
     entries = [handles[i] for i in order], [words[i] for i in order]
     figure = source.figure

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from obsynth.evaluate.alarms import shade
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.layout import grid, name_lines, new_figure
 from obsynth.evaluate.run import Run, Trace
@@ -123,6 +124,11 @@ def plot_run(
     Returns
     -------
     ndarray of Axes, one for each signal
+
+    Notes
+    -----
+    Of signals without bounds truth and estimate are drawn; where a fault detector ran, its
+    alarms shade the panels of the faults.
     """
     names = run.estimated if signals is None else tuple(signals)
     with style():
@@ -176,8 +182,8 @@ def plot_errors(
                 t, error = _cut(trace.t, trace.error, shown)
                 prefix = f"{label}: " if label else ""
                 for bound, word in ((trace.upper, f"{prefix}bounds"), (trace.lower, None)):
-                    if bound is not None:
-                        at, line = _cut(trace.t, bound - estimate, shown)
+                    if bound is not None and trace.bounded:
+                        at, line = _cut(trace.t, _finite(bound) - estimate, shown)
                         ax.plot(*thin(at, line), color=color, linewidth=1.0, label=word)
                 ax.plot(
                     *thin(t, error),
@@ -252,6 +258,11 @@ def plot_widths(
         return ax
 
 
+def _finite(bound: Array) -> Array:
+    """Leave a gap where a bound is infinite."""
+    return np.where(np.isinf(bound), np.nan, bound)
+
+
 def _cut(t: Array, values: Array, window: Window | None) -> tuple[Array, Array]:
     if window is None:
         return t, values
@@ -261,9 +272,11 @@ def _cut(t: Array, values: Array, window: Window | None) -> tuple[Array, Array]:
 
 def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
     """Interval as a band with edges, truth as a strong line, the estimate fine on top of it."""
-    if trace.lower is not None and trace.upper is not None:
-        t, lower = _cut(trace.t, trace.lower, window)
-        _, upper = _cut(trace.t, trace.upper, window)
+    if trace.alarm is not None:
+        shade(ax, trace.t, trace.alarm)
+    if trace.lower is not None and trace.upper is not None and trace.bounded:
+        t, lower = _cut(trace.t, _finite(trace.lower), window)
+        _, upper = _cut(trace.t, _finite(trace.upper), window)
         low, high = thin(t, lower), thin(t, upper)
         if len(low[0]) == len(t):
             ax.fill_between(t, lower, upper, color=INTERVAL_FILL, linewidth=0)

@@ -1,6 +1,7 @@
 """One self-contained page: what was derived, designed, proved, simulated and shipped."""
 
 import html
+import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -107,7 +108,7 @@ def report(
     plant = first.model
     widths = _half_widths(observers) if half_widths is None else dict(half_widths)
     sections = [
-        _plant_section(plant),
+        _plant_section(first),
         _Section("bounds", "Derived bounds"),
         _design_section(observers),
         _width_section(plant, widths, say),
@@ -159,7 +160,20 @@ def _half_widths(observers: Mapping[str, "Observer"]) -> dict[str, Any]:
     return {k: o.half_widths for k, o in observers.items() if o.half_widths is not None}
 
 
-def _plant_section(model: "Plant") -> _Section:
+def _subject(observer: "Observer") -> str:
+    """Say which equations the guarantee speaks of."""
+    if getattr(observer, "ode", None) is None:
+        return "All guarantees speak of the discrete model."
+    if observer.step_covered:
+        return "The guarantees speak of the differential equation, observed at these instants."
+    return (
+        "The guarantees speak of the differential equations of plant and observer; the observer's "
+        "step is their approximation with everything measured held over a sample."
+    )
+
+
+def _plant_section(observer: "Observer") -> _Section:
+    model = observer.model
     section = _Section("plant", "Plant")
     continuous = model.continuous
     shown = model if continuous is None else continuous
@@ -168,7 +182,7 @@ def _plant_section(model: "Plant") -> _Section:
         section.add(
             f"<p>Discretised with a sample time of {model.Ts:g} s "
             f"({html.escape(str(model.discretisation))}). "
-            "All guarantees speak of the discrete model.</p>"
+            f"{_subject(observer)}</p>"
         )
     section.add(signals_table(shown)._repr_html_())
     section.add(constants_html(shown))
@@ -239,9 +253,13 @@ def _width_section(
         figure = _new_figure(7.4, 3.0)
         plot_widths(widths, names, units, ax=figure.subplots())
     section.add(_figure_html(figure, "widths", ""))
-    rows = [[label, *(f"{v:.3f}" for v in row), f"{sum(row):.3f}"] for label, row in widths.items()]
+    rows = [[label, *map(_width, row), _width(sum(row))] for label, row in widths.items()]
     section.add(Table("Half widths in steady state", ["", *names, "sum"], rows)._repr_html_())
     return section
+
+
+def _width(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "n/a"
 
 
 def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) -> _Section:
@@ -258,13 +276,18 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
                 if run.scenario == scenario:
                     first.setdefault(label, run)
         for j, (label, run) in enumerate(first.items()):
-            caption = f"{scenario}, {label}, seed {run.seed}: truth, estimate and interval"
+            shown = ["truth", "estimate", *(["interval"] if run.bounded else [])]
+            shown += ["alarms"] if run.alarm is not None else []
+            words = f"{', '.join(shown[:-1])} and {shown[-1]}"
+            caption = f"{scenario}, {label}, seed {run.seed}: {words}"
             say(caption)
             figure, axes = _panels(run)
             with style():
                 plot_run(run, axes=axes)
             section.add(_figure_html(figure, f"run{i}{j}", caption), _facts(run))
-        caption = f"{scenario}: errors between their guaranteed bounds, settled"
+        between = " between their guaranteed bounds"
+        between = between if any(run.bounded for run in first.values()) else ""
+        caption = f"{scenario}: errors{between}, settled"
         say(caption)
         figure, axes = _panels(next(iter(first.values())))
         with style():
@@ -305,9 +328,9 @@ def _highlights(
     claims = [claim for observer in observers.values() for claim in observer.certificate]
     shown = {"claims proved": f"{sum(c.holds for c in claims)} of {len(claims)}"}
     every = [run for several in runs.values() for run in several]
-    if every:
-        worst = min(min(run.coverage.values(), default=1.0) for run in every)
-        shown["of all instants inside"] = percent(worst)
+    found = [run.coverage[name] for run in every for name in run.bounded]
+    if found:
+        shown["of all instants inside"] = percent(min(found))
     return shown
 
 

@@ -31,7 +31,8 @@ class Trace:
 
     Signals without an estimate (inputs, outputs, disturbances) have None there.
     With ``fault_delay = 1`` a fault's trace ends one sample before the run, as
-    its claims arrive one sample late.
+    its claims arrive one sample late. ``alarm`` is what a fault detector said at
+    these instants, which is about the instant ``fault_delay`` earlier.
     """
 
     name: str
@@ -41,11 +42,19 @@ class Trace:
     estimate: Array | None = None
     lower: Array | None = None
     upper: Array | None = None
+    alarm: NDArray[np.bool_] | None = None
 
     @property
     def label(self) -> str:
         """Name with its unit, for axes and heads."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the interval excludes anything at any instant."""
+        if self.lower is None or self.upper is None:
+            return False
+        return bool(np.any(~(np.isneginf(self.lower) & np.isposinf(self.upper))))
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -230,15 +239,22 @@ class Run:
             late = self.fault_delay
             until = len(self.t) - late
             claims = (self.fhat[late:, i], self.f_lower[late:, i], self.f_upper[late:, i])
-            return Trace(name, unit, self.t[:until], true[:until], *claims)
+            alarm = None if self.alarm is None else self.alarm[:until, i]
+            return Trace(name, unit, self.t[:until], true[:until], *claims, alarm)
         return Trace(name, unit, self.t, true)
+
+    @cached_property
+    def bounded(self) -> tuple[str, ...]:
+        """Names of the estimated signals that the observer bounds at any instant at all."""
+        return tuple(name for name in self.estimated if self[name].bounded)
 
     @cached_property
     def coverage(self) -> dict[str, float]:
         """Fraction of all instants at which each state and fault is inside its interval.
 
         Counted at tolerance zero over every instant, the transient included;
-        a bound that is no number counts as outside.
+        a bound that is no number counts as outside. An infinite interval holds every truth
+        and says nothing; see :attr:`bounded`.
         """
         return {name: float(np.mean(self[name].inside)) for name in self.estimated}
 
@@ -293,23 +309,24 @@ class Run:
         return Domain.of(self.x, self.xhat, self.box, self.status, self.names["x"])
 
     def summary(self, from_step: int = 0) -> Table:
-        """Coverage, rms error and half widths of every estimated signal."""
+        """Coverage, rms error and half widths of every estimated signal; first alarms.
+
+        Coverage of a signal without bounds is ``n/a``.
+        """
         rms = self.rms(from_step)
-        rows = []
+        rows: list[list[Any]] = []
         for name in self.estimated:
-            width = self.widths[name]
-            rows.append(
-                [
-                    self[name].label,
-                    percent(self.coverage[name]),
-                    rms[name],
-                    float(width[0]),
-                    float(width[-1]),
-                ]
-            )
+            trace, width = self[name], self.widths[name]
+            ends = float(width[0]), float(width[-1])
+            rows.append([trace.label, covered(self, name), rms[name], *ends])
+            if self.alarm is not None:
+                raised = None if trace.alarm is None else np.flatnonzero(trace.alarm)
+                first = None if raised is None or not raised.size else float(trace.t[raised[0]])
+                rows[-1].append(first)
         since = f", rms from k = {from_step}" if from_step else ""
         title = f"{self.scenario}, seed {self.seed}, {len(self.t)} instants{since}"
         columns = ["signal", "inside", "rms error", "half width at k = 0", "at the end"]
+        columns += [] if self.alarm is None else ["first alarm [s]"]
         return Table(title, columns, rows, note="; ".join(str(v) for v in self.violations))
 
     def to_xarray(self) -> Any:
@@ -354,10 +371,11 @@ class Run:
         return plot_run(self, signals)
 
     def __repr__(self) -> str:
-        worst = min(self.coverage.values(), default=1.0)
+        found = [self.coverage[name] for name in self.bounded]
+        inside = f"inside at {percent(min(found))} or more" if found else "without set bounds"
         return (
             f"<Run of {self.method} on {self.model!r}, {self.scenario}, seed {self.seed}, "
-            f"{len(self.t)} instants, inside at {percent(worst)} or more>"
+            f"{len(self.t)} instants, {inside}>"
         )
 
     def _repr_html_(self) -> str:
@@ -373,6 +391,11 @@ def _bounds(trace: Trace) -> tuple[Array, Array]:
     if trace.lower is None or trace.upper is None:
         raise SimulationError(f"{trace.name} has no interval.", symbol=trace.name)
     return trace.lower, trace.upper
+
+
+def covered(run: Run, name: str) -> str:
+    """Write the coverage of a signal for a table; ``n/a`` where the method does not bound it."""
+    return percent(run.coverage[name]) if name in run.bounded else "n/a"
 
 
 def percent(fraction: float) -> str:

@@ -92,7 +92,7 @@ class Table:
         return [[text(cell) for cell in row] for row in self.rows]
 
     def numeric(self) -> list[bool]:
-        """Return which columns hold numbers or percentages only, and are set flush right."""
+        """Return which columns hold numbers, percentages or "n/a" only, and are set flush right."""
         return [
             bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
             for j in range(len(self.columns))
@@ -138,7 +138,7 @@ class Table:
 
 
 def _is_number(cell: Any) -> bool:
-    if cell is None:
+    if cell is None or cell == "n/a":
         return True
     if isinstance(cell, bool):
         return False
