@@ -1,8 +1,10 @@
 """The three tanks, their observers, and plant and observer integrated together, made once."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -132,6 +134,91 @@ class Together:
 def together(printed):
     """The noise-free reference run, Gamma = .01."""
     return Together(printed, (8e-5, 6e-5))
+
+
+class ClosedLoop:
+    """Plant (Runge-Kutta, inputs held), control from the noisy outputs and step, all compiled.
+
+    Calling it returns arrays by name, one row for each sample; the memory is the one that the step
+    at that sample was called with.
+    """
+
+    chunk = 500
+
+    def __init__(self, observer, plant=None, late=0):
+        self.observer, self.names = observer, [s.name for s in observer.model.f]
+        memory = ca.SX.sym("memory", observer.step.numel_in(0))
+        x, w, f = ca.SX.sym("x", 3), ca.SX.sym("w", 2), ca.SX.sym("f", 2)
+        raised, last = ca.SX.sym("raised"), ca.SX.sym("last", 2)
+        y = x[:2] + w
+        wanted = ca.vertcat(0.5 * (1 + 0.07 * raised), 0.1 * (1 + 0.5 * raised))
+        u = ca.vertcat(
+            ca.fmax(0, -K * root_sx(y[0] - wanted[0])),
+            ca.fmax(0, -K * root_sx(y[1] - wanted[1]) + A20 * root_sx(y[1])),
+        )
+        results = observer.step(memory, u, last if late else y)
+        rk4 = (plant or observer.model).function()
+        following = rk4(x, u, [], f, w, [], [])[0]
+        state = ca.vertcat(x, memory, y)
+        moved = ca.vertcat(following, results[0], y)
+        self.n = memory.numel()
+        start = ca.SX.sym("state", 5 + self.n)
+        table = [x, memory, last]
+        parts = [start[:3], start[3 : 3 + self.n], start[3 + self.n :]]
+        outputs = ca.vertcat(state[: 3 + self.n], y, *results[1:])
+        moved, outputs = ca.substitute([moved, outputs], table, parts)
+        step = ca.Function("loop", [start, w, f, raised], [moved, outputs])
+        self.sizes = [3, self.n, 2, 3, 2, 3, 3, 2, 2, 1]
+        self.loop = step.mapaccum("loops", self.chunk)
+
+    def __call__(self, w, f=None, raised=None, x0=(0.5, 0.1, 0.3), **start):
+        count = len(w)
+        f = np.zeros((count, 2)) if f is None else f
+        raised = np.zeros(count) if raised is None else raised
+        memory = self.observer.memory0(list(x0), **start)
+        state = np.concatenate([x0, memory, np.asarray(x0[:2]) + w[0]])
+        rows = []
+        for begin in range(0, count, self.chunk):
+            piece = slice(begin, begin + self.chunk)
+            padded = [fill(value[piece], self.chunk).T for value in (w, f, raised[:, None])]
+            moved, outputs = self.loop(state, *padded)
+            state = np.array(moved)[:, -1]
+            rows.append(np.array(outputs).T)
+        table = np.vstack(rows)[:count]
+        ends = np.cumsum([0, *self.sizes])
+        names = ["x", "memory", "y", "xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper"]
+        parts = [table[:, a:b] for a, b in pairwise(ends)]
+        found = dict(zip([*names, "status"], parts, strict=True))
+        found["status"] = found["status"][:, 0].astype(int)
+        return found
+
+
+def root_sx(z):
+    return ca.sign(z) * ca.sqrt(ca.fabs(z))
+
+
+def fill(rows, count):
+    missing = count - len(rows)
+    return np.vstack([rows, np.repeat(rows[-1:], missing, axis=0)]) if missing else rows
+
+
+def paper_schedule(steps, Ts=0.01, theta=(8e-5, 6e-5)):
+    """Faults and raised reference at the samples 0..steps."""
+    t = Ts * np.arange(steps + 1)
+    f = np.zeros((steps + 1, 2))
+    f[t >= 200.0 - 1e-9, 0], f[t >= 300.0 - 1e-9, 1] = theta
+    raised = (np.ceil(t / 100.0 - 1e-9) % 2 == 0) & (t > 0)
+    return f, raised.astype(float)
+
+
+@pytest.fixture(scope="session")
+def schedule():
+    return paper_schedule
+
+
+@pytest.fixture(scope="session")
+def closed_loop():
+    return ClosedLoop
 
 
 @pytest.fixture(scope="session")

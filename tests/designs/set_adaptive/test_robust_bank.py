@@ -1,0 +1,366 @@
+"""The bank: delays, no false alarm, inclusion of weighted means, refusals by name."""
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.set_adaptive import bank_step as step_module
+from obsynth.designs.set_adaptive.assembly import assemble
+from obsynth.designs.set_adaptive.monotone import Monotone, with_ranges
+from obsynth.symbolic.noise import bounded_noise
+
+REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
+BOUND = 4.5e-3
+START = np.array([(0.44, 0.56), (0.04, 0.16), (0.24, 0.36)])
+RATES = (0.1, 0.2, 0.3, 0.5)
+
+
+@pytest.fixture(scope="module")
+def bank(tanks):
+    return SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION).design(tanks)
+
+
+@pytest.fixture(scope="module")
+def loop(bank, closed_loop):
+    return closed_loop(bank)
+
+
+@pytest.fixture(scope="module")
+def paper_run(loop, schedule):
+    f, raised = schedule(32_000)
+    w = bounded_noise(1, 32_000, [BOUND, BOUND])
+    return {**loop(w, f, raised, x_range=START), "f": f, "w": w}
+
+
+def intervals(observer, run):
+    """Fault intervals of every filter, shape (N, faults, rates), infinite while N = 0."""
+    layout, memory = observer.memory_layout, run["memory"]
+    N = memory[:, layout["response"]]
+    low = np.repeat(run["y"] - BOUND, len(RATES), axis=1) - memory[:, layout["filter_upper"]]
+    high = np.repeat(run["y"] + BOUND, len(RATES), axis=1) - memory[:, layout["filter_lower"]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shape = (-1, 2, len(RATES))
+        return (
+            np.where(N > 0, low / N, -np.inf).reshape(shape),
+            np.where(N > 0, high / N, np.inf).reshape(shape),
+        )
+
+
+def weighted_means(f, Ts=0.01):
+    """Means of faults that are held over the steps, with the weights exp(-rate age)."""
+    total, weight = np.zeros((2, len(RATES))), np.zeros(len(RATES))
+    rates = np.array(RATES)
+    decay, gathered = np.exp(-rates * Ts), -np.expm1(-rates * Ts) / rates
+    means = np.zeros((len(f), 2, len(RATES)))
+    for k, row in enumerate(f):
+        if k:
+            means[k] = total / weight
+        total = decay * total + gathered * row[:, None]
+        weight = decay * weight + gathered
+    return means
+
+
+def violations(observer, run):
+    """Counts of states and of weighted means outside of their sets."""
+    low, high = intervals(observer, run)
+    means = weighted_means(run["f"])
+    states = (run["x_lower"] > run["x"]) | (run["x"] > run["x_upper"])
+    return int(states.sum()), int(((low > means) | (means > high)).sum())
+
+
+def alarms(observer, run):
+    low, high = intervals(observer, run)
+    return ((low > 0) | (high < 0)).any(axis=2)
+
+
+def test_delays_and_no_false_alarm(bank, paper_run):
+    found = alarms(bank, paper_run)
+    for i, start in enumerate((20_000, 30_000)):
+        assert not found[:start, i].any()
+        delay = np.flatnonzero(found[start:, i])[0] * 0.01
+        assert delay == pytest.approx((1.37, 1.89)[i], abs=0.02)
+    # the interval that is returned, of the slowest filter, shows both faults as soon
+    for i, start in enumerate((20_000, 30_000)):
+        own = (paper_run["f_lower"][:, i] > 0) | (paper_run["f_upper"][:, i] < 0)
+        assert not own[:start].any()
+        assert np.flatnonzero(own[start:])[0] * 0.01 == pytest.approx((1.37, 1.89)[i], abs=0.02)
+
+
+def test_every_filter_has_its_own_delay(bank, paper_run, numbers):
+    expected = numbers["robust"]["h.01_seed1"]
+    low, high = intervals(bank, paper_run)
+    for j, rate in enumerate(RATES):
+        for i, start in enumerate((20_000, 30_000)):
+            shown = (low[start:, i, j] > 0) | (high[start:, i, j] < 0)
+            delay = np.flatnonzero(shown)[0] * 0.01
+            assert delay == pytest.approx(expected[f"{rate:g}"][f"d{i + 1}"], abs=0.02)
+
+
+def test_no_violation_in_thirty_two_thousand_checks(bank, paper_run):
+    assert violations(bank, paper_run) == (0, 0)
+    assert set(paper_run["status"]) == {0}
+    assert len(paper_run["x"]) == 32_001
+
+
+def test_the_unmeasured_level_is_enclosed_as_tightly_as_the_reference(paper_run, numbers):
+    expected = numbers["robust"]["h.01_seed1"]
+    at = 19_900
+    assert paper_run["x"][at, :2] == pytest.approx(expected["x199"][:2], abs=1e-7)
+    low, high = paper_run["x_lower"][at, 2], paper_run["x_upper"][at, 2]
+    assert high - low <= expected["Z199"][1] - expected["Z199"][0]
+    assert [low, high] == pytest.approx(expected["Z199"], abs=2e-5)
+
+
+@pytest.mark.parametrize(("Ts", "key"), [(0.02, "h.02"), (0.05, "h.05"), (0.1, "h.1")])
+def test_longer_steps(tanks, closed_loop, schedule, numbers, Ts, key):
+    bank = SetAdaptiveObserver(robust=True, Ts=Ts, region=REGION).design(tanks)
+    steps = round(320.0 / Ts)
+    f, raised = schedule(steps, Ts)
+    run = {**closed_loop(bank)(bounded_noise(1, steps, [BOUND] * 2), f, raised, x_range=START)}
+    found = alarms(bank, run)
+    assert set(run["status"]) == {0}
+    assert ((run["x_lower"] <= run["x"]) & (run["x"] <= run["x_upper"])).all()
+    for i, start in enumerate((200.0, 300.0)):
+        k = round(start / Ts)
+        assert not found[:k, i].any()
+        delay = np.flatnonzero(found[k:, i])[0] * Ts
+        assert delay <= numbers["robust"][key]["bank"][f"d{i + 1}"] + 0.02
+
+
+def test_the_interval_is_of_the_mean_and_not_of_the_present_value(bank, paper_run):
+    low, high = intervals(bank, paper_run)
+    fault, after = paper_run["f"][20_000:30_000, 0], slice(20_000, 30_000)
+    for j, seconds in ((0, 16.6), (3, 0.34)):
+        outside = (low[after, 0, j] > fault) | (fault > high[after, 0, j])
+        assert outside.sum() * 0.01 == pytest.approx(seconds, abs=0.02)
+    assert any("not its" in claim for claim in bank.guarantee.claims)
+
+
+def test_fault_free_runs_raise_no_alarm(bank, loop, schedule):
+    _, raised = schedule(12_000)
+    for seed in range(2, 5):
+        w = bounded_noise(seed, 12_000, [BOUND] * 2)
+        run = loop(w, None, raised, x_range=START)
+        assert not alarms(bank, run).any()
+        assert set(run["status"]) == {0}
+
+
+@pytest.mark.long
+def test_a_hundred_fault_free_runs_raise_no_alarm(bank, loop, schedule):
+    _, raised = schedule(20_000)
+    for seed in range(100, 200):
+        w = bounded_noise(seed, 20_000, [BOUND] * 2)
+        run = loop(w, None, raised, x_range=START)
+        assert not alarms(bank, run).any(), seed
+        assert ((run["x_lower"] <= run["x"]) & (run["x"] <= run["x_upper"])).all(), seed
+
+
+def hard_run(loop, seed, steps=400):
+    """Bang-bang noise, a start at a corner, faults that jump between their ends."""
+    rng = np.random.default_rng(seed)
+    w = BOUND * (1 - 1e-12) * rng.choice([-1.0, 1.0], (steps, 2))
+    if seed % 3 == 0:
+        w = np.tile(BOUND * (1 - 1e-12) * rng.choice([-1.0, 1.0], 2), (steps, 1))
+    f = 2e-4 * rng.choice([-1.0, 0.0, 1.0], (steps, 2))
+    f = np.repeat(f[:: 50 + seed % 40], 50 + seed % 40, axis=0)[:steps]
+    x0 = START[np.arange(3), rng.integers(0, 2, 3)]
+    raised = rng.integers(0, 2, steps).astype(float)
+    return {**loop(w, f, raised, x0=x0, x_range=START), "f": f}
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_inclusion_in_hard_runs(bank, loop, seed):
+    run = hard_run(loop, seed)
+    assert violations(bank, run) == (0, 0)
+    assert set(run["status"]) == {0}
+
+
+@pytest.mark.long
+def test_inclusion_in_a_thousand_hard_runs(bank, loop):
+    assert [violations(bank, hard_run(loop, seed)) for seed in range(1000)] == [(0, 0)] * 1000
+
+
+@pytest.mark.parametrize(
+    "mutant", ["no noise", "sign of the fault", "swapped ends", "late by one", "no envelope"]
+)
+def test_inclusion_sees_a_mutant(bank, closed_loop, monkeypatch, mutant):
+    record = dict(bank.record)
+    late = 0
+    if mutant == "no noise":
+        record["noise"] = (0.98 * np.array(record["noise"])).tolist()
+    elif mutant == "sign of the fault":
+        right = step_module.Corners.rate
+
+        def wrong(self, *given, **named):
+            named["faults"] = True
+            return right(self, *given, **named)
+
+        monkeypatch.setattr(step_module.Corners, "rate", wrong)
+        signs = {kind: np.array(v) for kind, v in record["signs"].items()}
+        signs["f"] = -signs["f"]
+        record["signs"] = {kind: v.tolist() for kind, v in signs.items()}
+    elif mutant == "swapped ends":
+        signs = {kind: np.array(v) for kind, v in record["signs"].items()}
+        signs["x"][2] = [-1, -1, -1]
+        record["signs"] = {kind: v.tolist() for kind, v in signs.items()}
+    elif mutant == "no envelope":
+        monkeypatch.setattr(
+            step_module, "_envelope", lambda design, corners, low, high: ((low, high), low[0] > 0)
+        )
+    else:
+        late = 1
+    broken = assemble(record)
+    loop = closed_loop(broken, late=late)
+    counts = [sum(violations(broken, hard_run(loop, seed))) for seed in range(12)]
+    assert sum(counts) > 0
+    if mutant in ("sign of the fault", "swapped ends"):
+        with pytest.raises(ob.CertificateError, match="monotone"):
+            broken.certificate.check()
+    elif mutant == "no noise":
+        with pytest.raises(ob.CertificateError, match="noise"):
+            broken.certificate.check()
+
+
+def test_a_missing_measurement_or_input(bank, tanks):
+    memory = bank.memory0([0.5, 0.1, 0.3], x_range=START)
+    u, y = [5e-5, 5e-6], [0.5, 0.1]
+    plain = bank.step(memory, u, y)
+    missing = bank.step(plain[0], u, [np.nan, 0.1])
+    assert int(missing[7]) == 2
+    width = np.array(missing[4] - missing[3]).ravel()
+    assert (width[:2] > 2 * BOUND).all()
+    assert np.isfinite(width).all()
+    blind = bank.step(plain[0], [np.nan, 0.0], y)
+    assert int(blind[7]) == 2
+    again = bank.step(blind[0], u, y)
+    assert int(again[7]) == 0
+    region = np.array(REGION)
+    assert np.array(again[3])[2] == region[2, 0]
+    assert np.array(again[6]).ravel() == pytest.approx([2e-4, 2e-4])
+
+
+def test_outside_of_the_region_is_reported_and_the_bank_starts_again(bank):
+    memory = bank.memory0([0.5, 0.1, 0.3], x_range=START)
+    u = [5e-5, 5e-6]
+    outside = bank.step(memory, u, [0.91, 0.1])
+    assert int(outside[7]) & 4
+    assert int(outside[7]) & 16
+    back = bank.step(outside[0], u, [0.5, 0.1])
+    assert int(back[7]) == 0
+    assert np.array(back[3])[2] == REGION[2][0]
+    jump = bank.step(bank.step(memory, u, [0.5, 0.1])[0], u, [0.52, 0.1])
+    assert int(jump[7]) == 8
+
+
+def test_zeros_are_not_initialised(bank):
+    n = bank.step.numel_in(0)
+    results = bank.step(np.zeros(n), [0, 0], [0.5, 0.1])
+    assert int(results[7]) & 1
+    assert np.array(results[0]).ravel().tolist() == [0.0] * n
+    assert np.isinf(np.array(results[3])).all()
+
+
+def test_the_continuous_form_agrees_with_short_steps(bank, tanks):
+    memory = bank.memory0([0.5, 0.1, 0.3], x_range=START)
+    u, y = np.array([5.8e-5, 3.5e-6]), np.array([0.5, 0.1])
+    short = SetAdaptiveObserver(robust=True, Ts=1e-5, region=REGION).design(tanks)
+    moved = np.array(short.step(memory, u, y)[0]).ravel()
+    slope = (moved - memory) / 1e-5
+    rates = np.array(bank.ode(memory, u, y)).ravel()
+    layout = bank.memory_layout
+    for name in ("hidden_lower", "hidden_upper", "filter_lower", "filter_upper", "response"):
+        # the envelope of the step still adds what y moves in 1e-5 s
+        np.testing.assert_allclose(slope[layout[name]], rates[layout[name]], rtol=1e-4, atol=1e-6)
+
+
+# -- monotone equations --------------------------------------------------------------
+
+
+def test_signs_are_proved_through_a_flow_without_a_derivative(tanks):
+    monotone = Monotone(with_ranges(tanks, [(0.0, 1.0)] * 3))
+    assert [monotone.signs(i, tanks.x).tolist() for i in range(3)] == [
+        [-1, 0, 1],
+        [0, -1, 1],
+        [1, 1, -1],
+    ]
+    assert monotone.signs(0, tanks.f).tolist() == [1, 0]
+
+
+def test_an_equation_that_is_not_monotone_is_named():
+    plant = ob.Plant("bump")
+    a, b = plant.states("a b", range=(0, 2))
+    (f,) = plant.faults("f", range=(-1, 1))
+    plant.dynamics([b * (1 - b) - a + f, a - b])
+    plant.outputs([a])
+    with pytest.raises(ob.StructureError, match=r"equation of a is not monotone in b") as refusal:
+        SetAdaptiveObserver(robust=True).design(plant)
+    assert refusal.value.symbol == "b"
+    narrow = SetAdaptiveObserver(robust=True, region=[(0, 2), (0.6, 2)]).design(plant)
+    assert narrow.certificate.valid
+
+
+def chain(fault_rows, **changes):
+    """Four levels in a row, of which the first and the last are measured."""
+    plant = ob.Plant("chain")
+    x = plant.states("x1:5", range=(0.0, 3.0))
+    (u,) = plant.inputs("u", range=(0, 2))
+    faults = plant.faults("f1:3", range=(-0.2, 0.2))
+    (v,) = plant.disturbances("v", bound=0.01)
+    (w,) = plant.disturbances("w", bound=0.02)
+    (k,) = plant.params("k", range=(0.9, 1.1))
+    (d,) = plant.params("d", range=(0.99, 1.01))
+    flow = [x[0] - x[1], d * (x[1] - x[2]), x[2] - x[3]]
+    out = x[3] ** 2 / 2
+    rates = [u - flow[0], flow[0] - flow[1] + w, flow[1] - flow[2], flow[2] - k * out]
+    for fault, row in zip(faults, fault_rows, strict=True):
+        rates[row] += changes.get("factor", 1) * fault
+    plant.dynamics(rates)
+    plant.outputs([x[0] + v, x[3]])
+    return plant
+
+
+def test_parameters_disturbances_and_two_unmeasured_states():
+    plant = chain((0, 3))
+    with pytest.raises(ob.StructureError, match="equation of x2 is not monotone in d"):
+        SetAdaptiveObserver(robust=True).design(plant)
+    ordered = [(2.0, 3.0), (1.5, 2.0), (1.0, 1.5), (0.2, 1.0)]
+    bank = SetAdaptiveObserver(robust=True, Ts=0.02, region=ordered, filters=(0.5,)).design(plant)
+    rng = np.random.default_rng(3)
+    F = bank.model.function()
+    x, theta = np.array([2.3, 1.75, 1.2, 0.75]), np.array([0.1, -0.05])
+    memory = bank.memory0(x)
+    for _ in range(120):
+        v, w = rng.choice([-0.01, 0.01]), rng.choice([-0.02, 0.02])
+        u, y = [0.4], x[[0, 3]] + [v, 0.0]
+        memory, _, _, low, high, f_low, f_high, status = bank.step(memory, u, y)
+        assert int(status) == 0
+        assert (np.array(low).ravel() <= x + 1e-12).all()
+        assert (x <= np.array(high).ravel() + 1e-12).all()
+        assert (np.array(f_low).ravel() <= theta).all()
+        assert (theta <= np.array(f_high).ravel()).all()
+        x = np.array(F(x, u, [], theta, [v, w], [1.05, 0.99], [])[0]).ravel()
+    assert (np.array(f_high - f_low) < 0.4).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "changes", "words"),
+    [
+        ((0, 1), {}, "f2 enters the equation of x2, which is not measured"),
+        ((0, 0), {}, "f1 and f2 enter the same equation"),
+        ((0, 3), {"factor": -1}, "f1 .*positive constant"),
+    ],
+)
+def test_other_plants_are_refused_by_name(rows, changes, words):
+    with pytest.raises(ob.StructureError, match=words):
+        SetAdaptiveObserver(robust=True).design(chain(rows, **changes))
+
+
+def test_an_unmeasured_state_that_grows_by_itself_is_refused():
+    plant = ob.Plant("growing")
+    a, b = plant.states("a b", range=(0, 1))
+    (f,) = plant.faults("f", range=(-1, 1))
+    plant.dynamics([-a + b + f, b - 2 * a])
+    plant.outputs([a])
+    with pytest.raises(ob.StructureError, match="derivative of b rises with b itself"):
+        SetAdaptiveObserver(robust=True).design(plant)
