@@ -92,8 +92,10 @@ class CProject:
         )
 
     def _repr_html_(self) -> str:
+        left = "style='text-align:left'"
         rows = "".join(
-            f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in self._rows()
+            f"<tr><th {left}>{escape(key)}</th><td {left}>{escape(text)}</td></tr>"
+            for key, text in self._rows()
         )
         return f"<table><caption>C project {escape(self.name)}</caption>{rows}</table>"
 

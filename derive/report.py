@@ -214,7 +214,8 @@ def _bounds(part: Split) -> tuple[JacobianBounds, str]:
         key=["exact", "converged", "budget"].index,
     )
     varying = int((bounds.max > bounds.min).sum())
-    return bounds, f"{varying} entries of dg/dx vary; worst status {worst}"
+    words = "1 entry of dg/dx varies" if varying == 1 else f"{varying} entries of dg/dx vary"
+    return bounds, f"{words}; worst status {worst}"
 
 
 def _detect(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:

@@ -148,10 +148,12 @@ class Certificate:
     def _repr_html_(self) -> str:
         from html import escape
 
+        left = "style='text-align:left'"
         rows = "".join(
-            f"<tr><td>{'&#10003;' if c.holds else '&#10007;'}</td><td>{escape(c.statement)}</td>"
-            f"<td>{c.margin:.3g}</td><td>{escape(c.proof)}</td></tr>"
+            f"<tr><td>{'&#10003;' if c.holds else '&#10007;'}</td>"
+            f"<td {left}>{escape(c.statement)}</td>"
+            f"<td>{c.margin:.3g}</td><td {left}>{escape(c.proof)}</td></tr>"
             for c in self.claims
         )
-        head = "<tr><th></th><th>claim</th><th>margin</th><th>proof</th></tr>"
+        head = f"<tr><th></th><th {left}>claim</th><th>margin</th><th {left}>proof</th></tr>"
         return f"<table>{head}{rows}</table>"

@@ -165,15 +165,16 @@ class Observer:
         from html import escape
 
         names = (*self.model.names("x"), *self.model.names("f"))
-        rows = ""
+        rows, left = "", "style='text-align:left'"
         if self.half_widths is not None:
             rows = "".join(
-                f"<tr><td>{escape(name)}</td><td>&plusmn;{width:.4g}</td></tr>"
+                f"<tr><td {left}>{escape(name)}</td><td>&plusmn;{width:.4g}</td></tr>"
                 for name, width in zip(names, self.half_widths, strict=True)
             )
         facts = "".join(
-            f"<tr><td>{escape(key)}</td><td>{value:.6g}</td></tr>"
+            f"<tr><td {left}>{escape(key)}</td><td>{value:.6g}</td></tr>"
             for key, value in self.performance.items()
         )
-        title = f"<caption>{escape(self.method)} for {escape(self.model.name)}</caption>"
+        words = f"{escape(self.method)} for {escape(self.model.name)}"
+        title = f"<caption style='text-align:left;white-space:nowrap'>{words}</caption>"
         return f"<table>{title}{rows}{facts}</table>{self.certificate._repr_html_()}"

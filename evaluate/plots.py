@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from obsynth.evaluate.alarms import shade
 from obsynth.evaluate.errors import ReportError
@@ -17,7 +17,7 @@ from obsynth.evaluate.run import Run, Trace
 from obsynth.evaluate.style import BARS, ESTIMATE, INK, INTERVAL, INTERVAL_FILL, SOFT, style
 from obsynth.evaluate.thin import thin
 
-__all__ = ["plot_errors", "plot_run", "plot_signal", "plot_widths"]
+__all__ = ["plot_errors", "plot_run", "plot_signal"]
 
 Array = NDArray[np.float64]
 Window = tuple[float, float]
@@ -197,65 +197,6 @@ def plot_errors(
             ax.set_ylabel(f"error of {first[name].label}")
         name_lines(flat, flat[0])
         return flat
-
-
-def plot_widths(
-    half_widths: Mapping[str, ArrayLike],
-    names: Sequence[str],
-    units: Sequence[str] | None = None,
-    ax: Any = None,
-    title: str = "Guaranteed half widths",
-) -> Any:
-    """Compare half widths of several designs as bars.
-
-    Parameters
-    ----------
-    half_widths : mapping of label to (n,)
-        For instance ``{"ellipsoid": ..., "peak": ...}``, widest first.
-    names : sequence of str
-        The n signals.
-    units : sequence of str, optional
-        Their units, shown with the names.
-    ax : matplotlib Axes, optional
-        Where to draw.
-    title : str
-        Title of the plot.
-
-    Returns
-    -------
-    Axes
-    """
-    table = {label: np.asarray(values, dtype=float) for label, values in half_widths.items()}
-    for label, values in table.items():
-        if values.shape != (len(names),):
-            raise ReportError(
-                f"{label!r} has half widths of shape {values.shape} for {len(names)} signals.",
-                label=label,
-            )
-    with style():
-        if ax is None:
-            ax = new_figure((7.2, 2.9)).subplots()
-        count = max(len(table), 1)
-        step = 0.84 / count
-        places = np.arange(len(names), dtype=float)
-        for i, (label, values) in enumerate(table.items()):
-            at = places + (i - 0.5 * (count - 1)) * step
-            finite = np.where(np.isfinite(values), values, 0.0)
-            bars = ax.bar(
-                at, finite, 0.92 * step, color=BARS[i % len(BARS)], label=label, linewidth=0
-            )
-            marks = [f"{v:.3g}" if np.isfinite(v) else "∞" for v in values]
-            ax.bar_label(bars, marks, fontsize=6.8, color=INK, padding=1.5)
-        marked = zip(names, units or [""] * len(names), strict=True)
-        heads = [f"{name}\n[{unit}]" if unit else name for name, unit in marked]
-        ax.set_xticks(places, heads)
-        ax.grid(visible=False, axis="x")
-        ax.tick_params(axis="x", length=0)
-        ax.set_title(title)
-        ax.margins(y=0.12)
-        if len(table) > 1:
-            ax.legend(loc="upper left", ncols=min(count, 4), borderaxespad=0.1)
-        return ax
 
 
 def _finite(bound: Array) -> Array:

@@ -13,11 +13,12 @@ from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.equations import constants_html, equations_html, signals_table
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.layout import panels
-from obsynth.evaluate.plots import plot_errors, plot_run, plot_widths
+from obsynth.evaluate.plots import plot_errors, plot_run
 from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.style import style
 from obsynth.evaluate.svg import figure_svg
 from obsynth.evaluate.table import Table, text
+from obsynth.evaluate.width_plot import plot_widths
 
 if TYPE_CHECKING:
     from obsynth.designs.observer import Observer
@@ -251,7 +252,7 @@ def _width_section(
     names, units = [s.name for s in signals], [s.unit for s in signals]
     with style():
         figure = _new_figure(7.4, 3.0)
-        plot_widths(widths, names, units, ax=figure.subplots())
+        plot_widths(widths, names, units, ax=figure)
     section.add(_figure_html(figure, "widths", ""))
     rows = [[label, *map(_width, row), _width(sum(row))] for label, row in widths.items()]
     section.add(Table("Half widths in steady state", ["", *names, "sum"], rows)._repr_html_())

@@ -97,7 +97,8 @@ class Excitation:
             return "no faults"
         names = ", ".join(e.fault for e in self.effects)
         if self.points == 1:
-            return f"constant {names} show with constant inputs; nothing has to move"
+            verb = "shows" if count == 1 else "show"
+            return f"constant {names} {verb} with constant inputs; nothing has to move"
         if self.points is not None:
             return (
                 f"one operating point shows {self.visible_at_rest} of {count} constant faults: the "

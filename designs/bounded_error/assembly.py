@@ -88,7 +88,7 @@ def _prove_decoupling(design: UioDesign) -> Claim:
         if fresh.residual == 0
         else f"|(I + E C) D| <= {fresh.residual:.1e}: covered by the rounding allowance",
         bool(same and np.array_equal(fresh.Pi, design.Pi)),
-        -fresh.residual,
+        0.0 - fresh.residual,
         "exact rational arithmetic on the stored E, C, D",
     )
 

@@ -80,6 +80,9 @@ def test_half_widths_are_bars_with_their_numbers(toy_run):
     assert heights == [1.0, 2.0, 0.0, 0.5, 0.25, 1.0]
     assert {"∞", "0.25"} <= {text.get_text() for text in ax.texts}
     assert [t.get_text() for t in ax.get_xticklabels()] == ["a", "b", "f"]
+    several = plot_widths({"one": [1.0, 2.0, 3.0]}, ["a", "f", "b"], ["cm", "V", "cm"])
+    assert [[bar.get_height() for bar in axes.patches] for axes in several] == [[1.0, 3.0], [2.0]]
+    assert [t.get_text() for t in several[1].get_xticklabels()] == ["f\n[V]"]
     with pytest.raises(ReportError, match="'wide' has half widths of shape"):
         plot_widths({"wide": [1.0]}, ["a", "b"])
 
