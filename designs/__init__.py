@@ -10,7 +10,7 @@ from obsynth.designs.errors import (
     SolverTrouble,
 )
 from obsynth.designs.fault_detector import FaultDetector
-from obsynth.designs.hinf import HinfUIO
+from obsynth.designs.hinf import HinfUIO, WorstCase, worst_case
 from obsynth.designs.interval import IntervalObserver
 from obsynth.designs.observer import STATUS, Observer
 from obsynth.designs.qpv import Ellipsoid, QPVObserver
@@ -36,6 +36,8 @@ __all__ = [
     "QPVObserver",
     "SetAdaptiveObserver",
     "SolverTrouble",
+    "WorstCase",
     "load",
     "save",
+    "worst_case",
 ]

@@ -141,10 +141,12 @@ def check_detectability(parts: Split, L: FloatArray, G: FloatArray, vertices: Fl
             if abs(mode) < 1.0 - RANK:
                 continue
             pencil = np.vstack([mode * np.eye(n) - matrix, parts.C.astype(complex)])
-            _, values, vectors = np.linalg.svd(_normalised_complex(pencil))
+            size = np.linalg.norm(pencil, axis=0)
+            size = np.where(size > 0.0, size, 1.0)
+            _, values, vectors = np.linalg.svd(pencil / size)
             if values[-1] > RANK:
                 continue
-            motion = np.abs(vectors[-1]) / np.linalg.norm(pencil, axis=0)
+            motion = np.abs(vectors[-1]) / size
             moving = [x for x, size in zip(names, motion, strict=True) if size > 1e-6 * max(motion)]
             raise StructureError(
                 f"the states {', '.join(moving)} have a motion with the mode {mode:.6g}, which "
@@ -157,8 +159,3 @@ def check_detectability(parts: Split, L: FloatArray, G: FloatArray, vertices: Fl
                 vertex=M,
                 vertex_index=index,
             )
-
-
-def _normalised_complex(pencil: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    size = np.linalg.norm(pencil, axis=0)
-    return np.asarray(pencil / np.where(size > 0.0, size, 1.0))

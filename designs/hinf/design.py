@@ -194,7 +194,8 @@ class HinfDesign:
 def enclosed_vertices(family: AffineFamily) -> Enclosure:
     """Enclose all matrices ``constant + sum_k s_k direction_k`` at the corners of the ranges."""
     ends = [sorted(set(pair)) for pair in family.ranges.tolist()]
-    table = np.array(list(product(*ends))).reshape(-1, len(ends))
+    corners = list(product(*ends))
+    table = np.array(corners, dtype=float).reshape(len(corners), len(ends))
     return Enclosure.combine(
         Enclosure.of(family.constant, family.radius),
         Enclosure.of(family.directions),

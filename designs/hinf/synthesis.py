@@ -6,7 +6,7 @@ caps and margins mean the same for every plant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -53,7 +53,12 @@ Structure = Literal["standard", "general", "printed"]
 # Several infima need one direction of P to go to infinity; within these limits, in units in
 # which the rest of P is about one, the least mu is off by less than 1e-6 of itself.
 CAP = 1e4
+# Asked for in turn where the solver does not cope with the one before.
+CAPS = (CAP, 1e3, 1e2)
 FLOOR = 1e-3
+# A level of zero, where w can be kept out of f - fhat altogether, is not worth endless gains: this
+# much of the typical size of f - fhat is asked for at least.
+LEAST_LEVEL = 1e-3
 # Room between the solver's answer and the boundary: large against the solver's tolerance.
 MARGIN = 1e-7
 # Largest relative duality gap of an answer that the solver does not call solved.
@@ -95,6 +100,7 @@ def state_problem(
     decay: float | None = None,
     gains: Filter | None = None,
     margin: float = MARGIN,
+    cap: float = CAP,
 ) -> Problem:
     """State the design LMI, or with `gains` the analysis LMI.
 
@@ -110,6 +116,8 @@ def state_problem(
     gains : Filter, optional
     margin : float
         Smallest eigenvalue asked of the inequalities.
+    cap : float
+        Largest eigenvalue of P.
 
     Returns
     -------
@@ -133,7 +141,7 @@ def state_problem(
     if decay is not None and loop is not None:
         block = decay_block(loop, decay, data.sector, _multipliers("decay.tau", data))
         problem.add_lmi("decay", block, ">>", margin=margin)
-    problem.add_lmi("P.cap", CAP * np.eye(len(data.A)) - P, ">>", strict=False)
+    problem.add_lmi("P.cap", cap * np.eye(len(data.A)) - P, ">>", strict=False)
     problem.add_lmi("P.floor", P - FLOOR * np.eye(len(data.A)), ">>", strict=False)
     problem.minimise(trace(P) if mu is not None else mu2)
     return problem
@@ -192,7 +200,7 @@ def find_level(
     decay: float | None = None,
     gains: Filter | None = None,
 ) -> float:
-    """Find the least mu, to the solver's accuracy.
+    """Find the least mu, to the solver's accuracy, not below what `LEAST_LEVEL` stands for.
 
     Raises
     ------
@@ -202,11 +210,41 @@ def find_level(
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
     given = None if gains is None else units.filter_from_plant(gains)
+
+    def state(cap: float) -> Problem:
+        return state_problem(scaled, structure, None, decay, given, cap=cap)
+
     try:
-        solution = solve_reliably(state_problem(scaled, structure, None, decay, given))
+        solution = _solve_with_caps(state)
     except InfeasibleDesign as refusal:
         raise _explained(scaled, structure, decay, given) from refusal
-    return float(np.sqrt(solution.number("mu2"))) * units.f
+    least = float(np.sqrt(max(solution.number("mu2"), 0.0)))
+    return max(least, LEAST_LEVEL) * units.f
+
+
+def _solve_with_caps(state: Callable[[float], Problem]) -> Solution:
+    """Solve under the first cap of P that the solver copes with.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If there is no room under the largest cap.
+    SolverTrouble
+        If there is, but no problem is solved.
+    """
+    troubles: list[SolverTrouble] = []
+    for cap in CAPS:
+        try:
+            return solve_reliably(state(cap))
+        except SolverTrouble as trouble:
+            troubles.append(trouble)
+        except InfeasibleDesign:
+            if not troubles:
+                raise
+    margin = largest_margin(state(CAP), explain=False)
+    if margin.feasible:
+        raise troubles[0]
+    raise InfeasibleDesign(f"{state(CAP).name}: no room", margin.lines(), margin=margin.value)
 
 
 def find_filter(
@@ -221,7 +259,11 @@ def find_filter(
     """
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
-    solution = solve_reliably(state_problem(scaled, structure, mu / units.f, decay))
+
+    def state(cap: float) -> Problem:
+        return state_problem(scaled, structure, mu / units.f, decay, cap=cap)
+
+    solution = _solve_with_caps(state)
     P = solution["P"]
     m, n_f = len(data.C), data.n_f
     K: FloatArray = np.asarray(np.linalg.solve(P, solution["N"]), dtype=float)

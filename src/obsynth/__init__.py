@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from obsynth.designs import QPVObserver as QPVObserver
     from obsynth.designs import SetAdaptiveObserver as SetAdaptiveObserver
     from obsynth.designs import load as load
+    from obsynth.designs import worst_case as worst_case
     from obsynth.evaluate import Run as Run
     from obsynth.evaluate import SimulationError as SimulationError
     from obsynth.evaluate import Table as Table
@@ -107,6 +108,7 @@ __all__ = [
     "scenarios",
     "simulate",
     "split",
+    "worst_case",
 ]
 
 _ROOMS = {
@@ -142,6 +144,7 @@ _ROOMS = {
         "QPVObserver",
         "SetAdaptiveObserver",
         "load",
+        "worst_case",
     ),
     "codegen": ("CProject", "generate_c"),
     "evaluate": (
