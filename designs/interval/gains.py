@@ -15,9 +15,20 @@ from obsynth.designs.interval.model import IntervalModel, columns_of
 from obsynth.designs.lmi import Problem, diagonal, full
 from obsynth.symbolic import ObsynthError
 
-__all__ = ["Reduced", "check_detectable", "lp_gain", "lp_problem", "placed_gains", "sylvester_gain"]
+__all__ = [
+    "Reduced",
+    "check_detectable",
+    "lp_gain",
+    "lp_problem",
+    "placed_gains",
+    "predicted_size",
+    "refined",
+    "sylvester_gain",
+]
 
 MODE = 1e-9
+MOST_SKEW = 1e7
+UNBOUNDED = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +47,12 @@ class Reduced:
     w_width : ndarray, shape (n_w,)
     y_size : ndarray, shape (m,)
         Largest |y| over the declared boxes.
+    W : ndarray, shape (n, n - q)
+        x = W z2 and a share that the measurement gives.
+    changes : ndarray, shape (K, n - q, n + n_u + 1)
+        T2 times what every scheduling scalar changes over its range in [A B o].
+    signals : ndarray, shape (n + n_u + 1,)
+        Largest |x|, |u| and 1.
     """
 
     A: FloatArray
@@ -46,6 +63,9 @@ class Reduced:
     W2: FloatArray
     w_width: FloatArray
     y_size: FloatArray
+    W: FloatArray
+    changes: FloatArray
+    signals: FloatArray
 
     @classmethod
     def of(cls, model: IntervalModel, plant: Decoupled) -> Reduced:
@@ -56,9 +76,9 @@ class Reduced:
         D = [nearest(plant.T2 @ v[:, a] @ plant.Phi) for v in model.vertices]
         box = nearest(model.box("w")).reshape(-1, 2)
         C, W2 = nearest(model.C), nearest(model.W2)
-        size = np.abs(C) @ nearest(model.size("x")) + np.abs(W2) @ np.abs(box).max(
-            axis=1, initial=0.0
-        )
+        x = nearest(model.size("x"))
+        size = np.abs(C) @ x + np.abs(W2) @ np.abs(box).max(axis=1, initial=0.0)
+        ranges = model.family.ranges[:, 1] - model.family.ranges[:, 0]
         return cls(
             np.array(A).reshape(-1, n2, n2),
             np.array(D).reshape(-1, n2, m),
@@ -68,6 +88,9 @@ class Reduced:
             W2,
             box[:, 1] - box[:, 0],
             size,
+            nearest(plant.W),
+            nearest(plant.T2) @ (ranges[:, None, None] * model.family.directions),
+            np.concatenate([x, nearest(model.size("u")), [1.0]]),
         )
 
 
@@ -225,25 +248,61 @@ def sylvester_gain(
 def placed_gains(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield (P, L) that make P (A2 - L C2) P^-1 diagonal with several sets of real poles.
 
-    A2 is the mean of the vertices; sets of poles that cannot be placed are left out.
+    A2 is the mean of the vertices; sets of poles for which the Sylvester equation has no regular
+    solution are left out.
     """
-    from scipy.signal import place_poles
-
     A2, C2 = data.A.mean(axis=0), data.C2
-    n2 = len(A2)
-    if not n2 or not len(C2):
+    n2, m2 = len(A2), len(C2)
+    if not n2 or not m2:
         return
     steps = np.arange(n2) - 0.5 * (n2 - 1)
-    for middle in (0.0, 0.15, 0.3, 0.5, 0.7):
+    Q = np.ones((n2, m2)) + np.eye(n2)[:, np.arange(m2) % n2]
+    for middle in (0.01, 0.15, 0.3, 0.5, 0.7):
         for apart in (0.05, 0.2):
             poles = middle + apart * steps
-            if np.abs(poles).max() >= 1.0:
-                continue
-            try:
-                L = place_poles(A2.T, C2.T, poles).gain_matrix.T
-            except ValueError:
-                continue
-            values, vectors = np.linalg.eig(A2 - L @ C2)
-            if np.abs(values.imag).max() > 0 or np.linalg.cond(vectors) > 1e6:
-                continue
-            yield np.linalg.inv(vectors.real), np.asarray(L, dtype=float)
+            if np.abs(poles).max() < 1.0:
+                try:
+                    yield sylvester_gain(A2, C2, np.diag(poles), Q)
+                except InfeasibleDesign:
+                    continue
+
+
+def predicted_size(data: Reduced, P: FloatArray, L: FloatArray) -> float:
+    """Return the sum of the steady widths of x of the vertex form without contraction.
+
+    In doubles, for a search; at least 1e6 where the widths are unbounded.
+    """
+    if np.linalg.cond(P) > MOST_SKEW:
+        return 2.0 * UNBOUNDED
+    S = np.linalg.inv(P)
+    M = np.abs(P @ (data.A - L @ data.C2) @ S).max(axis=0)
+    radius = float(np.abs(np.linalg.eigvals(M)).max())
+    if radius >= 0.999:
+        return UNBOUNDED * (1.0 + radius)
+    driven = P @ (data.W1 - (data.D + L @ data.N12) @ data.W2)
+    rest = np.abs(driven).max(axis=0) @ data.w_width
+    rest = rest + np.abs(P @ data.changes).sum(axis=0) @ data.signals
+    widths = np.linalg.solve(np.eye(len(P)) - M, rest)
+    return float((np.abs(data.W @ S) @ widths).sum())
+
+
+def refined(
+    data: Reduced, P: FloatArray, L: FloatArray, evaluations: int = 3000
+) -> tuple[FloatArray, FloatArray]:
+    """Improve P and L together by a direct search on `predicted_size`."""
+    from scipy.optimize import minimize
+
+    n2 = len(P)
+
+    def read(point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return point[: n2 * n2].reshape(n2, n2), point[n2 * n2 :].reshape(n2, -1)
+
+    rows = P / np.abs(P).max(axis=1, keepdims=True)
+    found = minimize(
+        lambda point: predicted_size(data, *read(point)),
+        np.concatenate([rows.ravel(), L.ravel()]),
+        method="Nelder-Mead",
+        options={"maxfev": evaluations, "xatol": 1e-7, "fatol": 1e-9, "adaptive": True},
+    )
+    better, gain = read(np.asarray(found.x, dtype=float))
+    return better / np.abs(better).max(axis=1, keepdims=True), gain

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +9,21 @@ import numpy as np
 from obsynth.designs.errors import InfeasibleDesign
 from obsynth.designs.interval.design import IntervalDesign
 from obsynth.designs.interval.exact_arrays import FloatArray, exact, nearest
-from obsynth.designs.interval.gains import Reduced, lp_gain, placed_gains, sylvester_gain
+from obsynth.designs.interval.gains import (
+    Reduced,
+    lp_gain,
+    placed_gains,
+    predicted_size,
+    refined,
+    sylvester_gain,
+)
 from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError
 
 __all__ = ["complete", "given_gains", "lp_design", "sylvester_design", "with_gains"]
+
+STARTS = 3
 
 
 def with_gains(design: IntervalDesign, P: FloatArray, L: FloatArray) -> IntervalDesign:
@@ -63,7 +71,9 @@ def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> 
 
 
 def lp_design(design: IntervalDesign) -> IntervalDesign:
-    """Gains by the linear programme: P = I where that works, else the best of several P.
+    """Gains by the linear programme for P = I, or where that has no solution by a search of P.
+
+    The search starts at gains that place real poles and improves P and L together.
 
     Raises
     ------
@@ -75,9 +85,12 @@ def lp_design(design: IntervalDesign) -> IntervalDesign:
     first = _try(design, identity, _programme(data, identity))
     if first is not None:
         return first
-    done = [d for d in (_try(design, P, L) for P, L in _candidates(data)) if d is not None]
+    starts = sorted(placed_gains(data), key=lambda gains: predicted_size(data, *gains))
+    tried = [refined(data, *gains) for gains in starts[:STARTS]]
+    tried += [*starts, *((identity, L) for _, L in starts)]
+    done = [d for d in (_try(design, P, L) for P, L in tried) if d is not None]
     if not done:
-        gains = next(_candidates(data), (identity, np.zeros((len(identity), len(data.C2)))))
+        gains = tried[0] if tried else (identity, np.zeros((len(identity), len(data.C2))))
         raise divergence(with_gains(design, *gains), "no P was found whose bounds stay bounded")
     return min(done, key=lambda d: float(d.half_widths.sum()))
 
@@ -87,16 +100,6 @@ def _programme(data: Reduced, P: FloatArray) -> FloatArray | None:
         return lp_gain(data, P)
     except InfeasibleDesign:
         return None
-
-
-def _candidates(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
-    identity = np.eye(data.A.shape[1])
-    for P, L in placed_gains(data):
-        yield P, L
-        better = _programme(data, P)
-        if better is not None:
-            yield P, better
-        yield identity, L
 
 
 def _try(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign | None:

@@ -49,28 +49,32 @@ LARGEST = 1e12
 class PartWidth:
     """What one `Part` adds: error <= E e + e_rest, width <= V w + V_mixed min(w, e) + w_rest.
 
-    All entries exact and nonnegative; shapes (rows, n - q) and (rows,).
+    All entries nonnegative, exact or in doubles; shapes (rows, n - q) and (rows,).
     """
 
-    E: Exact
-    e_rest: Exact
-    V: Exact
-    V_mixed: Exact
-    w_rest: Exact
+    E: Any
+    e_rest: Any
+    V: Any
+    V_mixed: Any
+    w_rest: Any
+
+    def width(self, w: Any, e: Any) -> Any:
+        """Return the widths of the rows for widths w and errors e of r."""
+        return self.V @ w + self.V_mixed @ np.minimum(w, e) + self.w_rest
 
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """One row of the measurement contraction: component <= |others| e + rest, likewise for w."""
+    """One row of the measurement contraction: component <= others e + rest, likewise for w."""
 
     component: int
-    others: Exact
-    rest: Exact
+    others: Any
+    rest: Any
 
 
 @dataclass(frozen=True, eq=False)
 class WidthMap:
-    """One step of the error and of the width of r.
+    """One step of the error and of the width of r, in exact numbers or in doubles.
 
     Attributes
     ----------
@@ -83,23 +87,28 @@ class WidthMap:
     part: PartWidth
     contractions: tuple[Contraction, ...]
 
-    def error(self, e: Any, lift: Callable[[Exact], Any]) -> Any:
+    def error(self, e: Any) -> Any:
         """Map the bound of the error."""
-        return self._contract(lift(self.part.E) @ e + lift(self.part.e_rest), lift)
+        return self._contract(self.part.E @ e + self.part.e_rest)
 
-    def width(self, w: Any, e: Any, lift: Callable[[Exact], Any]) -> Any:
+    def width(self, w: Any, e: Any) -> Any:
         """Map the width, for errors of at most e."""
-        part = self.part
-        both = np.minimum(w, e)
-        moved = lift(part.V) @ w + lift(part.V_mixed) @ both + lift(part.w_rest)
-        return self._contract(moved, lift)
+        return self._contract(self.part.width(w, e))
 
-    def _contract(self, values: Any, lift: Callable[[Exact], Any]) -> Any:
-        values = values.copy()
+    def _contract(self, values: Any) -> Any:
         for row in self.contractions:
-            bound = lift(row.others) @ values + lift(row.rest).item()
+            bound = row.others @ values + row.rest
             values[row.component] = min(values[row.component], bound)
         return values
+
+    def rounded(self) -> WidthMap:
+        """Return the map in doubles."""
+        part = PartWidth(**{name: nearest(value) for name, value in vars(self.part).items()})
+        contractions = tuple(
+            Contraction(c.component, nearest(c.others), float(nearest(np.array([c.rest]))[0]))
+            for c in self.contractions
+        )
+        return WidthMap(part, contractions)
 
 
 def part_width(part: Part, rows: Rows, slack: FloatArray, nominal: Exact | None) -> PartWidth:
@@ -215,48 +224,58 @@ def contraction_width(rows: Rows, slack: FloatArray, part: Part, component: int)
     n2 = part.S.shape[0]
     others = rows.upper[0][0, start : start + n2] - rows.upper[0][0, start + n2 : start + 2 * n2]
     noise = rows.upper[0][0, -1] - rows.lower[0][0, -1]
-    return Contraction(component, others + of_e[0], np.array([noise + constant[0]], dtype=object))
+    return Contraction(component, others + of_e[0], noise + constant[0])
 
 
 def steady(step: WidthMap) -> tuple[FloatArray, FloatArray] | None:
     """Return (e*, w*) in doubles, or None if the errors grow without bound.
 
-    Iterates from the solution without contraction where there is one, which is above what is
-    sought, otherwise from zero; both end in the only positive fixed point.
+    Iterates from the solution without contraction where there is one: the step maps it below
+    itself, and so every iterate. Where only the contraction keeps the errors small, from zero.
     """
-    lift = nearest
     n2 = len(step.part.e_rest)
     if n2 == 0:
         return np.zeros(0), np.zeros(0)
-    E, rest = nearest(step.part.E), nearest(step.part.e_rest)
-    table: dict[int, FloatArray] = {}
+    quick = step.rounded()
+    E, rest = quick.part.E, quick.part.e_rest
 
-    def quick(values: Exact) -> FloatArray:
-        if id(values) not in table:
-            table[id(values)] = lift(values)
-        return table[id(values)]
+    def error(e: FloatArray) -> FloatArray:
+        return np.asarray(quick.error(e) * INFLATION, dtype=float)
 
-    e = np.zeros(n2)
     if float(np.abs(np.linalg.eigvals(E)).max()) * INFLATION < 1.0:
-        e = np.maximum(np.linalg.solve(np.eye(n2) - E * INFLATION, rest * INFLATION), 0.0)
-    e_star = _iterate(e, lambda v: step.error(v, quick) * INFLATION)
-    if e_star is None:
-        return None
-    w_star = _iterate(e_star * 2.0, lambda v: step.width(v, e_star, quick) * INFLATION)
-    return None if w_star is None else (e_star, w_star)
+        linear = np.linalg.solve(np.eye(n2) - E * INFLATION, rest * INFLATION)
+        e_star = _descend(linear, error)
+    else:
+        found = _ascend(n2, error) if step.contractions else None
+        if found is None:
+            return None
+        e_star = found
+    w_star = _descend(
+        2.0 * e_star, lambda w: np.asarray(quick.width(w, e_star) * INFLATION, dtype=float)
+    )
+    return e_star, w_star
 
 
-def _iterate(start: FloatArray, step: Callable[[FloatArray], FloatArray]) -> FloatArray | None:
-    value = start
-    largest = LARGEST * max(1.0, float(step(start * 0.0).max(initial=0.0)))
-    for _ in range(100_000):
+def _descend(value: FloatArray, step: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    for _ in range(1000):
+        moved = np.minimum(step(value), value)
+        if np.all(value - moved <= 1e-10 * value):
+            return value
+        value = moved
+    return value
+
+
+def _ascend(size: int, step: Callable[[FloatArray], FloatArray]) -> FloatArray | None:
+    value = np.zeros(size)
+    largest = LARGEST * max(1.0, float(step(value).max()))
+    for _ in range(5000):
         moved = step(value)
         if not np.isfinite(moved).all() or moved.max() > largest:
             return None
-        if np.all(np.abs(moved - value) <= 1e-9 * moved):
-            return np.maximum(moved, value)
+        if np.all(moved - value <= 1e-12 * moved):
+            return moved * INFLATION
         value = moved
-    return value
+    return None
 
 
 def steady_holds(step: WidthMap, e: FloatArray, w: FloatArray) -> tuple[bool, float]:
@@ -267,30 +286,21 @@ def steady_holds(step: WidthMap, e: FloatArray, w: FloatArray) -> tuple[bool, fl
     (bool, float)
         Whether both hold, and the smallest relative room.
     """
-
-    def same(values: Exact) -> Exact:
-        return values
-
     exact_e, exact_w = exact(e), exact(w)
     room = 1.0
     for value, moved in (
-        (exact_e, step.error(exact_e, same)),
-        (exact_w, step.width(exact_w, exact_e, same)),
+        (exact_e, step.error(exact_e)),
+        (exact_w, step.width(exact_w, exact_e)),
     ):
         if any(not v > 0 for v in value):
             return False, 0.0
-        ratio = [
-            float(nearest(np.array([m / v], dtype=object))[0])
-            for m, v in zip(moved, value, strict=True)
-        ]
-        if any(m > (1 - DELTA) * v for m, v in zip(moved, value, strict=True)):
-            return False, 1.0 - max(ratio)
-        room = min(room, 1.0 - max(ratio, default=0.0))
+        left = np.array([1 - m / v for m, v in zip(moved, value, strict=True)], dtype=object)
+        room = min(room, float(nearest(left).min(initial=1.0)))
+        if any(gap < DELTA for gap in left):
+            return False, room
     return True, room
 
 
 def row_widths(part: PartWidth, e: FloatArray, w: FloatArray) -> FloatArray:
     """Return the widths of a part's rows for the steady e and w, rounded upwards."""
-    exact_e, exact_w = exact(e), exact(w)
-    both = np.minimum(exact_w, exact_e)
-    return above(part.V @ exact_w + part.V_mixed @ both + part.w_rest)
+    return above(part.width(exact(w), exact(e)))
