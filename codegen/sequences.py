@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, midpoints, nominal_values
@@ -12,6 +13,7 @@ __all__ = ["Drive", "random_memory"]
 
 _KINDS = ("u", "d", "f", "w", "p", "rho")
 _HOLD = 20
+_SMALL = 0.01
 
 
 def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
@@ -41,12 +43,14 @@ class Drive:
         self.rng = rng
         self._observer = description.observer
         self._plant = Machine(model.function())
+        self._slope = Machine(_input_slope(model.function()))
         self._nominal = nominal_values(model, "x")
         self._x_box = _finite(self._box("x"), self._nominal)
         self._boxes = {
             kind: _finite(self._box(kind), midpoints(self._box(kind))) for kind in _KINDS
         }
         self._sequence = 0
+        self._rest = False
         self._x = self._nominal
         self._levels = {kind: self._draw(kind) for kind in _KINDS}
         self._scheduling = list(description.scheduling)
@@ -69,7 +73,9 @@ class Drive:
         """Start a trajectory of `length` samples; return the observer's memory for it.
 
         None stands for the default memory. Every second trajectory starts from a guess of
-        its own, and two thirds of them carry a fault that grows from a random instant.
+        its own, and two thirds of them carry a fault that grows from a random instant. Half of
+        them are kept near where they start, with small faults, so that observers whose
+        guarantee holds in a small region are seen at work in it.
         """
         rng = self.rng
         self._sequence += 1
@@ -77,11 +83,14 @@ class Drive:
         self._u = np.repeat([self._draw("u") for _ in range(holds)], _HOLD, axis=0)
         onset = int(rng.integers(length))
         ramp = np.clip((np.arange(length) - onset) / (0.5 * length), 0.0, 1.0)
-        target = self._draw("f") * (self._sequence % 3 > 0)
+        self._rest = self._sequence % 4 < 2
+        target = self._draw("f") * (self._sequence % 3 > 0) * (_SMALL if self._rest else 1.0)
         self._ramp = ramp[:, None] * target
         self._levels["p"] = self._draw("p")
         self._x = rng.uniform(self._x_box[:, 0], self._x_box[:, 1])
         if self._sequence % 2:
+            if self._rest:
+                self._x = self._nominal
             return None
         return np.array(self._observer.memory0(self._x), dtype=float)
 
@@ -90,6 +99,8 @@ class Drive:
         # Measured scheduling moves slower than a sample, as do the inputs.
         for kind in ("d", "w") if self._scheduling and k % _HOLD else ("d", "w", "rho"):
             self._levels[kind] = self._draw(kind)
+        if self._rest and k % _HOLD == 0:
+            self._u[k : k + _HOLD] = self._keeping(self._u[k])
         self._levels["u"] = self._u[k]
         self._levels["f"] = self._ramp[k]
         y = self._measure(self._x)
@@ -98,6 +109,18 @@ class Drive:
         if np.isfinite(y).all():
             self._measured = y.copy()
         return [self._u[k].copy(), y, *self._theta(self._levels["rho"])]
+
+    def _keeping(self, u: FloatArray) -> FloatArray:
+        """Return inputs in their ranges that move the plant as little as inputs can."""
+        low, high = self._boxes["u"].T
+        for _ in range(2):
+            now = [u if kind == "u" else self._levels[kind] for kind in _KINDS]
+            moved, slope = self._slope(self._x, *now)
+            if not (np.isfinite(moved).all() and np.isfinite(slope).all()):
+                break
+            matrix = slope.reshape(u.size, self._x.size).T
+            u = np.clip(u - np.linalg.lstsq(matrix, moved - self._x)[0], low, high)
+        return u
 
     def wide(self) -> list[FloatArray]:
         """Return inputs and measurements spread around those seen last, over many magnitudes."""
@@ -108,6 +131,13 @@ class Drive:
 
     def _theta(self, rho: FloatArray) -> list[FloatArray]:
         return [rho[self._scheduling]] if self._scheduling else []
+
+
+def _input_slope(plant: ca.Function) -> ca.Function:
+    """Return (x, u, d, f, w, p, rho) -> (next x, its derivative by u, column by column)."""
+    ports = [ca.MX.sym(f"i{i}", plant.numel_in(i)) for i in range(plant.n_in())]
+    following = plant.call(ports)[0]
+    return ca.Function("slope", ports, [following, ca.vec(ca.jacobian(following, ports[1]))])
 
 
 def _spread(rng: np.random.Generator, values: FloatArray) -> FloatArray:

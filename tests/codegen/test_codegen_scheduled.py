@@ -198,3 +198,18 @@ def test_a_plant_without_measured_scheduling_is_refused(tmp_path: Path) -> None:
     plant.outputs([a])
     with pytest.raises(CodegenError, match="'blind' declares no measured scheduling signal"):
         generate_c(Scheduled(step(1), plant), tmp_path / "p", vectors=100)
+
+
+def test_half_of_the_trajectories_are_kept_where_they_start(observer: Scheduled) -> None:
+    drive = Drive(describe(observer), np.random.default_rng(1))
+    moved = {True: 0.0, False: 0.0}
+    for sequence in range(1, 9):
+        drive.begin(20)
+        start = drive._x.copy()
+        kept = sequence % 4 < 2
+        assert drive._rest is kept
+        inputs = [drive.sample(k)[0] for k in range(20)]
+        assert np.ptp(inputs) == 0.0, "held"
+        assert np.all(np.abs(inputs) <= 1.0)
+        moved[kept] += abs(drive._x[1] - start[1])
+    assert moved[True] < 0.5 * moved[False]
