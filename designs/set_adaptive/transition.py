@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from decimal import Decimal, localcontext
 
 import casadi as ca
 import numpy as np
@@ -63,14 +63,25 @@ def uniformisation(h: float, mu: float) -> Weights:
             option="Ts",
             largest=LARGEST_PRODUCT / mu,
         )
-    chances: list[float] = []
-    j = 0
-    while j <= product or chances[-1] > _TAIL * 2.0**-20:
-        chances.append(math.exp(j * math.log(product) - product - math.lgamma(j + 1)))
-        j += 1
-    tails = [math.fsum(chances[j + 1 :]) for j in range(len(chances))]
+    chances, tails = _poisson(product)
     kept = next(j for j, tail in enumerate(tails) if tail <= _TAIL) + 1
     return Weights(h, mu, np.array(chances[:kept]), np.array(tails[:kept]) / mu)
+
+
+def _poisson(mean: float) -> tuple[list[float], list[float]]:
+    """Return the probabilities of 0, 1, ... and of more than that, rounded once each."""
+    with localcontext() as context:
+        context.prec = 50
+        exact = Decimal(mean)
+        term = (-exact).exp()
+        terms = [term]
+        while len(terms) <= mean or float(term) > _TAIL * 2.0**-20:
+            term = term * exact / len(terms)
+            terms.append(term)
+        tails = [Decimal(0)] * len(terms)
+        for j in range(len(terms) - 1, 0, -1):
+            tails[j - 1] = tails[j] + terms[j]
+        return [float(term) for term in terms], [float(tail) for tail in tails]
 
 
 def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
