@@ -1,0 +1,426 @@
+"""Refusals, run-time monitors, storage and proofs of the interval observer, and its C code."""
+
+import copy
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import obsynth as ob
+from obsynth.codegen import find_compiler
+from obsynth.designs import STATUS
+from obsynth.designs.interval.assembly import prove
+
+BOX = np.tile([0.5, 1.5], (3, 1))
+
+
+def call(observer, memory, u, y):
+    return [np.array(o).ravel() for o in observer.step(memory, u, y)]
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+def lpv(A, F, C, **extra):
+    """A plant with given matrices, noise of 0.01 and states within 5."""
+    n, m = len(A), len(C)
+    p = ob.Plant("given")
+    x = p.states(f"x1:{n + 1}", range=(-5, 5), **extra)
+    f = p.faults(f"f1:{len(F[0]) + 1}") if len(F[0]) else ()
+    w = p.disturbances(f"w1:{n + 1}", bound=0.01)
+    v = p.disturbances(f"v1:{m + 1}", bound=0.01)
+    moved = sp.Matrix(A) * sp.Matrix(x) + sp.Matrix(w)
+    p.dynamics(moved + (sp.Matrix(F) * sp.Matrix(f) if f else sp.zeros(n, 1)), Ts=1)
+    p.outputs(sp.Matrix(C) * sp.Matrix(x) + sp.Matrix(v))
+    return p
+
+
+def test_full_rank_of_C_and_F_is_not_enough():
+    plant = lpv([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    with pytest.raises(ob.StructureError, match=r"rank\(C F\) = 0") as refusal:
+        ob.IntervalObserver().design(plant)
+    assert refusal.value.symbols == ("f1",)
+    assert refusal.value.states == ("x2",)
+    assert (refusal.value.rank_CF, refusal.value.q) == (0, 1)
+
+
+def test_faults_that_act_alike():
+    plant = lpv([[0, 1], [0, 0]], [[1, 2], [1, 2]], [[1, 0], [0, 1]])
+    with pytest.raises(ob.StructureError, match=r"rank\(F\) = 1"):
+        ob.IntervalObserver().design(plant)
+
+
+def test_an_undetectable_pair():
+    half = sp.Rational(1, 2)
+    plant = lpv([[half, 0, 0], [0, half, 0], [0, 0, 1]], [[1], [0], [0]], [[1, 0, 0], [0, 1, 0]])
+    with pytest.raises(ob.StructureError, match="not detectable") as refusal:
+        ob.IntervalObserver().design(plant)
+    assert refusal.value.symbols == ("x3",)
+    assert refusal.value.mode == pytest.approx(1.0)
+    stable = lpv(
+        [[half, 0, 0], [0, half, 0], [0, 0, half]], [[1], [0], [0]], [[1, 0, 0], [0, 1, 0]]
+    )
+    assert ob.IntervalObserver().design(stable).certificate.valid
+
+
+def test_bounds_that_diverge(example):
+    with pytest.raises(ob.InfeasibleDesign, match="diverge") as refusal:
+        ob.IntervalObserver(gains=(np.eye(2), [3.0, 1.0]), contraction=False).design(example)
+    assert refusal.value.radius > 1.0
+    with pytest.raises(ob.InfeasibleDesign, match="below zero"):
+        ob.IntervalObserver(gains=(np.eye(2), [0.4, -1]), bound="paper").design(example)
+
+
+def test_the_contraction_alone_can_keep_bounds_together():
+    plant = lpv([[2, 0], [1, 0]], [[], []], [[1, 0], [0, 1]])
+    zero = (np.eye(2), np.zeros((2, 2)))
+    observer = ob.IntervalObserver(gains=zero).design(plant)
+    assert observer.performance["spectral_radius"] > 1.9
+    assert observer.half_widths == pytest.approx([0.01, 0.01], rel=1e-4)
+    with pytest.raises(ob.InfeasibleDesign, match="diverge"):
+        ob.IntervalObserver(gains=zero, contraction=False).design(plant)
+
+
+def test_the_class_of_plants(example):
+    tanks = ob.plants.quadruple_tank()
+    with pytest.raises(ob.StructureError, match="continuous time"):
+        ob.IntervalObserver().design(tanks)
+    p = ob.Plant("sensor")
+    (x,) = p.states("x", range=(-1, 1))
+    p.dynamics([x / 2], Ts=1)
+    p.outputs([x])
+    p2 = ob.Plant("loose")
+    (x,) = p2.states("x", range=(-1, 1))
+    (w,) = p2.disturbances("w")
+    p2.dynamics([x / 2 + w], Ts=1)
+    p2.outputs([x])
+    with pytest.raises(ob.StructureError, match="no bound"):
+        ob.IntervalObserver().design(p2)
+    p3 = ob.Plant("irrational")
+    (x,) = p3.states("x", range=(-1, 1))
+    (f,) = p3.faults("f")
+    p3.dynamics([x / 2 + sp.sqrt(2) * f], Ts=1)
+    p3.outputs([x])
+    with pytest.raises(ob.StructureError, match="irrational"):
+        ob.IntervalObserver().design(p3)
+    assert ob.IntervalObserver().design(p).half_widths == pytest.approx([0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"gains": "guess"}, "'lp', 'sylvester' or a pair"),
+        ({"gains": 3.0}, "pair"),
+        ({"bound": "ellipsoid"}, "bound is"),
+        ({"form": "repaired"}, "form is"),
+        ({"precision": "half"}, "precision is"),
+        ({"centred": False}, "needs nominal"),
+        ({"nominal": np.eye(3)}, "centred=False"),
+        ({"R": np.eye(2)}, "sylvester"),
+        ({"gains": "sylvester", "Q": np.eye(2)}, "without R"),
+        ({"H": [[np.inf]]}, "finite"),
+    ],
+)
+def test_options(options, words):
+    with pytest.raises(ob.ObsynthError, match=words):
+        ob.IntervalObserver(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"H": 2 * np.eye(3)}, "not orthogonal"),
+        ({"H": np.eye(3)[[1, 0, 2]]}, "do not factorise F"),
+        ({"R0": [[1.0]]}, "without H"),
+        ({"H": np.eye(2)}, "shape"),
+        ({"N": np.eye(2), "R1": [[3.0]]}, "do not factorise C H1"),
+        ({"gains": (np.zeros((2, 2)), [1, 1])}, "regular"),
+        ({"gains": (np.eye(2), [1, 1, 1])}, "L has to be"),
+        ({"gains": "sylvester", "R": np.diag([0.2, 0.4]), "Q": [1, 1, 1]}, "shape"),
+        ({"centred": False, "nominal": np.eye(2)}, "nominal has to have"),
+    ],
+)
+def test_options_that_do_not_fit_the_plant(options, words, example):
+    with pytest.raises(ob.ObsynthError, match=words):
+        ob.IntervalObserver(**options).design(example)
+
+
+def test_given_transformations(example, designs):
+    """For n - q >= 2 a rotation of the free coordinates is another observer, as good a proof."""
+    c, s = np.cos(0.3), np.sin(0.3)
+    H = np.array([[-1, 0, 0], [0, c, -s], [0, s, c]])
+    turned = ob.IntervalObserver(H=H).design(example)
+    assert turned.certificate.valid
+    assert np.array_equal(turned.gains["H"], H)
+    run = ob.simulate(example, turned, ob.scenarios.interval_example(3))
+    assert min(run.coverage.values()) == 1.0
+    same = ob.IntervalObserver(
+        **{name: designs["d1"].gains[name] for name in ("H", "R0", "K0", "N", "R1", "K1")}
+    ).design(example)
+    assert same.half_widths == pytest.approx(designs["d1"].half_widths, rel=1e-9)
+
+
+def test_forms_are_taken_where_they_can_be_derived_again(example):
+    form = ob.quasi_lpv(example)
+    observer = ob.IntervalObserver().design(form)
+    assert observer.certificate.check().valid
+    other = ob.quasi_lpv(example, centre=([1, 0, 0], [0]))
+    with pytest.raises(ob.ObsynthError, match="not the one that is derived"):
+        ob.IntervalObserver().design(other)
+
+
+# -- run time ---------------------------------------------------------------------------------
+
+
+def test_memory_of_zeros_is_not_initialised(designs):
+    observer = designs["d1"]
+    memory = np.zeros(11)
+    out = call(observer, memory, [0.0], [1.0, 1.0])
+    assert np.array_equal(out[0], memory)
+    assert int(out[7][0]) & STATUS["not_initialised"]
+    assert np.all(np.isinf(out[3])) and np.all(np.isinf(out[6]))
+
+
+def test_the_fault_is_known_one_sample_later(designs):
+    observer = designs["d1"]
+    assert observer.fault_delay == 1
+    memory = observer.memory0(np.ones(3), x_range=BOX)
+    first = call(observer, memory, [3.5], [1.0, 1.0])
+    assert int(first[7][0]) == STATUS["fault_not_valid"]
+    assert np.isinf(first[5]).all()
+    second = call(observer, first[0], [0.0], [3.1, -1.15])
+    assert int(second[7][0]) == 0
+    assert second[5] <= 1.0 <= second[6]
+
+
+@pytest.mark.parametrize("missing", [np.nan, np.inf, -np.inf])
+def test_a_missing_sample(missing, designs, example):
+    observer = designs["d1"]
+    run = ob.simulate(example, observer, ob.scenarios.interval_example(seed=1))
+    memory = observer.memory0(np.ones(3), x_range=BOX)
+    for k in range(60):
+        y, u = run.y[k].copy(), run.u[k].copy()
+        if k == 20:
+            y[1] = missing
+        if k == 40:
+            u[0] = missing
+        out = call(observer, memory, u, y)
+        memory, status = out[0], int(out[7][0])
+        assert np.isfinite(memory).all()
+        if k in (20, 40):
+            assert status & STATUS["non_finite_input"]
+        if k == 20:
+            assert np.isinf(out[3]).all() and np.isfinite(out[1]).all()
+            assert np.abs(out[1] - run.x[k]).max() < 0.5
+            continue
+        assert np.all(out[3] <= run.x[k]) and np.all(run.x[k] <= out[4])
+        if k in (0, 21, 41):
+            assert status & STATUS["fault_not_valid"]
+            assert np.isinf(out[5]).all()
+        elif k != 20:
+            assert out[5] <= run.f[k - 1] <= out[6]
+
+
+def test_a_missing_sample_without_a_box_ends_the_guarantee():
+    p = ob.Plant("no box")
+    x = p.states("x1:3")
+    (w,) = p.disturbances("w", bound=0.1)
+    p.dynamics([x[0] / 2 + x[1] / 4, x[1] / 2 + w], Ts=1)
+    p.outputs([x[0]])
+    observer = ob.IntervalObserver().design(p)
+    with pytest.raises(ob.ObsynthError, match="x_range is needed"):
+        observer.memory0([0, 0])
+    memory = observer.memory0([0, 0], x_range=[[-1, 1]] * 2)
+    assert int(call(observer, memory, [], [0.1])[7][0]) == 0
+    lost = call(observer, memory, [], [np.nan])[0]
+    out = call(observer, lost, [], [0.1])
+    assert int(out[7][0]) & STATUS["not_initialised"]
+    assert np.isinf(out[3]).all()
+
+
+def test_an_impossible_measurement_is_reported(designs):
+    observer = designs["d1"]
+    memory = observer.memory0(np.ones(3), x_range=BOX)
+    out = call(observer, memory, [3.5], [1.0, 9.0])
+    assert int(out[7][0]) & STATUS["inconsistent_measurement"]
+    assert np.isfinite(out[3]).all() and np.all(out[3] <= out[4])
+    fine = call(observer, memory, [3.5], [1.0, 1.4])
+    assert not int(fine[7][0]) & STATUS["inconsistent_measurement"]
+
+
+def test_the_box_is_watched_where_the_matrices_rest_on_it():
+    p = ob.Plant("pendulum-like")
+    x = p.states("x1:3", range=[(-1, 1), (-2, 2)])
+    (f,) = p.faults("f")
+    w = p.disturbances("w1:3", bound=0.001)
+    p.dynamics([x[0] / 2 + f, x[1] / 4 + x[0] * x[1] / 8 + w[0]], Ts=1)
+    p.outputs([x[0] + w[1]])
+    observer = ob.IntervalObserver().design(p)
+    assert any("x1 in [-1, 1]" in a and "bit 4" in a for a in observer.guarantee.assumptions)
+    memory = observer.memory0([0, 0], x_range=[[-0.5, 0.5]] * 2)
+    assert int(call(observer, memory, [], [0.2])[7][0]) == STATUS["fault_not_valid"]
+    assert int(call(observer, memory, [], [1.2])[7][0]) & STATUS["outside_domain"]
+
+
+def test_no_bit_for_a_box_on_which_nothing_rests(designs):
+    memory = designs["d1"].memory0(np.full(3, 50.0), x_range=[[49, 51]] * 3)
+    out = call(designs["d1"], memory, [0.0], [50.0, 50.0])
+    assert int(out[7][0]) == STATUS["fault_not_valid"]
+    assert not any("bit 4" in text for text in designs["d1"].guarantee.assumptions)
+
+
+def test_memory0_says_what_is_wrong(designs):
+    with pytest.raises(ob.ObsynthError, match="guess has to be 3"):
+        designs["d1"].memory0([1.0])
+    with pytest.raises(ob.ObsynthError, match="lower before upper"):
+        designs["d1"].memory0(np.ones(3), x_range=[[1, 0]] * 3)
+
+
+# -- proofs and storage -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", ["b2", "c2", "d0", "d1"])
+def test_every_claim_is_proved_from_the_record(case, designs):
+    certificate = designs[case].certificate.check()
+    names = {claim.name for claim in certificate}
+    assert {"decoupling", "stability", "rounding", "model", "vertices"} <= names
+    assert ("nonnegative" in names) == (case in ("b2", "c2"))
+
+
+def test_a_stored_design_is_read_as_it_was(two_faults, tmp_path):
+    observer = ob.IntervalObserver().design(two_faults)
+    path = tmp_path / "two.json"
+    observer.save(path)
+    again = ob.load(path)
+    assert again.half_widths.tolist() == observer.half_widths.tolist()
+    assert again.step.serialize() == observer.step.serialize()
+    assert again.certificate.check().valid
+
+
+def test_a_stored_design_is_proved_in_another_process(designs, tmp_path):
+    path = tmp_path / "d1.json"
+    designs["d1"].save(path)
+    code = (
+        "import sys, obsynth as ob\n"
+        "certificate = ob.load(sys.argv[1]).certificate.check()\n"
+        "print(certificate.valid, len(certificate.claims))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True", "5"]
+
+
+def narrower_width(record):
+    record["width"][0] *= 0.99
+
+
+def narrower_error(record):
+    record["error"][1] *= 0.9
+
+
+def other_gain(record):
+    record["L"][0][0] = 3.0
+
+
+def narrower_range(record):
+    record["model"]["family"]["ranges"][0][1] = 0.9
+
+
+def smaller_entry(record):
+    record["model"]["family"]["constant"][1][0] = -0.89
+
+
+def other_fault(record):
+    record["model"]["F"][0][0] = "-2"
+
+
+def other_output(record):
+    record["model"]["C"][1][2] = "2"
+
+
+TAMPERED = [
+    narrower_width,
+    narrower_error,
+    other_gain,
+    narrower_range,
+    smaller_entry,
+    other_fault,
+    other_output,
+]
+
+
+@pytest.mark.parametrize("change", TAMPERED)
+def test_a_record_that_was_changed_is_not_proved(change, designs):
+    record = copy.deepcopy(dict(designs["d1"].record))
+    change(record)
+    assert not all(claim.holds for claim in prove(record))
+    assert all(claim.holds for claim in prove(designs["d1"].record))
+
+
+def wrong_shape(record):
+    record["P"] = [[1.0]]
+
+
+def missing(record):
+    del record["transformation"]["H"]
+
+
+def not_finite(record):
+    record["model"]["family"]["constant"][0][0] = float("nan")
+
+
+def unknown_bound(record):
+    record["bound"] = "box"
+
+
+@pytest.mark.parametrize("change", [wrong_shape, missing, not_finite, unknown_bound])
+def test_a_record_that_cannot_be_read(change, designs, tmp_path):
+    record = json.loads(json.dumps(designs["d1"].record))
+    change(record)
+    path = tmp_path / "broken.json"
+    path.write_text(json.dumps(record))
+    with pytest.raises(ob.CertificateError, match="cannot be read"):
+        ob.load(path)
+
+
+def test_analyse_proves_what_given_gains_guarantee(example, designs):
+    observer = ob.IntervalObserver().analyse(example, {"L": [[0.4], [-1.0]]})
+    assert observer.half_widths == pytest.approx(designs["d1"].half_widths, rel=1e-12)
+    wider = ob.IntervalObserver().analyse(example, {"L": [[0.6], [-1.0]]})
+    assert wider.half_widths[1] > observer.half_widths[1] * 1.01
+    with pytest.raises(ob.ObsynthError, match="needs L"):
+        ob.IntervalObserver().analyse(example, {"P": np.eye(2)})
+
+
+def test_sylvester_gains(example):
+    observer = ob.IntervalObserver(gains="sylvester").design(example)
+    assert observer.certificate.valid
+    off = observer.gains["R"] - np.diag(np.diag(observer.gains["R"]))
+    assert np.abs(off).max() < 1e-9
+    with pytest.raises(ob.InfeasibleDesign, match="eigenvalue in common"):
+        ob.IntervalObserver(gains="sylvester", R=np.diag([0.0, 0.2])).design(
+            lpv([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1], [0], [0]], [[1, 0, 0], [0, 0, 1]])
+        )
+
+
+def test_the_guarantee_names_its_assumptions(designs):
+    text = str(designs["d1"].guarantee)
+    for words in ("rho1 in [-1, 1]", "memory0", "whatever f do", "IEEE double", "bit 8"):
+        assert words in text
+    assert "interval_observer" in str(designs["d1"])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize(
+    "options", [{}, pytest.param({"bound": "paper", "precision": "single"}, marks=pytest.mark.long)]
+)
+def test_the_c_code_is_the_step(options, example, tmp_path):
+    observer = ob.IntervalObserver(gains=(np.diag([1.0, -1]), [0.4, -1]), **options).design(example)
+    project = ob.generate_c(observer, tmp_path / "c")
+    assert project.comparison is not None
+    assert project.comparison.vectors >= 1000
+    assert "equal to the last bit" in str(project)
