@@ -6,7 +6,7 @@ dependence counts only when the difference is proved to be identically zero.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _RANK_TOLERANCE = 1e-8
 _LARGEST_DENOMINATOR = 1000
+_ROUNDING = 1e-14
 
 
 def entry_name(entry: Entry, name: str = "m") -> str:
@@ -66,6 +67,9 @@ class AffineDependence:
         Names of the variables on which the entries depend.
     name : str
         How entries are called, for the text.
+    size : float
+        Largest magnitude of the entry at the samples; the text does not add constants to it that
+        the rounding of a matrix has left.
     """
 
     entry: Entry
@@ -74,6 +78,7 @@ class AffineDependence:
     proof: str
     shared: tuple[str, ...]
     name: str = "m"
+    size: float = 0.0
 
     def __str__(self) -> str:
         terms = []
@@ -82,9 +87,12 @@ class AffineDependence:
             factor = {1.0: "", -1.0: "-"}.get(number, f"{number:.6g} ")
             terms.append(f"{factor}{entry_name(other, self.name)}")
         constant = float(sp.N(self.constant, 17))
-        if constant != 0.0 or not terms:
+        small = bool(terms) and abs(constant) <= _ROUNDING * self.size
+        if not terms or (constant != 0.0 and not small):
             terms.append(f"{constant:.6g}")
         text = " + ".join(terms).replace("+ -", "- ")
+        if constant != 0.0 and small:
+            text += f" up to {abs(constant):.1e}"
         reason = (
             f"both depend on {', '.join(self.shared)} only"
             if len(self.coefficients) == 1
@@ -193,7 +201,8 @@ def find_dependences(
             basis.append(entry)
             columns.append(centred if size > 0.0 else np.ones_like(centred))
         else:
-            dependences.append(proved)
+            largest = float(np.abs(samples[entry]).max(initial=0.0))
+            dependences.append(replace(proved, size=largest))
     return sorted(basis), sorted(dependences, key=lambda d: d.entry)
 
 

@@ -66,6 +66,14 @@ class JacobianBounds:
         return self.family.vertices()
 
     @property
+    def varying(self) -> NDArray[np.bool_]:
+        """Entries that take more than one value, shape (n, k).
+
+        A number between two doubles has bounds that differ, but it does not vary.
+        """
+        return np.asarray(self.attained_max > self.attained_min)
+
+    @property
     def vertex_radius(self) -> Array:
         """Elementwise rounding of the vertices, shape (n, k)."""
         return self.family.radius
@@ -74,11 +82,11 @@ class JacobianBounds:
         count = self.family.vertex_count
         kind = "exact" if self.family.exact else "outer"
         lines = [
-            f"{int((self.max > self.min).sum())} varying entries, {count} vertices ({kind}) "
+            f"{int(self.varying.sum())} varying entries, {count} vertices ({kind}) "
             f"in place of {self.naive_vertex_count}",
         ]
         for (i, j), status in np.ndenumerate(self.status):
-            if self.max[i, j] > self.min[i, j]:
+            if self.varying[i, j]:
                 word = str(status).split(":")[0]
                 lines.append(
                     f"  {entry_name((i, j))} in [{self.min[i, j]:.8g}, {self.max[i, j]:.8g}]  "
@@ -93,7 +101,7 @@ class JacobianBounds:
             f"<td>{self.max[i, j]:.8g}</td><td>{self.gap[i, j]:.1e}</td>"
             f"<td>{str(s).split(':')[0]}</td></tr>"
             for (i, j), s in np.ndenumerate(self.status)
-            if self.max[i, j] > self.min[i, j]
+            if self.varying[i, j]
         )
         reasons = "".join(f"<li>{d}</li>" for d in self.dependences if d.coefficients)
         kind = "exact" if self.family.exact else "outer"

@@ -7,6 +7,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from obsynth.derive.common_factors import cancel_common_factors
 from obsynth.derive.exact import enclose_number, rational, substitute
 from obsynth.derive.intervals import Program, Quotients, evaluate
 from obsynth.derive.intervals.removable import remove_singularities
@@ -178,18 +179,31 @@ def _differentiated(
 def _preferred_rows(
     model: Plant, constants: list[tuple[float, float]]
 ) -> tuple[list[sp.Expr], ca.SX]:
-    """Right-hand side row by row, as it is or with sums for products of sines and cosines."""
+    """Right-hand side row by row, as it is or in a form with narrower ranges."""
     sx = model.sx(constants="symbol")
     rows, rhs = list(model.rhs), ca.vertsplit(sx.rhs)
     columns = ca.vertcat(sx.x, sx.u)
-    for i, row in enumerate(rows):
+    signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
+    variables, box = _all_variables(model)
+    elements = ca.vertsplit(ca.vertcat(variables, sx.c))
+    symbols = dict(zip((s.symbol for s in signals), elements, strict=True))
+
+    def may_vanish(part: sp.Expr) -> bool:
+        (value,) = to_sx([part], symbols, ["a denominator"])
+        function = ca.Function("part", [variables, sx.c], [value])
+        lower, upper = evaluate(Program.from_casadi(function, {1: constants}), *_ends(box))
+        return bool(lower[0, 0] <= 0.0 <= upper[0, 0])
+
+    for i, typed in enumerate(rows):
+        row = typed
+        shorter = cancel_common_factors(substitute(typed, {}), may_vanish)
+        if shorter is not None:
+            (written,) = to_sx([shorter], symbols, [f"dynamics row {i + 1}"])
+            if _agree(typed.xreplace(model.constant_values), written, symbols, model):
+                rows[i], rhs[i], row = shorter, written, shorter
         other = products_to_sums(substitute(row, {}))
         if other is None:
             continue
-        signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
-        variables, box = _all_variables(model)
-        elements = ca.vertsplit(ca.vertcat(variables, sx.c))
-        symbols = dict(zip((s.symbol for s in signals), elements, strict=True))
         (written,) = to_sx([other], symbols, [f"dynamics row {i + 1}"])
         if not _agree(row.xreplace(model.constant_values), written, symbols, model):
             continue
@@ -198,6 +212,10 @@ def _preferred_rows(
         if _is_narrower(widths[1], widths[0]):
             rows[i], rhs[i] = other, written
     return rows, ca.vertcat(*rhs)
+
+
+def _ends(box: Array) -> tuple[Array, Array]:
+    return box[:, :1], box[:, 1:]
 
 
 def _agree(row: sp.Expr, written: ca.SX, symbols: dict[sp.Symbol, ca.SX], model: Plant) -> bool:

@@ -6,8 +6,9 @@ import sympy as sp
 
 from obsynth.derive import DerivationError, jacobian_bounds, split
 from obsynth.derive.affine_family import AffineFamily, build_family
-from obsynth.derive.dependence import find_dependences
+from obsynth.derive.dependence import AffineDependence, find_dependences
 from obsynth.symbolic import Plant
+from obsynth.symbolic.plants import lorenz
 
 x, y = sp.symbols("x y", real=True)
 POINTS = np.random.default_rng(0).random((2, 60)) + 0.5
@@ -205,3 +206,22 @@ def test_display_is_a_table(bounds):
     assert "16 vertices (exact) in place of 64" in bounds._repr_html_()
     assert "16 vertices (exact)" in str(bounds)
     assert "in place of 64" in str(bounds)
+
+
+def test_numbers_between_two_doubles_do_not_vary():
+    found = jacobian_bounds(lorenz())
+    assert found.min[2, 2] < found.max[2, 2]
+    assert int(found.varying.sum()) == 4
+    assert str(found).startswith("4 varying entries, 8 vertices (exact) in place of 16")
+    assert "m33" not in str(found)
+    assert "m33" not in found._repr_html_()
+
+
+def test_constants_left_by_rounding_are_not_written_as_terms(bounds):
+    texts = [str(d) for d in bounds.dependences]
+    assert any(d.constant != 0 for d in bounds.dependences)
+    assert not any("e-17:" in text.split("up to")[0] for text in texts)
+    assert any(text.startswith("m13 = -m33 up to ") for text in texts)
+    assert str(AffineDependence((0, 0), {(1, 1): sp.Integer(2)}, sp.Float(1e-9), "", ("x",))) == (
+        "m11 = 2 m22 + 1e-09: both depend on x only; difference proved zero ()"
+    )
