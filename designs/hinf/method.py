@@ -96,7 +96,6 @@ class HinfUIO:
                  that is, the zeros of (A, L, C) stable
     (31)         the terms A'Hbar A, Hbar A and s_{k+1}'Q s_{k+1} carry a plus
     (34), (41)   A1'Hbar is A'Hbar
-    (35)         beta > 0 has to be imposed with (45), which does not imply it
     (43)         diag(I, I, I, I, P)
     (50)         cos(12 x1) where (51)-(53) belong to cos(12 x2); for the
                  printed g the printed K is unstable
