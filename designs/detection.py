@@ -35,7 +35,7 @@ class FaultEvent:
     promised : int or None
         Instant up to which an alarm was promised: by then the fault had been larger than its
         interval is long at as many consecutive valid samples as the alarm takes. None: it never
-        was, so it may be missed.
+        was, so it may be missed, or the method does not predict steady widths of the fault.
     others : tuple of str
         Faults that were not there but whose alarm was raised together with it.
     """
@@ -128,7 +128,7 @@ def compare(
     fault_delay: int,
     *,
     threshold: float,
-    width: FloatArray,
+    width: FloatArray | None,
     valid: BoolArray,
     persistence: Sequence[int],
 ) -> Detection:
@@ -145,8 +145,8 @@ def compare(
     fault_delay : int
     threshold : float
         Magnitude up to which a fault counts as not there.
-    width : (N + 1, n_f)
-        Lengths of the intervals that the alarms were decided from.
+    width : (N + 1, n_f), optional
+        Lengths of the intervals that the alarms were decided from; without, nothing is promised.
     valid : (N + 1,) bool
         Which samples count.
     persistence : sequence of int
@@ -170,7 +170,9 @@ def compare(
             raised = np.flatnonzero(alarm[first:stop, i])
             at = first + int(raised[0]) if raised.size else None
             counting = first + np.flatnonzero(valid[first:stop])
-            large = _first_run(size[counting, i] > width[counting, i], persistence[i])
+            large = None
+            if width is not None:
+                large = _first_run(size[counting, i] > width[counting, i], persistence[i])
             events.append(
                 FaultEvent(
                     fault=name,

@@ -75,7 +75,8 @@ class FaultDetector:
     Notes
     -----
     A fault that lies in [f_lower, f_upper] and an interval without zero together prove that
-    the fault is not zero. As long as the observer's assumptions hold there is therefore no false
+    the fault is not zero; where the method encloses a mean of the fault, that it was not zero
+    throughout. As long as the observer's assumptions hold there is therefore no false
     alarm, for any persistence; persistence guards against single samples at which an assumption
     is broken. A sample that does not count leaves counter and alarm as they are. The
     alarm at instant k speaks of instant k - `fault_delay`.
@@ -85,7 +86,8 @@ class FaultDetector:
     interval f_i lies. So the alarm is promised if abs(f_i) > 2 w_i at `persistence` consecutive
     valid samples at which the interval is not longer than 2 w_i; before the transient is over
     the half width of that instant stands for w_i. A smaller fault may be detected, but may also
-    remain inside an interval that holds zero for ever.
+    remain inside an interval that holds zero for ever. Where a method does not predict its
+    steady widths nothing is promised.
 
     The detector can be simulated and turned into C like an observer: its step has the
     observer's outputs and, behind them, ``alarm`` (n_f,), each 0 or 1.
@@ -178,6 +180,16 @@ class FaultDetector:
     def half_widths(self) -> FloatArray | None:
         """The observer's steady half widths."""
         return self.observer.half_widths
+
+    @property
+    def ode(self) -> ca.Function | None:
+        """The observer's right-hand side; its memory has no counters, as alarms do not flow."""
+        return self.observer.ode
+
+    @property
+    def step_covered(self) -> bool:
+        """Whether the observer's guarantee covers its step, for continuous-time methods."""
+        return self.observer.step_covered
 
     @property
     def gains(self) -> Mapping[str, FloatArray]:
@@ -281,8 +293,8 @@ class FaultDetector:
         own = self.observer.guarantee
         names, smallest = self.model.names("f"), self.smallest_detectable
         claims = [
-            f"an alarm of {name} proves that it was not zero at {count} samples, the latest ones "
-            "that count"
+            f"an alarm of {name} proves that what its interval encloses was not zero at {count} "
+            "samples, the latest ones that count: the fault was there"
             for name, count in zip(names, self.counts, strict=True)
         ]
         for i, (name, count) in enumerate(zip(names, self.counts, strict=True)):
@@ -353,6 +365,10 @@ class FaultDetector:
                 "give a run of its observer.",
                 faults=tuple(run.names["f"]),
             )
+        # Without predicted widths the interval may be that of a mean, which a fault enters slowly.
+        width = None
+        if self.half_widths is not None:
+            width = np.asarray(run.f_upper - run.f_lower, dtype=np.float64)
         return compare(
             self.alarms(run.f_lower, run.f_upper, run.status),
             run.f,
@@ -360,7 +376,7 @@ class FaultDetector:
             names,
             self.fault_delay,
             threshold=threshold,
-            width=np.asarray(run.f_upper - run.f_lower, dtype=np.float64),
+            width=width,
             valid=self.valid(run.status),
             persistence=self.counts,
         )

@@ -1,12 +1,14 @@
 """Plant and continuous-time observer as one differential equation."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.fault_detector import FaultDetector
 from obsynth.evaluate.calls import (
     first_memory,
     refuse_algebraic_loop,
@@ -51,8 +53,12 @@ def joint(
 
     Every signal but the states enters a Runge-Kutta step by three values: at its
     beginning, in its middle and at its end. A feedback (k, y) reads the output
-    of each stage.
+    of each stage. A fault detector decides afterwards, from the bounds at the samples.
     """
+    if isinstance(observer, FaultDetector):
+        run = joint(model, observer.observer, scenario, seed, substeps)
+        alarm = observer.alarms(run.f_lower, run.f_upper, run.status)
+        return replace(run, alarm=alarm, method=observer.method)
     system = _System(model, observer, 1 if substeps is None else substeps_of(substeps))
     fields = scenario_fields(model, scenario, seed)
     march = _with_feedback if scenario.feedback else _with_signals

@@ -1,0 +1,114 @@
+"""The fault detector over the methods: delays of the papers' examples, promises, refusals."""
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+from obsynth.designs.errors import DetectorError
+
+REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
+
+
+@pytest.fixture(scope="module")
+def interval():
+    return ob.IntervalObserver().design(ob.plants.interval_example())
+
+
+@pytest.fixture(scope="module")
+def bank():
+    options = {"robust": True, "Ts": 0.01, "region": REGION}
+    return ob.SetAdaptiveObserver(**options).design(ob.plants.three_tanks())
+
+
+@pytest.mark.parametrize("persistence", [1, 3])
+def test_interval_observer_finds_steps_when_promised(interval, persistence):
+    """Lamouchi et al.: f_k is bounded at k + 1, so an alarm is at least one sample late."""
+    detector = ob.FaultDetector(interval, persistence)
+    (smallest,) = detector.smallest_detectable
+    steps = 160
+    for factor, surely in ((1.01, True), (0.4, False)):
+        faults = np.zeros((steps + 1, 1))
+        faults[40:80] = factor * smallest
+        faults[100:] = -factor * smallest
+        for seed in range(5):
+            base = ob.scenarios.interval_example(seed, steps)
+            scenario = ob.Scenario(**{**vars(base), "faults": faults})
+            run = ob.simulate(interval.model, detector, scenario)
+            found = detector.detect(run)
+            np.testing.assert_array_equal(found.alarm, run.alarm)
+            assert found.false_alarms == {"f": 0}
+            assert found.lingering == {"f": 0}
+            assert [event.onset for event in found.events] == [40, 100]
+            for event in found.events:
+                assert event.alarm is None or event.alarm >= event.onset + persistence
+                if event.promised is not None:
+                    assert event.alarm <= event.promised
+            if surely:
+                # The transient is over long before: the prediction from the steady widths holds.
+                assert [e.promised for e in found.events] == [40 + persistence, 100 + persistence]
+
+
+def test_a_delay_of_the_bounds_that_is_forgotten_shows(interval):
+    """A detector that took the bounds of f_{k-1} for those of f_k alarms after the end."""
+    from dataclasses import replace
+
+    forgetful = ob.FaultDetector(replace(interval, fault_delay=0))
+    steps = 90
+    faults = np.zeros((steps + 1, 1))
+    faults[40:80] = 2.0
+    base = ob.scenarios.interval_example(0, steps)
+    scenario = ob.Scenario(**{**vars(base), "faults": faults})
+    run = ob.simulate(interval.model, forgetful, scenario)
+    assert forgetful.detect(run).lingering == {"f": 1}
+    assert ob.FaultDetector(interval).detect(replace(run, fault_delay=1)).lingering == {"f": 0}
+
+
+def test_interval_detector_in_c(interval, tmp_path):
+    project = ob.generate_c(ob.FaultDetector(interval, 2), tmp_path / "p", vectors=2000)
+    assert project.statuses[0] > 500
+    if project.comparison is not None:
+        assert project.comparison.vectors == 2000
+
+
+@pytest.mark.parametrize("engine", ["step", "joint"])
+def test_three_tanks_delays(bank, engine):
+    """Efimov et al., Section 6, with the bank: 1.37 s and 1.89 s, no false alarm."""
+    detector = ob.FaultDetector(bank)
+    plant = ob.plants.three_tanks()
+    run = ob.simulate(plant, detector, ob.scenarios.three_tanks(), engine=engine, substeps=1)
+    assert run.outside == ()
+    found = detector.detect(run)
+    np.testing.assert_array_equal(found.alarm, run.alarm)
+    assert found.delays["theta1"] == pytest.approx(1.37, abs=0.02)
+    assert found.delays["theta2"] == pytest.approx(1.89, abs=0.02)
+    assert not any(found.false_alarms.values())
+    assert all(event.isolated for event in found.events)
+    # The bank encloses a weighted mean, so nothing is promised for the present value.
+    assert [event.promised for event in found.events] == [None, None]
+    assert detector.smallest_detectable is None
+    later = ob.FaultDetector(bank, persistence=11).detect(run)
+    # The noise pulls single intervals back over zero, so eleven in a row take much longer.
+    for name, delay in later.delays.items():
+        assert delay >= found.delays[name] + 0.1 - 1e-9
+    assert not (later.alarm & ~found.alarm).any()
+
+
+def test_a_mean_outlasts_its_fault(bank):
+    scenario = ob.scenarios.three_tanks(end=230.0)
+    faults = np.zeros_like(scenario.faults)
+    faults[20_000:20_500, 0] = 8e-5
+    scenario = ob.Scenario(**{**vars(scenario), "faults": faults})
+    detector = ob.FaultDetector(bank)
+    found = detector.detect(ob.simulate(bank.model, detector, scenario))
+    assert found.delays["theta1"] == pytest.approx(1.37, abs=0.02)
+    assert found.lingering["theta1"] > 0
+    assert found.lingering["theta2"] == 0
+    assert found.false_alarms == {"theta1": 0, "theta2": 0}
+
+
+def test_a_method_without_fault_bounds_is_refused():
+    plant = ob.plants.hinf_example()
+    observer = ob.HinfUIO().design(plant)
+    assert observer.half_widths is None
+    with pytest.raises(DetectorError, match=r"hinf_uio estimates .* without bounds"):
+        ob.FaultDetector(observer)
