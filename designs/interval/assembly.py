@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.interval.design import METHOD, IntervalDesign
 from obsynth.designs.interval.exact_arrays import Exact, FloatArray, exact, nearest
 from obsynth.designs.interval.model import LARGEST_SIGNAL, IntervalModel
 from obsynth.designs.interval.proof import prove_design, prove_model
-from obsynth.designs.interval.step import build_step, first_box, memory_layout
+from obsynth.designs.interval.start import make_start
+from obsynth.designs.interval.step import build_step, memory_layout
 from obsynth.designs.observer import Observer
 from obsynth.designs.storage import FORMAT, VERSION
-from obsynth.symbolic import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]
 
@@ -82,7 +81,7 @@ def assemble(
         half_widths=design.half_widths,
         certificate=certificate,
         guarantee=_guarantee(design),
-        start=_make_start(design),
+        start=make_start(design),
         fault_delay=1,
     )
 
@@ -108,41 +107,6 @@ def _performance(design: IntervalDesign) -> dict[str, float]:
         "spectral_radius": radius_of(design.width_map.part.E),
         "vertices": float(len(design.model.vertices)),
     }
-
-
-def _make_start(design: IntervalDesign) -> Callable[..., FloatArray]:
-    plant = design.model.plant
-    n, n_f = len(plant.x), design.n_f
-    layout = memory_layout(n, len(design.P), n_f)
-
-    def start(
-        guess: ArrayLike,
-        x_range: ArrayLike | None = None,
-        f_range: ArrayLike | None = None,
-        y0: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Start from a box of states; neither the first fault nor y0 are needed."""
-        names = ", ".join(plant.names("x"))
-        point = np.asarray(guess, dtype=float)
-        if point.shape != (n,) or not np.isfinite(point).all():
-            raise ObsynthError(f"guess has to be {n} finite numbers ({names}); got {guess!r}")
-        box = plant.box("x") if x_range is None else np.asarray(x_range, dtype=float)
-        if box.shape != (n, 2) or not np.all(box[:, 0] <= box[:, 1]):
-            raise ObsynthError(
-                f"x_range has to have the shape ({n}, 2), lower before upper ({names})"
-            )
-        if not np.isfinite(box).all():
-            raise ObsynthError(
-                "x_range is needed: the states have no finite declared range, so the first set "
-                "has no bound"
-            )
-        memory = np.zeros(layout["initialised"].stop)
-        memory[layout["r_lower"]], memory[layout["r_upper"]] = first_box(design, box)
-        memory[layout["prediction"]] = point
-        memory[layout["initialised"]] = 1.0
-        return memory
-
-    return start
 
 
 def _guarantee(design: IntervalDesign) -> Guarantee:

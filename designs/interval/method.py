@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,10 +16,18 @@ from obsynth.designs.interval.exact_arrays import FloatArray
 from obsynth.designs.interval.gains import Reduced, check_detectable, lp_problem
 from obsynth.designs.interval.model import IntervalModel, model_of
 from obsynth.designs.interval.rows import UNIT, Precision
-from obsynth.designs.interval.synthesis import given_gains, lp_design, sylvester_design
+from obsynth.designs.interval.synthesis import (
+    given_gains,
+    lp_design,
+    read_gains,
+    sylvester_design,
+    with_gains,
+)
 from obsynth.symbolic import ObsynthError, Plant
 
 if TYPE_CHECKING:
+    import casadi as ca
+
     from obsynth.designs.lmi import Problem
     from obsynth.designs.observer import Observer
 
@@ -216,6 +224,38 @@ class IntervalObserver:
         L = np.asarray(gains["L"], dtype=float)
         P = np.eye(len(L)) if "P" not in gains else gains["P"]
         return replace(self, gains=(P, L), R=None, Q=None).design(model_or_form)
+
+    def unproved(
+        self, model_or_form: Plant | QuasiLPV
+    ) -> tuple[ca.Function, Callable[..., FloatArray]]:
+        """Return the step of given gains and its `memory0`, although nothing is proved of them.
+
+        For showing what a refused design does: its sets may grow without bound.
+
+        Parameters
+        ----------
+        model_or_form : Plant or QuasiLPV
+
+        Returns
+        -------
+        (casadi.Function, callable)
+            As `Observer.step` and `Observer.memory0`.
+
+        Raises
+        ------
+        ObsynthError
+            If no pair (P, L) is given.
+        """
+        from obsynth.designs.interval.start import make_start
+        from obsynth.designs.interval.step import build_step
+
+        if isinstance(self.gains, str) or self.gains[1] is None:
+            raise ObsynthError(
+                "only given gains can go unproved: gains=(P, L)", option="gains", given=self.gains
+            )
+        _, start = self._prepare(model_or_form)
+        design = with_gains(start, *read_gains(start, *map(np.array, self.gains)))
+        return build_step(design), make_start(design)
 
     def problem(self, model_or_form: Plant | QuasiLPV) -> Problem:
         """Return the linear programme of L, for the given P or the identity.

@@ -21,7 +21,7 @@ from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError
 
-__all__ = ["complete", "given_gains", "lp_design", "sylvester_design", "with_gains"]
+__all__ = ["complete", "given_gains", "lp_design", "read_gains", "sylvester_design", "with_gains"]
 
 STARTS = 3
 
@@ -43,6 +43,27 @@ def complete(design: IntervalDesign) -> IntervalDesign | None:
     return replace(design, error=found[0], width=found[1])
 
 
+def read_gains(
+    design: IntervalDesign, P: FloatArray, L: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Check given gains.
+
+    Raises
+    ------
+    ObsynthError
+        If a shape is wrong or P singular.
+    """
+    m2, n2 = design.plant.C2.shape
+    P, L = np.asarray(P, dtype=float), np.asarray(L, dtype=float)
+    if P.shape != (n2, n2) or not np.isfinite(P).all() or np.linalg.matrix_rank(P) < n2:
+        raise ObsynthError(f"P has to be regular with shape {(n2, n2)}", option="gains")
+    if L.size == 0:
+        L = L.reshape(n2, m2) if n2 * m2 == 0 else L
+    if L.shape != (n2, m2) or not np.isfinite(L).all():
+        raise ObsynthError(f"L has to be finite with shape {(n2, m2)}", option="gains")
+    return P, L
+
+
 def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign:
     """Complete a design with given P and L; for L = None the linear programme chooses it.
 
@@ -53,17 +74,11 @@ def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> 
     InfeasibleDesign
         If the bounds diverge.
     """
-    n2, m2 = design.plant.C2.shape[1], design.plant.C2.shape[0]
-    P = np.asarray(P, dtype=float)
-    if P.shape != (n2, n2) or not np.isfinite(P).all() or np.linalg.matrix_rank(P) < n2:
-        raise ObsynthError(f"P has to be regular with shape {(n2, n2)}", option="gains")
     if L is None:
+        zero = np.zeros((design.plant.C2.shape[1], design.plant.C2.shape[0]))
+        P, _ = read_gains(design, P, zero)
         L = lp_gain(Reduced.of(design.model, design.plant), P)
-    L = np.asarray(L, dtype=float)
-    L = L[:, None] if L.ndim == 1 and m2 == 1 else L
-    if L.shape != (n2, m2) or not np.isfinite(L).all():
-        raise ObsynthError(f"L has to be finite with shape {(n2, m2)}", option="gains")
-    chosen = with_gains(design, P, L)
+    chosen = with_gains(design, *read_gains(design, P, L))
     done = complete(chosen)
     if done is None:
         raise divergence(chosen)

@@ -1,15 +1,15 @@
 """Acceptance of the interval observer on the example of Lamouchi, Raissi, Amairi and Aoun."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.interval.assembly import assemble
 from obsynth.designs.interval.design import IntervalDesign
 from obsynth.designs.interval.exact_arrays import exact, nearest
 from obsynth.designs.interval.gains import Reduced, lp_problem, sylvester_gain
 from obsynth.designs.interval.printed import FLAWS, printed_faults
-from obsynth.designs.interval.step import build_step
 from obsynth.designs.interval.synthesis import with_gains
 from obsynth.designs.interval.theorem import comparison_radius, largest_alpha, lipschitz_alpha
 
@@ -231,23 +231,20 @@ def test_the_printed_fault_bound_is_refused_where_the_widths_are_stable(example)
         printed.design(example)
 
 
-def test_the_printed_widths_explode(literal, designs, numbers, paper_seeds, run_many, feedback):
+def test_the_printed_widths_explode(example, designs, numbers, paper_seeds, run_many, feedback):
     expected = numbers["example_mc100"]["a2 paper L,P literal, f fixed"]["w_k20_k199"]
-    step = build_step(literal)
-    start = assemble(stored(designs["b2"]))
-    object.__setattr__(start, "start", lambda *a, **k: _literal_memory(literal))
-    run = run_many(start, *paper_seeds(range(20), 20), feedback, BOX, step=step)
+    printed = ob.IntervalObserver(
+        gains=(P_PAPER, L_PAPER),
+        bound="paper",
+        contraction=False,
+        centred=False,
+        nominal=A_PAPER,
+    )
+    step, memory0 = printed.unproved(example)
+    shown = replace(designs["b2"], start=memory0)
+    run = run_many(shown, *paper_seeds(range(20), 20), feedback, BOX, step=step)
     widths = (run.x_upper - run.x_lower)[20].mean(axis=0)
     assert widths == pytest.approx(expected[:3], rel=0.01)
     assert widths[1] == pytest.approx(3.9e19, rel=0.01)
-
-
-def _literal_memory(design):
-    from obsynth.designs.interval.step import first_box, memory_layout
-
-    layout = memory_layout(3, 2, 1)
-    memory = np.zeros(layout["initialised"].stop)
-    memory[layout["r_lower"]], memory[layout["r_upper"]] = first_box(design, BOX)
-    memory[layout["prediction"]] = 1.0
-    memory[layout["initialised"]] = 1.0
-    return memory
+    with pytest.raises(ob.ObsynthError, match="only given gains"):
+        ob.IntervalObserver().unproved(example)
