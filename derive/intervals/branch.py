@@ -261,6 +261,12 @@ class Search:
         """Where a row may still hold more than the best value of its goal."""
         return np.asarray(rows.bound > self.best[rows.goal] + self.tolerance()[rows.goal])
 
+    def excess(self) -> float:
+        """Return the largest gap that is open, in units of what is good enough."""
+        rows = self.open
+        gap = (rows.bound - self.best[rows.goal]) / self.tolerance()[rows.goal]
+        return float(gap.max(initial=0.0))
+
     def close(self, rows: Rows, settled: Mask | None = None) -> Mask:
         """Close rows that cannot improve their goal; tell which ones stay open."""
         done = ~self.is_open(rows)

@@ -14,6 +14,8 @@ __all__ = ["staged"]
 
 # What a few sweeps over a few boxes settle needs no further thought.
 _QUICK = Budget(boxes=4_000, sweeps=7)
+# A gap that falls to this share in two sweeps over few boxes is soon closed.
+_FEW, _FAST = 400, 0.25
 # Ranges of quantities that become variables are to add next to nothing to the gap.
 _INNER = 1e-3
 
@@ -47,7 +49,7 @@ def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
     """
     quick = Budget(min(_QUICK.boxes, budget.boxes), min(_QUICK.sweeps, budget.sweeps))
     search = Search(problem, rtol)
-    outcome = search.run(quick)
+    outcome = _while_quick(search, quick, budget)
     left = [
         e for e in range(len(problem.gradient)) if not outcome.finished[2 * e : 2 * e + 2].all()
     ]
@@ -65,6 +67,17 @@ def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
     # what was spent before is counted already
     last = replace(last, boxes=last.boxes - spent[0], sweeps=last.sweeps - spent[1])
     return _merged(outcome, last, left)
+
+
+def _while_quick(search: Search, quick: Budget, budget: Budget) -> Outcome:
+    """Search for a while, and on as long as few boxes are left and the gap falls fast."""
+    outcome = search.run(quick)
+    while 0 < search.open.count <= _FEW and search.sweeps < budget.sweeps:
+        before = search.excess()
+        outcome = search.run(replace(budget, sweeps=search.sweeps + 2))
+        if search.excess() > _FAST * before:
+            break
+    return outcome
 
 
 def _merged(first: Outcome, second: Outcome, expressions: list[int]) -> Outcome:

@@ -295,6 +295,7 @@ def test_a_range_of_a_quantity_that_is_too_narrow_is_caught(exactly, monkeypatch
             box[4:, 1] -= 0.2 * width
         return real(expressions, variables, box, *constants)
 
+    monkeypatch.setattr(stages, "_FEW", 0)
     monkeypatch.setattr(stages, "make_problem", narrow)
     rising = ca.atan(X[0] + X[1] + ca.sin(4 * X[0] * X[1])) * ca.exp(X[2] * X[3] - X[2])
     assert wrong_bounds(exactly, rising, ROOM)
