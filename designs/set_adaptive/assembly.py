@@ -96,10 +96,13 @@ def assemble(
 
 def _performance(design: SetDesign) -> dict[str, float]:
     fastest = float((-np.diag(design.A_lower - design.L @ design.C)).max())
+    settled = design.C @ np.linalg.solve(design.L @ design.C - design.A_upper, design.G)
+    shown = settled[design.fault_outputs, np.arange(len(design.Gamma))]
     return {
         "decay": design.alpha,
         "decay_step": design.alpha_step,
         "alpha": design.alpha,
+        "adaptation": float((design.Gamma * shown**2).max()),
         "euler_step": 1.0 / fastest,
         "longest_step": LARGEST_PRODUCT / design.mu,
     }

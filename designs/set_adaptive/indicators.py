@@ -104,6 +104,17 @@ def fault_indicators(
     ------
     ObsynthError
         If the observer is of another kind.
+
+    Examples
+    --------
+    >>> from obsynth.designs.set_adaptive import SetAdaptiveObserver
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> observer = SetAdaptiveObserver().design(three_tanks())
+    >>> memory = observer.memory0([0.5, 0.1, 0.3])
+    >>> bool(fault_indicators(observer, memory, [0.5, 0.1]).D)
+    False
+    >>> bool(fault_indicators(observer, memory, [0.5, 0.1], form="printed").D)
+    True
     """
     design = _design(observer)
     parts = np.asarray(memory, dtype=float)

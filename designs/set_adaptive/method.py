@@ -47,8 +47,10 @@ class SetAdaptiveObserver:
         Largest entry of L that the design may use; the best decay is a supremum that only an
         unbounded gain reaches.
     Ts : float, optional
-        Sample time of `Observer.step`; by default at most a 32nd of the longest step for which
-        explicit Euler would keep the order, as 1, 2 or 5 times a power of ten.
+        Sample time of `Observer.step`, which is exact for any; by default at most a 32nd of the
+        longest step for which explicit Euler would keep the order and at most the time constant
+        of the adaptation, so that `Observer.ode` can be integrated with it, as 1, 2 or 5 times a
+        power of ten.
     noise : bool
         Include the declared disturbances in the bounds. Without, the bounds are the paper's
         functions of y and hold for exact measurements.
@@ -248,6 +250,7 @@ class SetAdaptiveObserver:
     ) -> SetDesign:
         from obsynth.designs.set_adaptive.design import SetDesign
         from obsynth.designs.set_adaptive.structure import output_of_fault
+        from obsynth.designs.set_adaptive.transition import uniformisation
 
         plant = structure.form.model
         q = len(plant.f)
@@ -257,8 +260,17 @@ class SetAdaptiveObserver:
                 f"Gamma has {Gamma.size} numbers; {q} are needed ({', '.join(plant.names('f'))})",
                 option="Gamma",
             )
-        slowest = 1.0 / float((-np.diag(A_lower - gain.L @ structure.C)).max())
-        Ts = round_down(slowest / 32.0) if self.Ts is None else float(self.Ts)
+        outputs = output_of_fault(structure.C, A_lower_box, structure.G, plant.names("f"))
+        Gamma = np.broadcast_to(Gamma, (q,)).copy()
+        # -(A_M - L C)^-1 G is where -Omega settles, and Gamma N^2 how fast theta then moves
+        settled = structure.C @ np.linalg.solve(gain.L @ structure.C - A_upper, structure.G)
+        adaptation = float((Gamma * settled[outputs, np.arange(q)] ** 2).max())
+        longest = 1.0 / float((-np.diag(A_lower - gain.L @ structure.C)).max())
+        if self.Ts is None:
+            Ts = round_down(min(longest / 32.0, 1.0 / adaptation))
+        else:
+            Ts = float(self.Ts)
+        uniformisation(Ts, float((-np.diag(A_lower_box - gain.L @ structure.C)).max()))
         A_upper_step = structure.bounds.extremes(structure.reach(Ts))[1]
         M = A_upper_step - gain.L @ structure.C
         alpha_step = float((-(gain.p @ M) / gain.p).min())
@@ -272,7 +284,7 @@ class SetAdaptiveObserver:
         alpha_step -= 1e-12 * (float(np.abs(M).max()) + alpha_step)
         options = asdict(self)
         options["filters"] = list(self.filters)
-        options["Gamma"] = Gamma.tolist()
+        options["Gamma"] = np.atleast_1d(self.Gamma).tolist()
         options["region"] = None
         return SetDesign(
             plant=plant,
@@ -294,10 +306,8 @@ class SetAdaptiveObserver:
             p=gain.p,
             alpha=gain.alpha,
             alpha_step=alpha_step,
-            Gamma=np.broadcast_to(Gamma, (q,)).copy(),
-            fault_outputs=np.array(
-                output_of_fault(structure.C, A_lower_box, structure.G, plant.names("f"))
-            ),
+            Gamma=Gamma,
+            fault_outputs=np.array(outputs),
             options=options,
         )
 

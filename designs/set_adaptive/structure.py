@@ -93,7 +93,7 @@ def read_structure(plant: Plant, noise: bool = True) -> Structure:
     --------
     >>> from obsynth.symbolic.plants import three_tanks
     >>> structure = read_structure(three_tanks())
-    >>> structure.noise.tolist(), structure.G[0].round(4).tolist()
+    >>> structure.noise.round(6).tolist(), structure.G[0].round(4).tolist()
     ([0.0045, 0.0045], [64.9351, 0.0])
     """
     plant = continuous(plant)

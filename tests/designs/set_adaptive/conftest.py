@@ -49,7 +49,7 @@ def printed(tanks):
 
 @pytest.fixture(scope="session")
 def cooperative(tanks):
-    return SetAdaptiveObserver(gain_cap=0.5).design(tanks)
+    return SetAdaptiveObserver(gain_cap=0.5, Ts=0.05).design(tanks)
 
 
 def root(z):

@@ -120,7 +120,7 @@ def test_inclusion_in_a_thousand_hard_runs(loop):
 
 @pytest.fixture(scope="module")
 def exact_observer(tanks):
-    return SetAdaptiveObserver(noise=False, gain_cap=0.5).design(tanks)
+    return SetAdaptiveObserver(noise=False, gain_cap=0.5, Ts=0.05).design(tanks)
 
 
 def exact_violations(loop):

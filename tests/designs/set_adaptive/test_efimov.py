@@ -248,6 +248,23 @@ def test_the_bounds_hold_the_truth_before_the_faults(together):
         assert (together.part(t, "theta_m") >= 0.0).all()
 
 
+def test_the_joint_engine_arrives_at_the_table(tanks, printed):
+    scenario = ob.scenarios.three_tanks("fault free", end=50.0, noise=None)
+    run = ob.simulate(tanks, printed, scenario, engine="joint")
+    assert run.x[-1] == pytest.approx(TABLE[50]["x"], abs=1e-8)
+    assert np.isinf(run.f_lower).all()
+    assert (run.status & 16 == 16).all()
+
+
+def test_the_continuous_form_with_noise_included(tanks):
+    observer = SetAdaptiveObserver(gain_cap=0.5).design(tanks)
+    assert observer.model.Ts == 0.005 < 1.0 / observer.performance["adaptation"]
+    scenario = ob.scenarios.three_tanks("fault free", end=30.0, Ts=0.005)
+    run = ob.simulate(tanks, observer, scenario, engine="joint")
+    assert min(run.coverage.values()) == 1.0
+    assert not run.status.any()
+
+
 @pytest.mark.parametrize("mutant", ["sign of row 2", "swapped bounds", "theta", "later by one"])
 def test_the_table_sees_a_mutant(printed, integrate, numbers, monkeypatch, mutant):
     from obsynth.designs.set_adaptive import ode as module

@@ -274,6 +274,19 @@ def test_the_continuous_form_agrees_with_short_steps(bank, tanks):
         np.testing.assert_allclose(slope[layout[name]], rates[layout[name]], rtol=1e-4, atol=1e-6)
 
 
+def test_through_simulate_and_the_fault_detector(bank, tanks):
+    scenario = ob.scenarios.three_tanks(end=210.0)
+    detector = ob.FaultDetector(bank)
+    run = ob.simulate(bank.model, detector, scenario)
+    assert min(run.coverage[name] for name in ("x1", "x2", "x3")) == 1.0
+    first = np.flatnonzero(run.alarm[:, 0])[0]
+    assert first * 0.01 - 200.0 == pytest.approx(1.37, abs=0.02)
+    assert not run.alarm[:, 1].any()
+    fine = ob.simulate(tanks, bank, ob.scenarios.three_tanks("fault free", end=20.0), substeps=4)
+    assert min(fine.coverage.values()) == 1.0
+    assert fine.outside == ()
+
+
 # -- monotone equations --------------------------------------------------------------
 
 

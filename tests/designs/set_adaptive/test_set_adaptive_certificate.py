@@ -1,0 +1,338 @@
+"""What is stored is what is proved: certificates from files, mutants of records, C code."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.assembly import assemble, prove
+from obsynth.designs.set_adaptive.indicators import fault_indicators, monitors
+
+REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
+
+
+@pytest.fixture(scope="module")
+def bank(tanks):
+    return SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION).design(tanks)
+
+
+@pytest.fixture(params=["adaptive", "bank"])
+def either(request, cooperative, bank):
+    return cooperative if request.param == "adaptive" else bank
+
+
+def test_claims(cooperative, bank):
+    names = [claim.name for claim in cooperative.certificate.check()]
+    assert names == [
+        "signs", "boxes", "metzler", "decay", "decay_step", "transition", "law",
+        "model", "bounds", "speed",
+    ]  # fmt: skip
+    assert [claim.name for claim in bank.certificate.check()] == [
+        "falling", "filters", "monotone", "structure",
+    ]  # fmt: skip
+    # the exact margins are decided by rational arithmetic
+    assert cooperative.certificate["decay"].margin > 0.0
+    assert len(cooperative.certificate.check("lmi").claims) == 7
+
+
+def test_files_are_checked_by_another_process(cooperative, bank, tmp_path):
+    paths = [tmp_path / "adaptive.json", tmp_path / "bank.json"]
+    for observer, path in zip((cooperative, bank), paths, strict=True):
+        observer.save(path)
+    code = (
+        "import sys, obsynth as ob\n"
+        "for path in sys.argv[1:]:\n"
+        "    observer = ob.load(path)\n"
+        "    print(observer.certificate.check().valid, observer.step.numel_in(0))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, paths)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [
+        "True",
+        str(cooperative.step.numel_in(0)),
+        "True",
+        str(bank.step.numel_in(0)),
+    ]
+
+
+def test_a_loaded_observer_is_the_same_function(either, tmp_path):
+    path = tmp_path / "observer.json"
+    either.save(path)
+    loaded = ob.load(path)
+    memory = either.memory0([0.5, 0.1, 0.3])
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        u, y = rng.uniform(0, 1e-4, 2), np.array([0.5, 0.1]) + rng.uniform(-4e-3, 4e-3, 2)
+        expected, found = either.step(memory, u, y), loaded.step(memory, u, y)
+        for a, b in zip(expected, found, strict=True):
+            assert np.array(a).tolist() == np.array(b).tolist()
+        assert np.array(either.ode(memory, u, y)).tolist() == (
+            np.array(loaded.ode(memory, u, y)).tolist()
+        )
+        memory = expected[0]
+
+
+def spoiled(record, name):
+    record = json.loads(json.dumps(record))
+    if name == "gain":
+        record["L"][2][0] = 0.0153
+    elif name == "gain without effect":
+        record["L"] = (0.01 * np.eye(3, 2)).tolist()
+    elif name == "decay":
+        record["alpha"] *= 1.0 + 1e-9
+    elif name == "decay of the step":
+        record["alpha_step"] *= 1.001
+    elif name == "vector":
+        record["p"][0] *= -1.0
+    elif name == "upper bound":
+        record["A_upper"][1][2] *= 0.999
+    elif name == "lower bound":
+        record["A_lower_box"][0][2] *= 1.01
+    elif name == "formula":
+        text = record["bounds"]["upper"]["A"][0][2]
+        record["bounds"]["upper"]["A"][0][2] = f"(999/1000)*({text})"
+    elif name == "swapped":
+        bounds = record["bounds"]
+        bounds["lower"], bounds["upper"] = bounds["upper"], bounds["lower"]
+    elif name == "noise":
+        record["w_radius"][0] *= 0.999
+    elif name == "speed":
+        record["rate"][0][1] *= 0.99
+    elif name == "input":
+        record["G"][0][0] *= 1.0 + 1e-12
+    elif name == "step":
+        record["Ts"] = 300.0
+    elif name == "Gamma":
+        record["Gamma"][1] = -0.01
+    return record
+
+
+@pytest.mark.parametrize(
+    ("name", "claim"),
+    [
+        ("gain", "metzler"),
+        ("gain without effect", "decay"),
+        ("decay", "decay"),
+        ("decay of the step", "decay_step"),
+        ("vector", "decay"),
+        ("upper bound", "bounds"),
+        ("lower bound", "bounds"),
+        ("formula", "bounds"),
+        ("swapped", "bounds"),
+        ("noise", "boxes"),
+        ("speed", "speed"),
+        ("input", "model"),
+        ("step", "transition"),
+        ("Gamma", "law"),
+    ],
+)
+def test_a_spoiled_record_is_not_proved(cooperative, name, claim):
+    failed = [c.name for c in prove(spoiled(cooperative.record, name)) if not c.holds]
+    assert claim in failed
+
+
+@pytest.mark.parametrize("name", ["sign", "gain", "noise", "region", "rate"])
+def test_a_spoiled_bank_is_not_proved(bank, name):
+    record = json.loads(json.dumps(bank.record))
+    if name == "sign":
+        record["signs"]["x"][0][2] = -1
+    elif name == "gain":
+        record["gain"][0] *= 1.0001
+    elif name == "noise":
+        record["noise"][1][1] *= 0.999
+    elif name == "region":
+        # an equation of another plant: the last level feeds itself
+        record["plant"]["dynamics"][2] += " + x3"
+    else:
+        record["filters"][0] = -0.1
+    assert not all(claim.holds for claim in prove(record))
+
+
+@pytest.mark.parametrize("key", ["L", "bounds", "Ts", "fault_outputs"])
+def test_an_incomplete_record_is_refused(cooperative, key):
+    record = {name: value for name, value in cooperative.record.items() if name != key}
+    with pytest.raises(ob.CertificateError, match="cannot be read"):
+        assemble(record)
+
+
+def test_other_damage_is_refused(cooperative, bank):
+    for change in ({"L": [[1.0]]}, {"fault_outputs": [0, 7]}, {"options": {"law": "none"}}):
+        with pytest.raises(ob.CertificateError):
+            assemble({**cooperative.record, **change})
+    with pytest.raises(ob.CertificateError, match="cannot be read"):
+        assemble({**bank.record, "scale": [1.0]})
+    with pytest.raises(ob.CertificateError, match="cannot be read"):
+        assemble({**bank.record, "outputs": [0, 9]})
+
+
+def test_guarantees_name_what_they_rest_on(cooperative, bank, printed):
+    text = str(cooperative.guarantee)
+    for words in ("constant", "no false alarm", "x3 in [0.24, 0.36]", "held between", "v1 in"):
+        assert words in text
+    assert "exp(-0.1 age)" in str(bank.guarantee)
+    assert "neither fault bounds nor state bounds" in str(printed.guarantee)
+    assert "are zero" in str(printed.guarantee)
+
+
+# -- C -------------------------------------------------------------------------------
+
+
+def test_generated_c_equals_the_step(either, tmp_path):
+    project = ob.generate_c(either, tmp_path / "c", vectors=1000)
+    if project.comparison is None:
+        pytest.skip("no C compiler")
+    assert project.comparison.vectors == 1000
+
+
+# -- refusals ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"law": "averaged"}, "law is 'averaged'"),
+        ({"form": "repaired"}, "form is"),
+        ({"Gamma": 0.0}, "Gamma"),
+        ({"Gamma": (0.1, -1.0)}, "Gamma"),
+        ({"gain_cap": np.inf}, "gain_cap"),
+        ({"Ts": -0.1}, "Ts"),
+        ({"window": 0.0}, "window"),
+        ({"filters": ()}, "filters"),
+        ({"filters": (0.1, -0.2)}, "filters"),
+        ({"robust": True, "form": "printed"}, "bank"),
+    ],
+)
+def test_options_out_of_range(options, words):
+    with pytest.raises(ob.ObsynthError, match=words):
+        SetAdaptiveObserver(**options)
+
+
+def plant_with(change=None, **changes):
+    """Two levels, the first measured; changed in one respect."""
+    plant = ob.Plant("two levels")
+    low = changes.get("low", 0.0)
+    a, b = plant.states("a b", range=[(low, 2.0), (0.0, 2.0)])
+    (u,) = plant.inputs("u", range=(0, 1))
+    fault_range = None if change == "fault range" else (-0.1, 0.1)
+    if change != "no fault":
+        (f,) = plant.faults("f", **({} if fault_range is None else {"range": fault_range}))
+    else:
+        f = 0
+    (v,) = plant.disturbances("v", **({} if change == "noise" else {"bound": 0.01}))
+    d = plant.unknown_inputs("d")[0] if change == "unknown input" else 0
+    factor = {"negative": -1, "varying": a}.get(change, 1)
+    coupling = 3 if change == "unstable" else 1
+    plant.dynamics(
+        [-2 * a + coupling * b + u + factor * f + d, a - (b if change != "unstable" else -b)]
+    )
+    outputs = {"sum": a + b + v, "falls": -a + v, "fault": a + f + v}
+    plant.outputs([outputs.get(change, a + v)])
+    return plant
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("unknown input", "unknown input d"),
+        ("no fault", "declares no fault"),
+        ("fault range", "fault f has no range"),
+        ("noise", "disturbance v has no bound"),
+        ("negative", "f enters the row of a with a negative factor"),
+        ("varying", r"B_f\[1,1\].*varies with a"),
+        ("sum", "y1 does not show one state"),
+        ("falls", "y1 falls with a"),
+        ("fault", "f enters an output"),
+    ],
+)
+def test_plants_outside_of_the_class_are_refused_by_name(change, words):
+    with pytest.raises(ob.StructureError, match=words):
+        SetAdaptiveObserver().design(plant_with(change))
+
+
+def test_more_refusals(tanks):
+    with pytest.raises(ob.StructureError, match=r"state a may be negative \(-1\)"):
+        SetAdaptiveObserver().design(plant_with(low=-1.0))
+    with pytest.raises(ob.InfeasibleDesign, match="unmeasured states \\(b\\)"):
+        SetAdaptiveObserver().design(plant_with("unstable"))
+    with pytest.raises(ob.ObsynthError, match="Gamma has 3 numbers"):
+        SetAdaptiveObserver(Gamma=(0.1, 0.1, 0.1)).design(tanks)
+    with pytest.raises(ob.ObsynthError, match="hold L alone"):
+        SetAdaptiveObserver().analyse(tanks, {"K": np.eye(3, 2)})
+    with pytest.raises(ob.ObsynthError, match="no gains"):
+        SetAdaptiveObserver(robust=True).analyse(tanks, {"L": np.eye(3, 2)})
+    with pytest.raises(ob.ObsynthError, match="too long"):
+        SetAdaptiveObserver(Ts=100.0).design(tanks)
+    discrete = ob.Plant("discrete")
+    (x,) = discrete.states("x", range=(0, 1))
+    discrete.dynamics([x / 2], Ts=1)
+    discrete.outputs([x])
+    with pytest.raises(ob.StructureError, match="discrete plant"):
+        SetAdaptiveObserver().design(discrete)
+
+
+def test_a_fault_that_no_output_shows():
+    plant = ob.Plant("hidden fault")
+    a, b = plant.states("a b", range=(0, 1))
+    (f,) = plant.faults("f", range=(-1, 1))
+    plant.dynamics([-a, a - b + f])
+    plant.outputs([a])
+    with pytest.raises(ob.StructureError, match="show the fault f"):
+        SetAdaptiveObserver().design(plant)
+
+
+def test_a_discretisation_of_the_package_is_seen_through(tanks):
+    observer = SetAdaptiveObserver(gain_cap=0.5).design(tanks.discretise("euler", 0.1))
+    assert observer.model.continuous.Ts is None
+    assert observer.model.Ts != 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"guess": [0.5, 0.1]}, "guess has to be 3"),
+        ({"x_range": [(0.5, 0.4)] * 3}, "x_range"),
+        ({"x_range": [(-0.1, 0.4)] * 3}, "below zero"),
+        ({"f_range": [(0, 1)]}, "f_range has to be 2"),
+    ],
+)
+def test_a_start_that_does_not_fit(cooperative, given, words):
+    with pytest.raises(ob.ObsynthError, match=words):
+        cooperative.memory0(**{"guess": [0.5, 0.1, 0.3], **given})
+
+
+def test_the_bank_has_no_indicators_of_the_paper(bank):
+    memory = bank.memory0([0.5, 0.1, 0.3])
+    with pytest.raises(ob.ObsynthError, match="no indicators"):
+        fault_indicators(bank, memory, [0.5, 0.1])
+    with pytest.raises(ob.ObsynthError, match="no indicators"):
+        monitors(bank, memory)
+    with pytest.raises(ob.ObsynthError, match="outside of the region"):
+        bank.memory0([0.5, 0.1, 0.3], x_range=[(0.91, 0.92), (0.1, 0.2), (0.2, 0.3)])
+
+
+def test_a_scheduled_plant_reads_theta():
+    plant = ob.Plant("valve")
+    a, b = plant.states("a b", range=(0, 2))
+    (u,) = plant.inputs("u", range=(0, 2))
+    (opening,) = plant.scheduling("opening", range=(0.5, 1.5))
+    plant.actuator_faults("f", of=u, range=(-0.2, 0.2))
+    plant.dynamics([-opening * a + u, opening * a - 2 * b])
+    plant.outputs([a])
+    observer = SetAdaptiveObserver(gain_cap=0.5, Ts=0.05).design(plant)
+    assert observer.step.name_in() == ["memory", "u", "y", "theta"]
+    assert observer.ode.name_in() == ["memory", "u", "y", "theta"]
+    F = observer.model.function()
+    x, memory = np.array([1.0, 0.5]), observer.memory0([1.0, 0.5])
+    for k in range(100):
+        rho = [1.0 + 0.4 * np.sin(k / 7)]
+        memory, _, _, low, high, f_low, f_high, status = observer.step(memory, [1.0], x[:1], rho)
+        assert int(status) == 0
+        assert (np.array(low).ravel() <= x + 1e-9).all()
+        assert (x <= np.array(high).ravel() + 1e-9).all()
+        assert float(f_low) <= 0.1 <= float(f_high)
+        x = np.array(F(x, [1.0], [], [0.1], [], [], rho)[0]).ravel()
