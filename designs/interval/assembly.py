@@ -113,12 +113,11 @@ def _guarantee(design: IntervalDesign) -> Guarantee:
     plant = design.model.plant
     claims = [f"{', '.join(plant.names('x'))} lie inside the returned intervals at every k >= 0"]
     if plant.f:
-        claims.append(
-            f"{', '.join(plant.names('f'))} of the instant before lie inside theirs at every k >= 1"
-        )
+        faults = ", ".join(plant.names("f"))
+        claims.append(f"{faults} of the instant before: inside the intervals at every k >= 1")
     free = (*plant.names("f"), *plant.names("d"))
     if free:
-        claims.append(f"whatever {', '.join(free)} do, however fast")
+        claims.append(f"for all values of {', '.join(free)}, however fast they change")
     words = {"double": "IEEE double", "single": "IEEE single"}
     claims.append(f"all of this with the step evaluated in {words[design.precision]} precision")
     assumptions = [

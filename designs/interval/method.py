@@ -59,7 +59,8 @@ class IntervalObserver:
     contraction : bool
         Cut the set of every instant with what the measurement says of it.
     form : {"corrected", "printed"}
-        ``"printed"`` takes the theorem at its word and is refused with what fails.
+        ``"printed"`` takes the theorem at its word and is refused with what fails: the widths, or
+        else (32).
     nominal : array_like of shape (n, n), optional
         The nominal A of ``centred=False``.
     precision : {"double", "single"}
@@ -162,6 +163,12 @@ class IntervalObserver:
             raise ObsynthError(
                 "centred=False needs nominal=, the A around which DeltaA is taken",
                 option="nominal",
+            )
+        if self.form == "printed" and (self.bound != "paper" or self.contraction):
+            raise ObsynthError(
+                'form="printed" stands for (13)-(32), which has bound="paper" and '
+                "contraction=False",
+                option="form",
             )
         if self.gains != "sylvester" and (self.R is not None or self.Q is not None):
             raise ObsynthError('R and Q belong to gains="sylvester"', option="R")

@@ -116,6 +116,7 @@ def test_the_class_of_plants(example):
         ({"gains": 3.0}, "pair"),
         ({"bound": "ellipsoid"}, "bound is"),
         ({"form": "repaired"}, "form is"),
+        ({"form": "printed"}, "stands for"),
         ({"precision": "half"}, "precision is"),
         ({"centred": False}, "needs nominal"),
         ({"nominal": np.eye(3)}, "centred=False"),
@@ -409,7 +410,7 @@ def test_sylvester_gains(example):
 
 def test_the_guarantee_names_its_assumptions(designs):
     text = str(designs["d1"].guarantee)
-    for words in ("rho1 in [-1, 1]", "memory0", "whatever f do", "IEEE double", "bit 8"):
+    for words in ("rho1 in [-1, 1]", "memory0", "for all values of f", "IEEE double", "bit 8"):
         assert words in text
     assert "interval_observer" in str(designs["d1"])
 
