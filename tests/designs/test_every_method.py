@@ -12,19 +12,20 @@ import pytest
 import obsynth as ob
 from obsynth.designs.certificate import Certificate
 from obsynth.designs.observer import STEP_OUTPUTS
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
 
 
 def tank():
     return ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
 
 
+REGION = ob.Ellipsoid([0.2, 0.2, 0.2, 0.1, 0.1, 0.1], [10, 10, 10, 0, 0, 0])
 METHODS = {
     "bounded_error_uio": (ob.BoundedErrorUIO(gamma=0.005), tank),
     "hinf_uio": (ob.HinfUIO(method="polytopic"), ob.plants.hinf_example),
     "interval_observer": (ob.IntervalObserver(), ob.plants.interval_example),
-    "set_adaptive_observer": (SetAdaptiveObserver(), ob.plants.three_tanks),
-    "the bank": (SetAdaptiveObserver(robust=True), ob.plants.three_tanks),
+    "qpv_observer": (ob.QPVObserver(region=REGION, eta=0.2), ob.plants.qpv_example),
+    "set_adaptive_observer": (ob.SetAdaptiveObserver(), ob.plants.three_tanks),
+    "the bank": (ob.SetAdaptiveObserver(robust=True), ob.plants.three_tanks),
 }
 ALONE = """
 import sys
