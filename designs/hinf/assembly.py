@@ -152,6 +152,7 @@ def _guarantee(design: HinfDesign) -> Guarantee:
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
         f"{inside}: {ranges} {seen}",
+        *_inputs_assumed(design),
         "every sample arrives (status bit 2); one that is missing counts as a new initial error",
         f"({noise}) has finite energy over the horizon; no bound is used",
         "rounding errors of the step, about 1e-16 of the signals, are not counted as disturbances",
@@ -159,6 +160,12 @@ def _guarantee(design: HinfDesign) -> Guarantee:
     if residual > 0.0:
         assumptions.append(f"so is what rounding leaves of the faults, {residual:.1e} of them")
     return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def _inputs_assumed(design: HinfDesign) -> list[str]:
+    bounded = [s for s in design.plant.u if np.isfinite([s.lower, s.upper]).any()]
+    ranges = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in bounded)
+    return [f"{ranges} [monitored: status bit 4]"] if bounded else []
 
 
 def _make_start(design: HinfDesign) -> Callable[..., FloatArray]:

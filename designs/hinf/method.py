@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.hinf.design import Bound, HinfDesign
+from obsynth.designs.hinf.given import read_diagonal, read_gains, unstable_gains
 from obsynth.designs.hinf.prepare import Prepared, prepare
 from obsynth.designs.hinf.proof import prove_level
 from obsynth.designs.hinf.sector import MULTIPLIERS, Multipliers
@@ -108,8 +109,10 @@ class HinfUIO:
 
     Examples
     --------
-    >>> HinfUIO(method="general").drop_zero_rows
-    True
+    >>> from obsynth.symbolic.plants import hinf_example
+    >>> observer = HinfUIO(method="general").design(hinf_example())
+    >>> round(observer.performance["least_mu"], 4), observer.certificate.valid
+    (0.4586, True)
     """
 
     method: Literal["standard", "polytopic", "general"] = "standard"
@@ -147,7 +150,7 @@ class HinfUIO:
                 option="decay",
             )
         if self.majorant is not None:
-            object.__setattr__(self, "majorant", _diagonal(self.majorant))
+            object.__setattr__(self, "majorant", read_diagonal(self.majorant))
         self._refuse_contradictions()
 
     def _refuse_contradictions(self) -> None:
@@ -268,10 +271,10 @@ class HinfUIO:
         """
         prepared = self._prepare(model_or_split, bounds)
         data = prepared.design.data
-        chosen = _read_gains(prepared.design, gains)
+        chosen = read_gains(prepared.design, gains)
         unstable = unstable_vertex(data, chosen)
         if unstable is not None:
-            raise _unstable(prepared, *unstable)
+            raise unstable_gains(prepared, *unstable)
         least = None
         if self.mu is None:
             least = find_level(data, self._structure, self.decay, chosen)
@@ -354,67 +357,16 @@ class HinfUIO:
         """Say which level is feasible where the given one is not."""
         least = find_level(data, self._structure, self.decay)
         details = [f"the least level of this form is {least:.6g}"]
+        if self.mu is not None and self.mu > least:
+            return InfeasibleDesign(
+                f"mu = {self.mu:.6g} leaves too little room for a proof",
+                [*details, "ask for a level .01 % above it"],
+                mu=self.mu,
+                least_mu=least,
+            )
         if self.method != "general":
             other = find_level(replace(data, sector=None), "general", self.decay)
             details.append(f'method="general" reaches {other:.6g}')
         return InfeasibleDesign(
             f"mu = {self.mu:.6g} is infeasible", details, mu=self.mu, least_mu=least
         )
-
-
-def _diagonal(value: Any) -> tuple[float, ...]:
-    array = np.asarray(value, dtype=float)
-    if array.ndim == 2 and array.shape[0] == array.shape[1]:
-        if np.any(array - np.diag(np.diag(array))):
-            raise ObsynthError("majorant= has to be a diagonal M'M", option="majorant")
-        array = np.diag(array)
-    if array.ndim != 1 or not np.all(np.isfinite(array)) or np.any(array < 0.0):
-        raise ObsynthError(
-            f"majorant= is {value!r}; it has to be the diagonal of M'M, not negative",
-            option="majorant",
-        )
-    return tuple(float(v) for v in array)
-
-
-def _read_gains(design: HinfDesign, gains: Mapping[str, ArrayLike]) -> Filter:
-    data = design.data
-    n, m, n_f = len(data.A), len(data.C), data.n_f
-    shapes = {"K": (n, m), "F": (n, m), "H": (n_f, m), "D": (n_f, m)}
-    unknown = sorted(set(gains) - set(shapes))
-    if "K" not in gains or unknown:
-        raise ObsynthError(
-            f"gains are {sorted(gains)}; K is needed, F, H and D may be given", option="gains"
-        )
-    arrays: dict[str, FloatArray] = {}
-    for name, value in gains.items():
-        array = np.asarray(value, dtype=float)
-        if array.shape != shapes[name] or not np.all(np.isfinite(array)):
-            raise ObsynthError(
-                f"{name} has shape {array.shape}; {shapes[name]} finite numbers are needed",
-                option="gains",
-            )
-        arrays[name] = array
-    return replace(data.standard_filter(arrays["K"]), **arrays)
-
-
-def _unstable(prepared: Prepared, index: int, radius: float) -> InfeasibleDesign:
-    vertex = prepared.bounds.vertices()[index]
-    varying = prepared.bounds.max > prepared.bounds.min
-    names = prepared.design.plant.names("x")
-    entries = {
-        f"dg_{names[i]}/d{names[j]}": float(vertex[i, j])
-        for i, j in np.argwhere(varying & (np.abs(vertex) > 1e-12))
-    }
-    where = ", ".join(f"{name} = {value:.6g}" for name, value in entries.items())
-    return InfeasibleDesign(
-        f"the error is unstable with these gains: spectral radius {radius:.6f} at the vertex "
-        f"{where or index}",
-        [
-            "a Jacobian that the plant has there or near it makes the estimation error grow",
-            "design gains for this plant, or narrow the ranges of the states",
-        ],
-        spectral_radius=radius,
-        vertex=vertex,
-        vertex_index=index,
-        entries=entries,
-    )

@@ -7,7 +7,7 @@ caps and margins mean the same for every plant.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -81,16 +81,6 @@ class Found:
     tau: FloatArray
     tau_decay: FloatArray
     printed: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Setting:
-    """A problem with what its unknowns mean."""
-
-    problem: Problem
-    data: FilterData
-    structure: Structure
-    free_gains: bool
 
 
 def state_problem(
@@ -214,15 +204,18 @@ def find_level(
     def state(cap: float) -> Problem:
         return state_problem(scaled, structure, None, decay, given, cap=cap)
 
+    # Where alpha and beta of (45) want to be infinite the solver stops short of it, the sooner the
+    # larger P may be.
+    starts = (CAPS, CAPS[-1:]) if structure == "printed" else (CAPS,)
     try:
-        solution = _solve_with_caps(state)
+        squares = [_solve_with_caps(state, caps).number("mu2") for caps in starts]
     except InfeasibleDesign as refusal:
         raise _explained(scaled, structure, decay, given) from refusal
-    least = float(np.sqrt(max(solution.number("mu2"), 0.0)))
+    least = float(np.sqrt(max(min(squares), 0.0)))
     return max(least, LEAST_LEVEL) * units.f
 
 
-def _solve_with_caps(state: Callable[[float], Problem]) -> Solution:
+def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] = CAPS) -> Solution:
     """Solve under the first cap of P that the solver copes with.
 
     Raises
@@ -233,7 +226,7 @@ def _solve_with_caps(state: Callable[[float], Problem]) -> Solution:
         If there is, but no problem is solved.
     """
     troubles: list[SolverTrouble] = []
-    for cap in CAPS:
+    for cap in caps:
         try:
             return solve_reliably(state(cap))
         except SolverTrouble as trouble:
@@ -356,8 +349,3 @@ def _explained(
         )
     details.append("smaller ranges of the states make its Jacobian vary less")
     return InfeasibleDesign(headline, details)
-
-
-def without_sector(data: FilterData) -> FilterData:
-    """Return the data with the vertices in place of the multipliers."""
-    return replace(data, sector=None)

@@ -160,6 +160,15 @@ def test_gains_that_are_none(consistent):
         method.analyse(consistent[0], {"K": np.zeros((2, 3))})
 
 
+def test_gains_that_let_the_fault_through(consistent, paper_gain):
+    method = ob.HinfUIO(method="polytopic")
+    with pytest.raises(ob.ObsynthError, match="H does not decouple f") as caught:
+        method.analyse(consistent[0], paper_gain | {"H": [[0.0, 0.999]]})
+    assert caught.value.residual == pytest.approx(1e-3)
+    with pytest.raises(ob.ObsynthError, match="F does not decouple f"):
+        method.analyse(consistent[0], paper_gain | {"F": np.zeros((3, 2))})
+
+
 def test_a_level_that_given_gains_do_not_keep(consistent, paper_gain):
     with pytest.raises(ob.InfeasibleDesign, match="cannot be shown"):
         ob.HinfUIO(method="polytopic", mu=0.46).analyse(consistent[0], paper_gain)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import obsynth as ob
 from obsynth.designs.hinf.lmis import dissipation_block, loop_of_filter
@@ -143,6 +144,49 @@ def test_what_the_general_filter_returns_is_projected(consistent):
     for name in ("Z", "Y"):
         assert np.abs(observer.gains[name] @ CL).max() == 0.0
         assert np.abs(observer.gains[name]).max() > 1e-3
+
+
+def linear_part():
+    """The example without g."""
+    R = sp.Rational
+    A = sp.Matrix([[137, 199, 284], [R(118, 10), 299, 470], [894, 661, 65]]) / 1000
+    plant = ob.Plant("linear part")
+    x, (f,), w = (
+        plant.states("x1:4", range=(-50, 50)),
+        plant.faults("f"),
+        plant.disturbances("w1:4"),
+    )
+    W = sp.diag(R(1, 2), R(2, 5), R(3, 10))
+    plant.dynamics(A * sp.Matrix(x) + sp.Matrix([0, f, 0]) + W * sp.Matrix(w), Ts=1)
+    plant.outputs([x[0], x[1]])
+    return plant
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"form": "printed"}, "paper45"),
+        ({}, "std"),
+        ({"method": "polytopic"}, "std"),
+        ({"method": "general"}, "general"),
+    ],
+)
+def test_linear_part(options, name, hinf_reference):
+    observer = ob.HinfUIO(**options, slack=5e-6).design(linear_part())
+    expected = hinf_reference["mu"]["linear_g0"][name]
+    assert observer.performance["least_mu"] == pytest.approx(expected, abs=3e-5)
+    assert observer.performance["l2_gain"] == pytest.approx(expected, abs=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("variant", "gamma2", "group"),
+    [("consistent", 0.517, "g51"), ("printed_g", 0.518551875, "g50")],
+)
+def test_standard_form_with_gamma_squared_identity(variant, gamma2, group, request, hinf_reference):
+    method = ob.HinfUIO(majorant=(gamma2,) * 3, drop_zero_rows=False)
+    observer = method.design(*request.getfixturevalue(variant))
+    expected = hinf_reference["mu"][group]["std_gamma2I"]
+    assert observer.performance["least_mu"] == pytest.approx(expected, abs=3e-5)
 
 
 def test_second_stage_keeps_P_moderate(consistent):
