@@ -59,6 +59,8 @@ class ErrorSets:
     @cached_property
     def pairs(self) -> FloatArray:
         """Offsets of all pairs of vertices, shape (p q, number of entering coordinates)."""
+        if not self.state_entering:
+            return np.zeros((1, 0))
         x, e = (shape.vertices for shape in self._projected)
         return np.hstack([np.repeat(x, len(e), axis=0), np.tile(e, (len(x), 1))])
 

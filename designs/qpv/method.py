@@ -145,7 +145,7 @@ class QPVObserver:
         self._check_numbers()
         for name in ("polytope", "performance_output", "initial_error", "E_x"):
             value = getattr(self, name)
-            if value is not None and not isinstance(value, str):
+            if value is not None and not (name == "polytope" and isinstance(value, str)):
                 object.__setattr__(self, name, _array(name, value))
         if isinstance(self.polytope, str) and self.polytope not in ("box", "cross"):
             raise ObsynthError(

@@ -165,7 +165,7 @@ def hull(vertices: FloatArray) -> Shape:
 
 
 def _signs(n: int) -> FloatArray:
-    return np.array(list(itertools.product((-1.0, 1.0), repeat=n))).reshape(-1, n)
+    return np.array(list(itertools.product((-1.0, 1.0), repeat=n))).reshape(2**n, n)
 
 
 def _check_count(count: int, what: str) -> None:
