@@ -5,14 +5,54 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Detection", "FaultEvent", "compare"]
+__all__ = ["Detection", "FaultEvent", "RunLike", "compare"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+
+class RunLike(Protocol):
+    """What the comparison reads of a run."""
+
+    @property
+    def t(self) -> FloatArray:
+        """Time in seconds, (N + 1,)."""
+        ...
+
+    @property
+    def f(self) -> FloatArray:
+        """True faults, (N + 1, n_f)."""
+        ...
+
+    @property
+    def f_lower(self) -> FloatArray:
+        """Lower bounds as returned at each instant, (N + 1, n_f)."""
+        ...
+
+    @property
+    def f_upper(self) -> FloatArray:
+        """Upper bounds as returned at each instant, (N + 1, n_f)."""
+        ...
+
+    @property
+    def status(self) -> NDArray[np.int64]:
+        """Status of each step, (N + 1,)."""
+        ...
+
+    @property
+    def names(self) -> Mapping[str, tuple[str, ...]]:
+        """Names of the signals by group; ``names["f"]`` are the faults."""
+        ...
+
+    @property
+    def fault_delay(self) -> int:
+        """By how many samples the fault bounds lag behind."""
+        ...
 
 
 @dataclass(frozen=True)

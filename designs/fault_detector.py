@@ -6,14 +6,14 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.certificate import Certificate, Guarantee
-from obsynth.designs.detection import Detection, compare
+from obsynth.designs.detection import Detection, RunLike, compare
 from obsynth.designs.errors import DetectorError
 from obsynth.designs.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS
 
@@ -29,25 +29,6 @@ SKIPPED = ("not_initialised", "non_finite_input", "fault_not_valid")
 """Bits of the status at which a sample never counts, neither for an alarm nor against it."""
 
 _COUNT = "alarm_count"
-
-
-class _RunLike(Protocol):
-    """What the comparison reads of a run."""
-
-    @property
-    def t(self) -> FloatArray: ...
-    @property
-    def f(self) -> FloatArray: ...
-    @property
-    def f_lower(self) -> FloatArray: ...
-    @property
-    def f_upper(self) -> FloatArray: ...
-    @property
-    def status(self) -> NDArray[np.int64]: ...
-    @property
-    def names(self) -> Mapping[str, tuple[str, ...]]: ...
-    @property
-    def fault_delay(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,7 +317,7 @@ class FaultDetector:
         mask = sum(STATUS[name] for name in self._skipped)
         return np.asarray((np.asarray(status, dtype=np.int64) & mask) == 0)
 
-    def detect(self, run: _RunLike, threshold: float = 0.0) -> Detection:
+    def detect(self, run: RunLike, threshold: float = 0.0) -> Detection:
         """Compare the alarms of a run with the faults that were there.
 
         Parameters

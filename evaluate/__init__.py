@@ -7,9 +7,10 @@ from obsynth.evaluate.errors import ReportError, SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.evaluate.plots import plot_errors, plot_run, plot_signal
 from obsynth.evaluate.report import report
-from obsynth.evaluate.run import Run, Trace, Violation
+from obsynth.evaluate.run import Run
 from obsynth.evaluate.simulate import simulate
 from obsynth.evaluate.table import Table
+from obsynth.evaluate.trace import Trace, Violation
 from obsynth.evaluate.width_plot import plot_widths
 
 __all__ = [

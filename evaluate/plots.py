@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from obsynth.evaluate.alarms import shade
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.layout import grid, name_lines, new_figure
-from obsynth.evaluate.run import Run, Trace
+from obsynth.evaluate.run import Run
 from obsynth.evaluate.style import BARS, ESTIMATE, INK, INTERVAL, INTERVAL_FILL, SOFT, style
 from obsynth.evaluate.thin import thin
+from obsynth.evaluate.trace import Trace
 
 __all__ = ["plot_errors", "plot_run", "plot_signal"]
 

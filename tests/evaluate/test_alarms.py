@@ -19,6 +19,7 @@ from obsynth.evaluate import (
 )
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.run import Run
+from obsynth.symbolic import Plant
 
 pytestmark = [pytest.mark.usefixtures("no_window"), pytest.mark.filterwarnings("error")]
 
@@ -165,6 +166,25 @@ def test_half_widths_that_are_partly_infinite(toy, tmp_path):
     page = report(tmp_path / "page.html", observer).read_text()
     assert "n/a" in page
     assert ">inf<" not in page
+
+
+def test_a_report_says_which_equations_the_guarantee_speaks_of(toy, tmp_path):
+    plant = Plant("decay")
+    (a,) = plant.states("a", range=(-50, 50))
+    plant.dynamics([-a])
+    plant.outputs([a])
+    model = plant.discretise("rk4", Ts=0.5)
+    words = {
+        "All guarantees speak of the discrete model": {},
+        "step is their approximation": {"ode": object(), "step_covered": False},
+        "observed at these instants": {"ode": object(), "step_covered": True},
+    }
+    for expected, facts in words.items():
+        observer = toy.observer(model, half_widths=None)
+        for name, value in facts.items():
+            object.__setattr__(observer, name, value)
+        page = report(tmp_path / "page.html", observer).read_text().replace("&#39;", "'")
+        assert [word in page for word in words] == [word == expected for word in words]
 
 
 def test_not_applicable_is_flush_right_among_numbers():

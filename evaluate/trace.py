@@ -1,0 +1,98 @@
+"""One signal of a run, and where it was outside of its interval."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.evaluate.errors import SimulationError
+
+__all__ = ["Trace", "Violation"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One signal over time: truth, estimate and interval, all about the same instants.
+
+    Signals without an estimate (inputs, outputs, disturbances) have None there.
+    With ``fault_delay = 1`` a fault's trace ends one sample before the run, as
+    its claims arrive one sample late. ``alarm`` is what a fault detector said at
+    these instants, which is about the instant ``fault_delay`` earlier.
+    """
+
+    name: str
+    unit: str
+    t: Array
+    true: Array
+    estimate: Array | None = None
+    lower: Array | None = None
+    upper: Array | None = None
+    alarm: NDArray[np.bool_] | None = None
+
+    @property
+    def label(self) -> str:
+        """Name with its unit, for axes and heads."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the interval excludes anything at any instant."""
+        if self.lower is None or self.upper is None:
+            return False
+        return bool(np.any(~(np.isneginf(self.lower) & np.isposinf(self.upper))))
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Where the truth is inside the interval, tolerance zero; no number is outside."""
+        if self.lower is None or self.upper is None:
+            raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
+        return np.asarray((self.lower <= self.true) & (self.true <= self.upper))
+
+    @property
+    def error(self) -> Array:
+        """Truth minus estimate."""
+        if self.estimate is None:
+            raise SimulationError(f"{self.name} is not estimated.", symbol=self.name)
+        return np.asarray(self.true - self.estimate)
+
+    @property
+    def half_width(self) -> Array:
+        """Half the length of the interval."""
+        if self.lower is None or self.upper is None:
+            raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
+        return np.asarray(0.5 * (self.upper - self.lower))
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A signal that was outside its interval.
+
+    Attributes
+    ----------
+    signal : str
+    count : int
+        Violated instants in the whole run.
+    instants, amounts : tuple
+        The first few instants k, and how far outside the truth was.
+    worst, worst_at : float, int
+        The largest amount and its instant.
+    """
+
+    signal: str
+    count: int
+    instants: tuple[int, ...]
+    amounts: tuple[float, ...]
+    worst: float
+    worst_at: int
+
+    def __str__(self) -> str:
+        first = ", ".join(
+            f"k = {k} by {a:.3g}" for k, a in zip(self.instants, self.amounts, strict=True)
+        )
+        more = ", ..." if self.count > len(self.instants) else ""
+        return (
+            f"{self.signal}: {self.count} instants outside ({first}{more}; "
+            f"worst {self.worst:.3g} at k = {self.worst_at})"
+        )
