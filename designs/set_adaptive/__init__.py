@@ -1,5 +1,11 @@
-"""The set adaptive observer for quasi-LPV plants, and its robust bank."""
+"""The set adaptive observer for quasi-LPV plants, its indicators, and its robust bank."""
 
+from obsynth.designs.set_adaptive.indicators import (
+    Indicators,
+    Monitors,
+    fault_indicators,
+    monitors,
+)
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
-__all__ = ["SetAdaptiveObserver"]
+__all__ = ["Indicators", "Monitors", "SetAdaptiveObserver", "fault_indicators", "monitors"]
