@@ -103,8 +103,17 @@ def _theta(t: float) -> tuple[float, float]:
     )
 
 
+def _equilibrium(t1: float, t2: float) -> tuple[float, float, float]:
+    """-B(theta)^-1 A(theta) (10, 10, 10)' written out."""
+    return (
+        (87.0 + 0.5 * t1 + 20.0 * t2) / (1.2 + t1),
+        10.0 + 20.0 * t2 - 40.0 * t1,
+        10.0 + 15.0 * t1,
+    )
+
+
 def _inputs(Ts: float, U_p: float) -> Callable[[float], Sequence[float]]:
-    """-B(theta)^-1 A(theta) (10, 10, 10)' written out, plus the perturbation."""
+    """Equilibrium at the current theta, plus the perturbation."""
     turn = math.pi / 9.0
 
     def at(k: float) -> tuple[float, float, float]:
@@ -115,11 +124,8 @@ def _inputs(Ts: float, U_p: float) -> Callable[[float], Sequence[float]]:
             math.cos(2 * t - 2 * turn) + math.cos(5 * t - 20 * turn) + math.cos(8 * t - 56 * turn),
             math.cos(3 * t - 6 * turn) + math.cos(6 * t - 30 * turn) + math.cos(9 * t - 72 * turn),
         )
-        return (
-            (87.0 + 0.5 * t1 + 20.0 * t2) / (1.2 + t1) + U_p * waves[0],
-            10.0 + 20.0 * t2 - 40.0 * t1 + U_p * waves[1],
-            10.0 + 15.0 * t1 + U_p * waves[2],
-        )
+        u1, u2, u3 = _equilibrium(t1, t2)
+        return u1 + U_p * waves[0], u2 + U_p * waves[1], u3 + U_p * waves[2]
 
     return at
 
