@@ -80,8 +80,8 @@ class Reduced:
         size = np.abs(C) @ x + np.abs(W2) @ np.abs(box).max(axis=1, initial=0.0)
         ranges = model.family.ranges[:, 1] - model.family.ranges[:, 0]
         return cls(
-            np.array(A).reshape(-1, n2, n2),
-            np.array(D).reshape(-1, n2, m),
+            np.array(A).reshape(len(A), n2, n2),
+            np.array(D).reshape(len(D), n2, m),
             nearest(plant.C2),
             nearest(plant.N12),
             nearest(plant.T2 @ model.W1),
@@ -150,8 +150,15 @@ def lp_problem(data: Reduced, P: FloatArray) -> Problem:
     -------
     Problem
         With the variables ``lambda``, ``Y``, ``T`` and ``U``.
+
+    Raises
+    ------
+    ObsynthError
+        If n = q, where no state is left to be bounded by a recursion.
     """
     n2, m2 = len(P), len(data.C2)
+    if not n2:
+        raise ObsynthError("every state is measured once the faults are known: there is no gain")
     S = np.linalg.inv(P)
     Lambda, T = diagonal("lambda", n2), full("T", n2, n2)
     U = full("U", n2, len(data.w_width)) if data.w_width.size else None
@@ -186,12 +193,15 @@ def lp_gain(data: Reduced, P: FloatArray) -> FloatArray:
     InfeasibleDesign
         If no L makes the errors of this P decay at all vertices in common.
     """
-    if not len(data.C2):
-        return np.zeros((len(P), 0))
+    if not len(data.C2) or not len(P):
+        return np.zeros((len(P), len(data.C2)))
     try:
         solution = lp_problem(data, P).solve(tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
     except SolverTrouble:
         solution = lp_problem(data, P).solve()
+    if "Y" not in solution.values:
+        # neither C2 nor the noise of the remaining outputs: nothing to be gained from them
+        return np.zeros((len(P), len(data.C2)))
     Y, weights = solution["Y"], np.diag(solution["lambda"])
     return np.asarray(np.linalg.solve(P, Y / weights[:, None]), dtype=float)
 

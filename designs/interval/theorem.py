@@ -69,7 +69,8 @@ def divergence(design: IntervalDesign, headline: str = "the bounds diverge") -> 
     alpha = lipschitz_alpha(nearest(parts.sigma_lower), nearest(parts.sigma_upper))
     limit = largest_alpha(R)
     details = []
-    if design.bound == "paper" and R.min(initial=0.0) < -NEGATIVE:
+    signed = design.bound == "paper" and R.min(initial=0.0) < -NEGATIVE
+    if signed:
         details.append(
             f"R = P (A2 - L C2) P^-1 has an entry {R.min():.4g} below zero, which Theorem 1 does "
             'not allow; bound="vertex" needs no sign'
@@ -86,6 +87,8 @@ def divergence(design: IntervalDesign, headline: str = "the bounds diverge") -> 
         'use gains="lp" with centred=True, narrower ranges of the scheduling variables, or measure '
         "more states"
     )
+    if radius < 1.0 and signed:
+        headline = "R is not nonnegative"
     return InfeasibleDesign(
         f"{headline}: spectral radius {radius:.6g}",
         details,
