@@ -77,7 +77,7 @@ def vertices_table(bounds: "JacobianBounds") -> Table:
     """Say how many vertices the design needs, and why."""
     # A constant of 1e-17 is what the doubles of A leave of the exact dependence.
     why = [
-        re.sub(r" [+-] [\d.]+e-1[5-9]", "", str(dependence).split("; ")[0])
+        re.sub(r" (?:[+-]|up to) [\d.]+e-1[5-9]", "", str(dependence).split("; ")[0])
         for dependence in bounds.dependences
         if dependence.coefficients
     ]
