@@ -20,6 +20,7 @@ from obsynth.designs.interval.synthesis import (
     given_gains,
     lp_design,
     read_gains,
+    search_design,
     sylvester_design,
     with_gains,
 )
@@ -42,15 +43,16 @@ class IntervalObserver:
     """Interval observer for states and actuator faults of parameter-varying plants.
 
     For discrete-time plants ``x+ = A(rho) x + B(rho) u + o(rho) + F f + W1 w``, ``y = C x + W2 w``
-    with bounded w, rho bounded but not measured, faults f (and unknown inputs) of any size and
-    rank(C F) = q. An orthogonal transformation takes the faults away; what remains is bounded
-    from below and above, and the faults follow with a delay of one sample.
+    with bounded w, rho bounded (values of rho that are measured are not used), faults f and unknown
+    inputs of any size, and rank(C F) = q. An orthogonal transformation takes the faults away; what
+    remains is bounded from below and above, and the faults follow with a delay of one sample.
 
     Parameters
     ----------
-    gains : "lp", "sylvester" or (P, L)
-        L by the linear programme that minimises the widths for P = I (for other P where P = I has
-        no solution), both by P A2 - R P = Q C2, or given; (P, None) lets the programme choose L.
+    gains : "lp", "search", "sylvester" or (P, L)
+        L by the linear programme that minimises the widths for P = I; both by a direct search on
+        the predicted widths (which is also taken where P = I has no solution); both by
+        P A2 - R P = Q C2; or given, where (P, None) lets the programme choose L.
     centred : bool
         Whether the paper's bound is taken around the middle of the matrices; False: around
         `nominal`. The vertex bound does not depend on it.
@@ -149,9 +151,10 @@ class IntervalObserver:
             object.__setattr__(self, name, _read_matrix(name, getattr(self, name)))
         if not isinstance(self.gains, str):
             object.__setattr__(self, "gains", _read_pair(self.gains))
-        elif self.gains not in ("lp", "sylvester"):
+        elif self.gains not in ("lp", "search", "sylvester"):
             raise ObsynthError(
-                f"gains is {self.gains!r}; it has to be 'lp', 'sylvester' or a pair (P, L)",
+                f"gains is {self.gains!r}; it has to be 'lp', 'search', 'sylvester' or a pair "
+                "(P, L)",
                 option="gains",
             )
         if self.centred and self.nominal is not None:
@@ -322,6 +325,8 @@ class IntervalObserver:
         if not isinstance(self.gains, str):
             P, L = self.gains
             return given_gains(start, np.array(P), None if L is None else np.array(L))
+        if self.gains == "search":
+            return search_design(start)
         if self.gains == "sylvester":
             return sylvester_design(start, _array(self.R), _array(self.Q))
         return lp_design(start)
@@ -376,6 +381,7 @@ def _read_pair(value: Any) -> tuple[Any, Any]:
         P, L = value
     except (TypeError, ValueError) as error:
         raise ObsynthError(
-            f"gains is {value!r}; it has to be 'lp', 'sylvester' or a pair (P, L)", option="gains"
+            f"gains is {value!r}; it has to be 'lp', 'search', 'sylvester' or a pair (P, L)",
+            option="gains",
         ) from error
     return _read_matrix("P", P), _read_matrix("L", L)

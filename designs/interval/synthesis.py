@@ -21,7 +21,15 @@ from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError
 
-__all__ = ["complete", "given_gains", "lp_design", "read_gains", "sylvester_design", "with_gains"]
+__all__ = [
+    "complete",
+    "given_gains",
+    "lp_design",
+    "read_gains",
+    "search_design",
+    "sylvester_design",
+    "with_gains",
+]
 
 STARTS = 3
 
@@ -86,9 +94,7 @@ def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> 
 
 
 def lp_design(design: IntervalDesign) -> IntervalDesign:
-    """Gains by the linear programme for P = I, or where that has no solution by a search of P.
-
-    The search starts at gains that place real poles and improves P and L together.
+    """Gains by the linear programme for P = I; where that has no solution, by `search_design`.
 
     Raises
     ------
@@ -98,11 +104,30 @@ def lp_design(design: IntervalDesign) -> IntervalDesign:
     data = Reduced.of(design.model, design.plant)
     identity = np.eye(data.A.shape[1])
     first = _try(design, identity, _programme(data, identity))
-    if first is not None:
-        return first
-    starts = sorted(placed_gains(data), key=lambda gains: predicted_size(data, *gains))
-    tried = [refined(data, *gains) for gains in starts[:STARTS]]
-    tried += [*starts, *((identity, L) for _, L in starts)]
+    return search_design(design) if first is None else first
+
+
+def search_design(design: IntervalDesign) -> IntervalDesign:
+    """Gains by a direct search that improves P and L together.
+
+    Starts at the linear programme's gain for P = I and at gains that place real poles; what has
+    the smallest steady widths is taken.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no P that was tried gives bounds that stay bounded.
+    """
+    data = Reduced.of(design.model, design.plant)
+    identity = np.eye(data.A.shape[1])
+    starts = list(placed_gains(data))
+    programme = _programme(data, identity)
+    if programme is not None:
+        starts.append((identity, programme))
+    starts.sort(key=lambda gains: predicted_size(data, *gains))
+    tried = [*starts, *((identity, L) for _, L in starts)]
+    if len(identity):
+        tried += [refined(data, *gains) for gains in starts[:STARTS]]
     done = [d for d in (_try(design, P, L) for P, L in tried) if d is not None]
     if not done:
         gains = tried[0] if tried else (identity, np.zeros((len(identity), len(data.C2))))

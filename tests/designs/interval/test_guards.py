@@ -112,7 +112,7 @@ def test_the_class_of_plants(example):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"gains": "guess"}, "'lp', 'sylvester' or a pair"),
+        ({"gains": "guess"}, "'sylvester' or a pair"),
         ({"gains": 3.0}, "pair"),
         ({"bound": "ellipsoid"}, "bound is"),
         ({"form": "repaired"}, "form is"),
@@ -395,6 +395,16 @@ def test_analyse_proves_what_given_gains_guarantee(example, designs):
     assert wider.half_widths[1] > observer.half_widths[1] * 1.01
     with pytest.raises(ob.ObsynthError, match="needs L"):
         ob.IntervalObserver().analyse(example, {"P": np.eye(2)})
+
+
+def test_searched_gains(example, designs, two_faults):
+    searched = ob.IntervalObserver(gains="search").design(example)
+    # nothing is better than P = I on the example
+    assert searched.half_widths == pytest.approx(designs["d1"].half_widths, rel=1e-3)
+    programme = ob.IntervalObserver().design(two_faults)
+    searched = ob.IntervalObserver(gains="search").design(two_faults)
+    assert searched.certificate.valid
+    assert searched.half_widths.sum() < 0.95 * programme.half_widths.sum()
 
 
 def test_sylvester_gains(example):
