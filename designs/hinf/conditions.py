@@ -64,8 +64,8 @@ def check_outputs(parts: Split) -> None:
         y = parts.model.output_names[rows[0]]
         raise StructureError(
             f"the disturbance {w} enters the output {y}, and equation (2) has none: make it a "
-            f"state of its own, n_next = {w} and {y} = ... + n, which delays it by one sample and "
-            "changes no energy",
+            f"state of its own, n_next = {w}, and write n in place of {w} in all equations and "
+            "outputs, which delays it by one sample and changes no energy",
             symbol=w,
             row=y,
         )

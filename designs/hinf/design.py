@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive import AffineFamily
 from obsynth.derive.split import LinearForm
-from obsynth.designs.errors import CertificateError
+from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.hinf.system import Filter, FilterData, Sector
 from obsynth.designs.lmi import Enclosure
 from obsynth.symbolic import Plant
@@ -21,6 +21,7 @@ from obsynth.symbolic import Plant
 __all__ = ["METHOD", "Bound", "HinfDesign", "enclosed_vertices"]
 
 METHOD = "hinf_uio"
+MOST_VERTICES = 2**12
 LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 FloatArray = NDArray[np.float64]
 
@@ -102,7 +103,7 @@ class HinfDesign:
     @cached_property
     def data(self) -> FilterData:
         """The numeric data of the error system, the rounding of the vertices enclosed."""
-        vertices = enclosed_vertices(self.family)
+        vertices = enclosed_vertices(self.family, every=self.sector is None)
         CL = self.C @ self.L
         H = np.linalg.solve(CL.T @ CL, CL.T)
         # An exact inverse stays exact where the columns are those of the identity.
@@ -191,10 +192,35 @@ class HinfDesign:
             raise CertificateError("a group of the sector has no multiplier")
 
 
-def enclosed_vertices(family: AffineFamily) -> Enclosure:
-    """Enclose all matrices ``constant + sum_k s_k direction_k`` at the corners of the ranges."""
+def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
+    """Enclose the matrices ``constant + sum_k s_k direction_k`` at the corners of the ranges.
+
+    Parameters
+    ----------
+    family : AffineFamily
+    every : bool
+        False: above `MOST_VERTICES` corners, take the middle and the ends of one range at a time
+        instead, which lie in the family too.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If there are more vertices than a design can use.
+    """
     ends = [sorted(set(pair)) for pair in family.ranges.tolist()]
-    corners = list(product(*ends))
+    if family.vertex_count <= MOST_VERTICES:
+        corners = list(product(*ends))
+    elif every:
+        raise InfeasibleDesign(
+            f"the Jacobian has {family.vertex_count} vertices, more than {MOST_VERTICES}",
+            ['multipliers="per_entry" needs none of them', "or narrow the ranges of the states"],
+            vertices=family.vertex_count,
+        )
+    else:
+        middle = tuple(0.5 * (pair[0] + pair[-1]) for pair in ends)
+        corners = [middle]
+        for k, pair in enumerate(ends):
+            corners += [(*middle[:k], end, *middle[k + 1 :]) for end in pair]
     table = np.array(corners, dtype=float).reshape(len(corners), len(ends))
     return Enclosure.combine(
         Enclosure.of(family.constant, family.radius),

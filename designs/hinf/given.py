@@ -76,7 +76,7 @@ def read_gains(design: HinfDesign, gains: Mapping[str, ArrayLike]) -> Filter:
 
 def unstable_gains(prepared: Prepared, index: int, radius: float) -> InfeasibleDesign:
     """Return the refusal of gains whose error grows at a vertex of the Jacobian set."""
-    vertex = prepared.bounds.vertices()[index]
+    vertex = prepared.design.data.vertices[index]
     varying = prepared.bounds.max > prepared.bounds.min
     names = prepared.design.plant.names("x")
     entries = {

@@ -102,5 +102,5 @@ def prepare(
         bound=Bound(1.0, np.zeros((n, n)), np.zeros(0), np.zeros(0)),
         options={},
     )
-    check_detectability(parts, L, design.data.G, bounds.vertices())
+    check_detectability(parts, L, design.data.G, design.data.vertices)
     return Prepared(parts, bounds, found, design)

@@ -327,7 +327,8 @@ def _explained(
 ) -> InfeasibleDesign:
     """Say what binds where no mu is feasible: the decay of V alone, a homogeneous problem."""
     what = "these gains" if gains is not None else "any gain"
-    headline = f"no quadratic V decays along every error with {what}, so there is no level mu"
+    how = "decays" if decay is None else f"shrinks to {decay:g} of itself in a step"
+    headline = f"no quadratic V {how} along every error with {what}, so there is no level mu"
     details = []
     if structure != "printed":
         problem = Problem("decay of V")
@@ -342,7 +343,7 @@ def _explained(
         except SolverTrouble as trouble:
             details.append(str(trouble).splitlines()[0])
     if decay is not None:
-        details.append(f"asked for: V+ < {decay:g} V; a larger decay= asks for less")
+        details.append("a larger decay= asks for less")
     if scaled.sector is not None:
         details.append(
             'multipliers="per_entry" or method="polytopic" know more about the nonlinearity'

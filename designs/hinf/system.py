@@ -89,7 +89,7 @@ class FilterData:
     A_radius, W_radius : ndarray
         How far the plant's own coefficients may be from the doubles.
     vertices : ndarray of shape (N, n, n)
-        Of the Jacobian of g.
+        Of the Jacobian of g; with multipliers and too many vertices, some matrices of the set.
     vertex_radius : ndarray of shape (N, n, n)
     sector : Sector or None
         Used in place of the vertices where it is there.

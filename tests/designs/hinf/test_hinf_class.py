@@ -104,3 +104,28 @@ def test_a_given_split(plant):
     assert second.record["linear"] == "jacobian"
     assert second.performance["least_mu"] == pytest.approx(first.performance["least_mu"], rel=1e-4)
     assert second.certificate.check().valid
+
+
+def many(n=14):
+    """A chain of n tanks, each with a slope of its own: 2^n vertices."""
+    plant = ob.Plant("chain")
+    x = plant.states(f"x1:{n + 1}", range=(-3, 3))
+    (f,), w = plant.faults("f"), plant.disturbances("w1:3")
+    rows = [sp.Rational(1, 2) * x[0] + f + w[0] / 10]
+    rows += [
+        sp.Rational(2, 5) * a + b / 10 + sp.sin(a) / 20 for a, b in zip(x[1:], x, strict=False)
+    ]
+    rows[0] += sp.sin(x[1]) / 10 + w[1]
+    plant.dynamics(rows, Ts=1)
+    plant.outputs([x[0], x[1]])
+    return plant
+
+
+def test_more_vertices_than_can_be_used():
+    plant = many()
+    with pytest.raises(ob.InfeasibleDesign, match="8192 vertices") as caught:
+        ob.HinfUIO(method="polytopic").design(plant)
+    assert "per_entry" in str(caught.value)
+    observer = ob.HinfUIO(multipliers="per_entry").design(plant)
+    assert observer.certificate.valid
+    assert len(observer.record["bound"]["tau"]) == 14

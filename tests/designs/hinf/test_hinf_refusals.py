@@ -140,7 +140,10 @@ def test_a_level_below_the_least_one(consistent):
 
 
 def test_a_decay_that_no_gain_reaches(consistent):
-    refused(ob.InfeasibleDesign, "decay", consistent[0], ob.HinfUIO(decay=1e-4))
+    refused(ob.InfeasibleDesign, "shrinks to 0.05", consistent[0], ob.HinfUIO(decay=0.05))
+    slower = ob.HinfUIO(decay=0.2).design(*consistent)
+    assert slower.performance["decay"] == 0.2
+    assert "V+ <= 0.2 V" in str(slower.guarantee)
 
 
 def test_a_majorant_that_is_none(consistent):
