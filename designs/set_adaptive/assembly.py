@@ -17,7 +17,7 @@ from obsynth.designs.set_adaptive.equations import memory_layout
 from obsynth.designs.set_adaptive.inputs import read_box, read_vector
 from obsynth.designs.set_adaptive.ode import build_ode
 from obsynth.designs.set_adaptive.proof import prove_design
-from obsynth.designs.set_adaptive.step import ROUNDING, build_step, initial_memory
+from obsynth.designs.set_adaptive.step import build_step, initial_memory
 from obsynth.designs.set_adaptive.structure import Structure
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 from obsynth.designs.storage import FORMAT, VERSION
@@ -171,7 +171,8 @@ def _guarantee(design: SetDesign) -> Guarantee:
         else:
             assumptions.append(f"the disturbances {', '.join(plant.names('w'))} are zero")
     assumptions.append(
-        f"rounding errors of one step stay below {ROUNDING:.1e} of the size of its terms, which "
-        "is added to the bounds"
+        f"the step is evaluated in IEEE {design.precision} precision: the rounding errors of one "
+        f"step stay below {design.rounding:.1e} of the size of its terms, which is "
+        "added to the bounds"
     )
     return Guarantee(tuple(claims), tuple(assumptions))

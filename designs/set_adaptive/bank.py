@@ -15,6 +15,7 @@ from obsynth.derive.exact import round_number, substitute
 from obsynth.derive.quasi_lpv.measured import Reading, readings
 from obsynth.designs.errors import CertificateError
 from obsynth.designs.set_adaptive.monotone import Monotone, exact_slope, with_ranges
+from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.designs.set_adaptive.structure import continuous
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.errors import ObsynthError
@@ -69,6 +70,16 @@ class BankDesign:
     options: Mapping[str, Any]
 
     @property
+    def precision(self) -> str:
+        """``"double"`` or ``"single"``."""
+        return precision_of(self.options)
+
+    @property
+    def rounding(self) -> float:
+        """What the rounding of one step may be, relative to the size of its terms."""
+        return allowance(self.precision, len(self.plant.x))
+
+    @property
     def hidden(self) -> list[int]:
         """States that no output shows."""
         return [i for i in range(len(self.plant.x)) if i not in set(self.outputs.tolist())]
@@ -120,6 +131,8 @@ class BankDesign:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise CertificateError(f"the stored design cannot be read: {error!r}") from error
+        if design.precision not in PRECISIONS:
+            raise CertificateError(f"precision = {design.precision!r} in the stored design")
         return design
 
 

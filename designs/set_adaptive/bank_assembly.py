@@ -13,7 +13,6 @@ from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.observer import Observer
 from obsynth.designs.set_adaptive.bank import UNKNOWN, BankDesign, read_bank
 from obsynth.designs.set_adaptive.bank_step import (
-    BANK_ROUNDING,
     bank_layout,
     build_bank_ode,
     build_bank_step,
@@ -168,8 +167,9 @@ def _guarantee(design: BankDesign) -> Guarantee:
         f"the faults stay in {sizes}",
         "what happens between two samples is enclosed by an envelope whose containment every step "
         "checks; where it fails the bank starts again",
-        f"rounding errors of one step stay below {BANK_ROUNDING:.1e} of the size of its terms, "
-        "which is added to the bounds",
+        f"the step is evaluated in IEEE {design.precision} precision: the rounding errors of one "
+        f"step stay below {design.rounding:.1e} of the size of its terms, which is "
+        "added to the bounds",
     ]
     if noise:
         assumptions.append(f"{noise} [monitored in part: status bit 8]")

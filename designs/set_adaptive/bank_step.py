@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.set_adaptive.bank import UNKNOWN, BankDesign
+from obsynth.designs.set_adaptive.rounding import outward
 from obsynth.designs.stepping import all_finite, finite_or, make_step, select, status_word
 
-__all__ = ["BANK_ROUNDING", "bank_layout", "build_bank_ode", "build_bank_step", "first_memory"]
+__all__ = ["bank_layout", "build_bank_ode", "build_bank_step", "first_memory"]
 
 FloatArray = NDArray[np.float64]
-BANK_ROUNDING = 2.0**-42
-"""Above the relative rounding error of one step of the bank."""
 _PASSES = 3
 _WIDER = 1.05
 _EXTRA = 1e-12
@@ -52,6 +51,7 @@ def bank_layout(design: BankDesign) -> dict[str, slice]:
 def first_memory(design: BankDesign, x_box: FloatArray) -> FloatArray:
     """Return the memory for a first state in a box."""
     layout = bank_layout(design)
+    x_box = outward(x_box, design.precision)
     memory = np.zeros(layout["initialised"].stop)
     rates = len(design.filters)
     for side, end in (("lower", 0), ("upper", 1)):
@@ -139,7 +139,7 @@ def build_bank_step(design: BankDesign) -> ca.Function:
     corners = Corners(design, finite_or(u, nominal), theta)
 
     initialised = memory[layout["initialised"]] > 0.5
-    region = ca.DM(design.region)
+    region = ca.DM(outward(design.region, design.precision))
     told = _from_outputs(design, finite_or(y, [0.0] * y.numel()))
     inside = ca.SX(1)
     for k, i in enumerate(design.outputs.tolist()):
@@ -246,7 +246,7 @@ def build_bank_ode(design: BankDesign) -> ca.Function:
 
 def _from_outputs(design: BankDesign, y: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the ends of the measured states that a measurement leaves."""
-    wide = BANK_ROUNDING * ca.fabs(y)
+    wide = design.rounding * ca.fabs(y)
     scale = ca.DM(design.scale)
     return (y - ca.DM(design.noise[:, 1]) - wide) / scale, (
         y - ca.DM(design.noise[:, 0]) + wide
@@ -281,8 +281,8 @@ def _fault_intervals(
     outputs, rates = design.outputs.tolist(), len(design.filters)
     lows, highs, sound = [], [], ca.SX(1)
     for j, i in enumerate(design.fault_rows.tolist()):
-        first, second = interval(parts, shown, outputs.index(i), j * rates)
-        low, high = design.plant.box("f")[j]
+        first, second = interval(parts, shown, outputs.index(i), j * rates, design.rounding)
+        low, high = outward(design.plant.box("f"), design.precision)[j]
         fits = ca.logic_and(first <= high, second >= low)
         sound = ca.logic_and(sound, fits)
         lows.append(ca.if_else(fits, ca.fmax(first, low), first))
@@ -291,13 +291,13 @@ def _fault_intervals(
 
 
 def interval(
-    parts: dict[str, ca.SX], shown: tuple[ca.SX, ...], k: int, place: int
+    parts: dict[str, ca.SX], shown: tuple[ca.SX, ...], k: int, place: int, rounding: float
 ) -> tuple[ca.SX, ca.SX]:
     """Return ((y_low - z_upper) / N, (y_high - z_lower) / N), all numbers while N is zero."""
     N = parts["response"][place]
     below = shown[0][k] - parts["filter_upper"][place]
     above = shown[1][k] - parts["filter_lower"][place]
-    slack = BANK_ROUNDING * (ca.fabs(shown[0][k]) + ca.fabs(shown[1][k]))
+    slack = rounding * (ca.fabs(shown[0][k]) + ca.fabs(shown[1][k]))
     started = N > 0.0
     safe = ca.if_else(started, N, 1.0)
     return (
@@ -314,12 +314,12 @@ def _envelope(
     Passes X -> X_0 + [0, Ts] f(X), widened; the last one has to lie in what it was made from.
     """
     n = len(design.plant.x)
-    region = ca.DM(design.region)
+    region = ca.DM(outward(design.region, design.precision))
 
     def reached(X: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
         fall = [ca.fmin(0.0, corners.rate(i, 0, *X)) for i in range(n)]
         rise = [ca.fmax(0.0, corners.rate(i, 1, *X)) for i in range(n)]
-        slack = BANK_ROUNDING * (ca.fabs(low) + ca.fabs(high))
+        slack = design.rounding * (ca.fabs(low) + ca.fabs(high))
         return (
             low + design.Ts * ca.vertcat(*fall) - slack,
             high + design.Ts * ca.vertcat(*rise) + slack,
@@ -346,15 +346,16 @@ def _move_hidden(
     """Move the ends of the unmeasured states; return them and the hull of all states over it."""
     hull_low, hull_high = X[0] + 0.0, X[1] + 0.0
     ends: dict[str, list[ca.SX]] = {"hidden_lower": [], "hidden_upper": []}
+    region = outward(design.region, design.precision)
     for place, i in enumerate(design.hidden):
-        low, high = design.region[i]
+        low, high = region[i]
         for side, name, sign in ((0, "hidden_lower", -1.0), (1, "hidden_upper", 1.0)):
             z = parts[name][place]
             first = corners.rate(i, side, *X, own=z)
             later = ca.fmin(ca.fmax(z + design.Ts * first, low), high)
             second = corners.rate(i, side, *X, own=later)
             worst = ca.fmax(first, second) if side else ca.fmin(first, second)
-            slack = BANK_ROUNDING * (ca.fabs(z) + design.Ts * ca.fabs(worst))
+            slack = design.rounding * (ca.fabs(z) + design.Ts * ca.fabs(worst))
             new = z + design.Ts * worst + sign * slack
             ends[name].append(ca.fmin(ca.fmax(new, low), high))
             if side:
@@ -374,6 +375,7 @@ def _move_filters(
 ) -> dict[str, ca.SX]:
     """Move every filter by the exact exponential of -rate."""
     rates = design.filters.tolist()
+    largest = np.abs(design.plant.box("f")).max(axis=1)
     moved: dict[str, ca.SX] = {}
     for side, name, sign in ((0, "filter_lower", -1.0), (1, "filter_upper", 1.0)):
         values = []
@@ -384,8 +386,9 @@ def _move_filters(
                 z = parts[name][j * len(rates) + k]
                 end = X[side][i]
                 slack = ca.fabs(z) + gathered * (ca.fabs(balance) + rate * ca.fabs(end))
+                slack += largest[j] * parts["response"][j * len(rates) + k]
                 new = decay * z + gathered * (balance + rate * end)
-                values.append(new + sign * BANK_ROUNDING * slack)
+                values.append(new + sign * design.rounding * slack)
         moved[name] = ca.vertcat(*values)
     response = []
     for j, gain in enumerate(design.gain.tolist()):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.designs.errors import CertificateError
 from obsynth.designs.set_adaptive.bounds import EndBounds
+from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.symbolic import Plant
 
 __all__ = ["KINDS", "METHOD", "SetDesign"]
@@ -76,6 +77,16 @@ class SetDesign:
     def law(self) -> str:
         """``"cooperative"`` or ``"printed"``."""
         return str(self.options["law"])
+
+    @property
+    def precision(self) -> str:
+        """``"double"`` or ``"single"``."""
+        return precision_of(self.options)
+
+    @property
+    def rounding(self) -> float:
+        """What the rounding of one step may be, relative to the size of its terms."""
+        return allowance(self.precision, len(self.plant.x), self.Ts * self.mu)
 
     @property
     def window(self) -> float | None:
@@ -159,6 +170,8 @@ class SetDesign:
         outputs = self.fault_outputs
         if outputs.shape != (sizes["q"],) or np.any(outputs < 0) or np.any(outputs >= sizes["m"]):
             raise CertificateError("fault_outputs of the stored design name no outputs")
+        if self.precision not in PRECISIONS:
+            raise CertificateError(f"precision = {self.precision!r} in the stored design")
         if self.options.get("law") not in ("cooperative", "printed"):
             raise CertificateError(f"law = {self.options.get('law')!r} in the stored design")
 

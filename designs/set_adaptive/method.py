@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.set_adaptive.rounding import PRECISIONS
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ class SetAdaptiveObserver:
     region : sequence of (float, float), optional
         Box of the states in which the bank's monotonicity is proved and which it assumes; the
         declared ranges by default.
+    precision : {"double", "single"}
+        In which the step runs: what its rounding may do is added to the bounds.
     form : {"corrected", "printed"}
         ``"printed"``: the printed gain condition, law and bounds.
 
@@ -117,10 +120,11 @@ class SetAdaptiveObserver:
     robust: bool = False
     filters: Sequence[float] = (0.1, 0.2, 0.3, 0.5)
     region: Sequence[Sequence[float]] | None = None
+    precision: Literal["double", "single"] = "double"
     form: Literal["corrected", "printed"] = "corrected"
 
     def __post_init__(self) -> None:
-        for name, values in (("law", _LAWS), ("form", _FORMS)):
+        for name, values in (("law", _LAWS), ("form", _FORMS), ("precision", PRECISIONS)):
             if getattr(self, name) not in values:
                 raise ObsynthError(
                     f"{name} is {getattr(self, name)!r}; it has to be one of "

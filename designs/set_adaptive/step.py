@@ -24,21 +24,20 @@ from obsynth.designs.set_adaptive.equations import (
     residuals,
 )
 from obsynth.designs.set_adaptive.ode import exact_arguments
+from obsynth.designs.set_adaptive.rounding import SHOWN, outward
 from obsynth.designs.set_adaptive.transition import apply, uniformisation
 from obsynth.designs.stepping import all_finite, finite_or, make_step, select, status_word
 
-__all__ = ["ROUNDING", "build_step", "initial_memory"]
+__all__ = ["build_step", "initial_memory"]
 
 FloatArray = NDArray[np.float64]
-ROUNDING = 2.0**-42
-"""Above the relative rounding error of one step: a few hundred operations without cancellation."""
-_ULPS = 2.0**-48
 
 
 def initial_memory(
     design: SetDesign, x_box: FloatArray, f_box: FloatArray, initialised: float = 1.0
 ) -> FloatArray:
     """Return the memory for a first state and constant faults in boxes."""
+    x_box, f_box = outward(x_box, design.precision), outward(f_box, design.precision)
     n, q = len(design.plant.x), len(design.plant.f)
     layout = memory_layout(n, q)
     memory = np.zeros(layout["initialised"].stop)
@@ -65,7 +64,7 @@ def build_step(design: SetDesign) -> ca.Function:
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", m)
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
     scheduled = any(s.name in plant.names("rho") for s in design.bounds.exact)
-    x_box, f_box = plant.box("x"), plant.box("f")
+    x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
 
     y_finite, u_finite = all_finite(y), all_finite(u)
     nominal = [0.0 if s.nominal is None else float(s.nominal) for s in plant.u]
@@ -74,7 +73,7 @@ def build_step(design: SetDesign) -> ca.Function:
     scale = np.array([design.C[k, i] for k, i in enumerate(row_of)])
     y_box = scale[:, None] * x_box[row_of]
     shown = finite_or(y - ca.DM(design.W2 @ design.w_centre), y_box.mean(axis=1))
-    v = ca.DM(design.noise) * (1.0 + _ULPS) + _ULPS * ca.fabs(shown)
+    v = ca.DM(design.noise) + SHOWN[design.precision] * (ca.DM(design.noise) + ca.fabs(shown))
     low = select(y_finite, shown - v, ca.SX(y_box[:, 0]))
     high = select(y_finite, shown + v, ca.SX(y_box[:, 1]))
     inside = ca.SX(1)
@@ -179,7 +178,7 @@ def _adapt(
                     rest = rest - N[k, j] * opposite[j]
                     size = size + ca.fabs(N[k, j] * opposite[j])
             push = Ts * float(design.Gamma[i]) * N[k, i]
-            slack = ROUNDING * (ca.fabs(own[i]) + push * size)
+            slack = design.rounding * (ca.fabs(own[i]) + push * size)
             moved = own[i] + push * rest + (slack if o == "m" else -slack)
             parts.append(moved / (1.0 + push * N[k, i]))
         results.append(ca.vertcat(*parts))
@@ -194,13 +193,15 @@ def _contract(
     row_of: list[int],
 ) -> tuple[ca.SX, ca.SX]:
     """Intersect xi with the declared ranges and the measurement, where all three agree."""
-    box = design.plant.box("x")
+    box = outward(design.plant.box("x"), design.precision)
     low = ca.fmax(memory["xi_m"], ca.DM(box[:, 0]))
     high = ca.fmin(memory["xi_M"], ca.DM(box[:, 1]))
     for k, i in enumerate(row_of):
         scale = float(design.C[k, i])
-        low[i] = ca.fmax(low[i], outputs[0][k] / scale - _ULPS)
-        high[i] = ca.fmin(high[i], outputs[1][k] / scale + _ULPS)
+        told = outputs[0][k] / scale, outputs[1][k] / scale
+        wide = SHOWN[design.precision] * (ca.fabs(told[0]) + ca.fabs(told[1]))
+        low[i] = ca.fmax(low[i], told[0] - wide)
+        high[i] = ca.fmin(high[i], told[1] + wide)
     agree = usable
     for i in range(len(box)):
         agree = ca.logic_and(agree, low[i] <= high[i])
@@ -213,13 +214,13 @@ def _frozen(
     """Return the bounding systems for everything that C x may show until the next sample."""
     push = ca.DM(design.input_rate) @ u
     size = ca.DM(np.abs(design.rate).max(axis=1)) + ca.fabs(push)
-    fall = ca.fmin(ca.DM(design.rate[:, 0]) + push - _ULPS * size, 0.0)
-    rise = ca.fmax(ca.DM(design.rate[:, 1]) + push + _ULPS * size, 0.0)
+    fall = ca.fmin(ca.DM(design.rate[:, 0]) + push - SHOWN[design.precision] * size, 0.0)
+    rise = ca.fmax(ca.DM(design.rate[:, 1]) + push + SHOWN[design.precision] * size, 0.0)
     box = []
     for row in design.C:
         i = int(np.flatnonzero(row)[0])
         box.append(row[i] * design.plant.box("x")[i])
-    y_box = np.array(box)
+    y_box = outward(np.array(box), design.precision)
     reached = (low + design.Ts * fall, high + design.Ts * rise)
     outputs = tuple(
         ca.fmin(ca.fmax(side, ca.DM(y_box[:, 0])), ca.DM(y_box[:, 1])) for side in reached
@@ -244,7 +245,7 @@ def _predict(
         state = ca.horzcat(zeta, xi, Omega, magnitude)
         pushed = ca.horzcat(drive.c, drive.c + G @ bound, -G, forced)
         moved = apply(weights, drive.M, state, pushed)
-        slack = sign * ROUNDING * moved[:, 2 + q]
+        slack = sign * design.rounding * moved[:, 2 + q]
         changed[f"zeta_{o}"] = moved[:, 0] + slack
         changed[f"xi_{o}"] = moved[:, 1] + slack
         changed[f"Omega_{o}"] = moved[:, 2 : 2 + q]
