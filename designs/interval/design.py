@@ -166,12 +166,14 @@ class IntervalDesign:
         state, fault = self.state_rows, self.estimate_rows
         share = row_widths(self._width_of(self.share, self.share_rows), self.error, self.width)
         x = self._linear_width(state)
-        f = exact(self._linear_width(fault)) + exact(share)
+        size = self.share.size + exact(share)
+        f = exact(self._linear_width(fault, {"share_upper": size, "share_lower": size}))
+        f = f + exact(share)
         unit = exact(1.0 + 4.0 * UNIT[self.precision])
         return np.asarray(above(np.concatenate([exact(x), f]) * unit / 2), dtype=float)
 
-    def _linear_width(self, rows: Rows) -> FloatArray:
-        """Width of bounds that are linear in r and y."""
+    def _linear_width(self, rows: Rows, more: Mapping[str, Exact] | None = None) -> FloatArray:
+        """Width of bounds that are linear in r and y; `more`: sizes of what else they take."""
         n2, w = len(self.P), exact(self.width)
         low, high = rows.lower[0], rows.upper[0]
         names = list(rows.sizes)
@@ -183,7 +185,7 @@ class IntervalDesign:
         x, v = self.model.size("x"), self.model.size("w")
         r = magnitude(exact(self.P) @ self.plant.T2) @ x + w
         y = magnitude(self.model.C) @ x + magnitude(self.model.W2) @ v
-        known = {"r_upper": r, "r_lower": r, "y": y, "one": exact(np.ones(1))}
+        known = {"r_upper": r, "r_lower": r, "y": y, "one": exact(np.ones(1)), **(more or {})}
         total = of_r @ w + high[:, -1] - low[:, -1]
         at = 0
         for name, size in rows.sizes.items():

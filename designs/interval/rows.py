@@ -147,6 +147,16 @@ class Part:
         noise = y @ magnitude(self.model.W2) @ self.model.size("w")
         return r, y, X @ rho[:, b], X @ rho[:, o] + noise[:, None]
 
+    @property
+    def size(self) -> Exact:
+        """Largest magnitude of X (A x + B u + o + W1 w) over the declared boxes."""
+        model = self.model
+        signals = np.concatenate([model.size("x"), model.size("u"), exact(np.ones(1))])
+        driven = magnitude(self.X @ model.W1) @ model.size("w")
+        rows = [magnitude(self.X @ vertex) @ signals for vertex in model.vertices]
+        largest: Exact = np.stack(rows).max(axis=0) + driven
+        return largest
+
     def vertex_rows(self) -> Rows:
         """Bound at the vertices of the polytope: one vertex for y, w and r together."""
         a, b, o = columns_of(self.model)
