@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi import Problem, diagonal, full, scalar, trace
 
-__all__ = ["Gain", "analyse_gain", "design_gain", "off_diagonal"]
+__all__ = ["Gain", "analyse_gain", "design_gain", "gain_problem", "off_diagonal"]
 
 FloatArray = NDArray[np.float64]
 _ITERATIONS = 40
@@ -122,6 +123,36 @@ def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: Flo
     if best is None:
         raise SolverTrouble("no positive vector p was found for the Metzler matrix A_M - L C")
     return best
+
+
+def gain_problem(
+    A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, cap: float, alpha: float
+) -> Problem:
+    """Return the program for a given decay, which is possible where its optimum is not negative.
+
+    Its variables are P = diag(p), W = P L, R = diag(r) and the margin t of the decay.
+
+    Examples
+    --------
+    >>> A = np.array([[-1.0, 0.5], [0.2, -1.0]])
+    >>> C = np.array([[1.0, 0.0]])
+    >>> [gain_problem(A, A, C, 2.0, a).solve()["margin"].item() > 0 for a in (0.99, 1.01)]
+    [True, False]
+    """
+    n, m = A_lower.shape[0], C.shape[0]
+    problem = Problem("gain of the set adaptive observer")
+    P, R, W, t = diagonal("P", n), diagonal("R", n), full("W", n, m), scalar("margin")
+    ones = np.ones((1, n))
+    problem.add("positive p", P >= 0.0)
+    problem.add("positive r", R >= 0.0)
+    problem.add_equality("size of p", trace(P) - np.ones((1, 1)))
+    problem.add("Metzler", P @ A_lower - W @ C + R >= 0.0)
+    decay = ones @ (P @ A_upper - W @ C) + alpha * (ones @ P)
+    problem.add("decay", -1.0 * decay - t @ ones >= 0.0)
+    for name, sign in (("cap from above", 1.0), ("cap from below", -1.0)):
+        problem.add(name, cap * (P @ np.ones((n, m))) - sign * W >= 0.0)
+    problem.maximise(t)
+    return problem
 
 
 def off_diagonal(matrix: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ from obsynth.designs.set_adaptive.rounding import PRECISIONS
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
+    from obsynth.designs.lmi import Problem
     from obsynth.designs.observer import Observer
     from obsynth.designs.set_adaptive.design import SetDesign
     from obsynth.designs.set_adaptive.gain import Gain
@@ -243,6 +244,26 @@ class SetAdaptiveObserver:
                 alpha=gain.alpha,
             )
         return assemble(self._complete(structure, gain, A_lower, A_upper, A_lower_box), structure)
+
+    def problem(self, model: Plant, alpha: float) -> Problem:
+        """Return the gain program for a decay alpha, see `Problem.to_cvxpy`.
+
+        The decay is possible where the optimal ``margin`` is not negative; L = P^-1 W.
+
+        Raises
+        ------
+        ObsynthError
+            For the bank, which needs no program.
+        """
+        from obsynth.designs.set_adaptive.gain import gain_problem
+        from obsynth.designs.set_adaptive.structure import read_structure
+
+        if self.robust:
+            raise ObsynthError("the bank (robust=True) needs no program", option="robust")
+        structure = read_structure(model, self.noise)
+        A_upper = structure.bounds.extremes(structure.reach(0.0))[1]
+        A_lower = structure.bounds.extremes(np.inf)[0]
+        return gain_problem(A_lower, A_upper, structure.C, self.gain_cap, alpha)
 
     def _complete(
         self,

@@ -77,6 +77,20 @@ def test_gain_program(hull, structure, cap, alpha):
     assert (gain.p @ (hull[1] - gain.L @ structure.C) <= -gain.alpha * gain.p).all()
 
 
+def test_the_program_as_a_problem_of_the_layer_and_of_cvxpy(tanks):
+    method = SetAdaptiveObserver(noise=False)
+    for alpha, sign in ((0.0302010 - 1e-6, 1.0), (0.0302010 + 1e-6, -1.0)):
+        problem = method.problem(tanks, alpha)
+        tight = {"tol_feas": 1e-11, "tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12}
+        margin = problem.solve(**tight)["margin"].item()
+        assert sign * margin > 0.0
+        other = problem.to_cvxpy()
+        other.solve(solver="CLARABEL", **tight)
+        assert other.var_dict["margin"].value.item() == pytest.approx(margin, abs=1e-9)
+    with pytest.raises(ob.ObsynthError, match="no program"):
+        SetAdaptiveObserver(robust=True).problem(tanks, 0.01)
+
+
 def test_the_largest_decay_is_a_supremum(hull, structure, numbers):
     supremum = numbers["part1"]["max_alpha_common"]
     found = [design_gain(*hull, structure.C, cap).alpha for cap in (1e2, 1e3, 1e4)]
