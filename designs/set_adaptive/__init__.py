@@ -3,9 +3,17 @@
 from obsynth.designs.set_adaptive.indicators import (
     Indicators,
     Monitors,
+    bank_intervals,
     fault_indicators,
     monitors,
 )
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
-__all__ = ["Indicators", "Monitors", "SetAdaptiveObserver", "fault_indicators", "monitors"]
+__all__ = [
+    "Indicators",
+    "Monitors",
+    "SetAdaptiveObserver",
+    "bank_intervals",
+    "fault_indicators",
+    "monitors",
+]

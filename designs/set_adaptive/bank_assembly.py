@@ -154,7 +154,8 @@ def _guarantee(design: BankDesign) -> Guarantee:
         f"[f_lower, f_upper] holds the mean of the fault since the start with the weights "
         f"exp(-{first:g} age), age in seconds, at every sample, however the fault moves; not its "
         "present value. A constant fault is its own mean; without fault zero is never excluded",
-        f"the memory holds the same for every rate ({rates}): an alarm of any of them is right",
+        f"the memory holds the same for every rate ({rates}), see bank_intervals: an alarm of any "
+        "of them is right",
         f"{measured} lie in [x_lower, x_upper] at every sample",
     ]
     if hidden:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from obsynth.designs.set_adaptive.bank import BankDesign
 from obsynth.designs.set_adaptive.design import SetDesign
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.designs.observer import Observer
 
-__all__ = ["Indicators", "Monitors", "fault_indicators", "monitors"]
+__all__ = ["Indicators", "Monitors", "bank_intervals", "fault_indicators", "monitors"]
 
 FloatArray = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -133,6 +134,54 @@ def fault_indicators(
     elif form != "printed":
         raise ObsynthError(f'form is {form!r}; it has to be "corrected" or "printed"')
     return Indicators(outside("zeta"), np.asarray((first > 0.0) | (second < 0.0)), outside("xi"))
+
+
+def bank_intervals(
+    observer: Observer, memory: ArrayLike, y: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return the fault intervals of every filter of a bank.
+
+    Each holds the mean of the fault with the weights exp(-rate age); an alarm of any of them, zero
+    outside of it, proves a fault.
+
+    Parameters
+    ----------
+    observer : Observer
+        Of `SetAdaptiveObserver(robust=True)`.
+    memory : array_like of shape (..., n_memory)
+        With which the step is called at the instants of y.
+    y : array_like of shape (..., m)
+        Measurements.
+
+    Returns
+    -------
+    (ndarray, ndarray)
+        Shape (..., number of faults, number of filters); infinite before the first step.
+
+    Raises
+    ------
+    ObsynthError
+        If the observer is of another kind.
+    """
+    if observer.record.get("kind") != "bank":
+        raise ObsynthError(
+            f"the observer of the method {observer.method!r} is no bank (robust=True)",
+            method=observer.method,
+        )
+    design = BankDesign.from_record(observer.record)
+    parts, layout = np.asarray(memory, dtype=float), observer.memory_layout
+    shown = np.asarray(y, dtype=float)[..., None]
+    outputs, rates = design.outputs.tolist(), len(design.filters)
+    places = [outputs.index(i) for i in design.fault_rows.tolist()]
+    shape = (*parts.shape[:-1], len(places), rates)
+    N = parts[..., layout["response"]].reshape(shape)
+    found = []
+    for noise, side in ((1, "upper"), (0, "lower")):
+        ends = (shown[..., 0] - design.noise[:, noise]) / design.scale
+        rest = ends[..., places][..., None] - parts[..., layout[f"filter_{side}"]].reshape(shape)
+        open_end = np.full(shape, -np.inf if noise else np.inf)
+        found.append(np.divide(rest, N, out=open_end, where=N > 0.0))
+    return found[0], found[1]
 
 
 def monitors(observer: Observer, memory: ArrayLike) -> Monitors:

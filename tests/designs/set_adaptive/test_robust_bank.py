@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.set_adaptive import SetAdaptiveObserver, bank_intervals
 from obsynth.designs.set_adaptive import bank_step as step_module
 from obsynth.designs.set_adaptive.assembly import assemble
 from obsynth.designs.set_adaptive.monotone import Monotone, with_ranges
@@ -95,6 +95,20 @@ def test_every_filter_has_its_own_delay(bank, paper_run, numbers):
             shown = (low[start:, i, j] > 0) | (high[start:, i, j] < 0)
             delay = np.flatnonzero(shown)[0] * 0.01
             assert delay == pytest.approx(expected[f"{rate:g}"][f"d{i + 1}"], abs=0.02)
+
+
+def test_the_intervals_of_all_filters(bank, cooperative, paper_run):
+    expected = intervals(bank, paper_run)
+    found = bank_intervals(bank, paper_run["memory"], paper_run["y"])
+    for a, b in zip(expected, found, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    low, high = bank_intervals(bank, paper_run["memory"][700], paper_run["y"][700])
+    assert low.shape == (2, 4)
+    f_box = bank.model.box("f")
+    assert paper_run["f_lower"][700] == pytest.approx(np.maximum(low[:, 0], f_box[:, 0]), abs=1e-9)
+    assert paper_run["f_upper"][700] == pytest.approx(np.minimum(high[:, 0], f_box[:, 1]), abs=1e-9)
+    with pytest.raises(ob.ObsynthError, match="no bank"):
+        bank_intervals(cooperative, cooperative.memory0([0.5, 0.1, 0.3]), [0.5, 0.1])
 
 
 def test_no_violation_in_thirty_two_thousand_checks(bank, paper_run):
