@@ -198,4 +198,4 @@ def test_an_ellipsoid_is_checked():
 def test_a_problem_needs_a_fixed_eta():
     with pytest.raises(ob.ObsynthError, match="fixed eta"):
         design(eta=None).problem(plant())
-    assert design().problem(plant()).to_cvxpy().is_dcp()
+    assert set(design().problem(plant()).variables) >= {"P", "Gamma0", "Gamma1", "Z"}

@@ -1,6 +1,4 @@
-"""The step at run time: its differential equation, status bits, time index, C code."""
-
-import shutil
+"""The step at run time: its differential equation, status bits, time index."""
 
 import numpy as np
 import pytest
@@ -198,10 +196,3 @@ def test_every_index_is_contained_and_a_shift_by_one_is_not(noiseless):
     late &= run.x[1:] >= run.x_lower[:-1]
     assert not late.all()
     assert set(run.status[-10:].astype(int).tolist()) == {0}
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_the_generated_c_equals_the_step(designed, tmp_path):
-    project = ob.generate_c(designed("noise"), tmp_path / "noise")
-    assert project.comparison is not None
-    assert project.comparison.vectors > 0
