@@ -14,6 +14,7 @@ import numpy as np
 import sympy as sp
 
 import obsynth as ob
+from obsynth.designs import SolverTrouble
 from obsynth.designs.hinf.worst_case import worst_case
 
 METHODS = {
@@ -63,7 +64,7 @@ def measure(seed, methods=METHODS, steps=4000, points=64):
     name = list(methods)[seed % len(methods)]
     try:
         observer = methods[name].design(random_plant(seed))
-    except (ob.StructureError, ob.InfeasibleDesign) as refusal:
+    except (ob.StructureError, ob.InfeasibleDesign, SolverTrouble) as refusal:
         return name, type(refusal).__name__
     found = worst_case(observer, steps=steps, points=points)
     return name, found.certified, found.gain, found.limit
@@ -76,6 +77,8 @@ def main(count):
         name, *outcome = measure(seed)
         if len(outcome) == 1:
             refused[outcome[0]] += 1
+            if outcome[0] == "SolverTrouble":
+                print(f"plant {seed}, {name}: no solver solved it")
         else:
             rows[name].append(outcome)
     print(f"{count} plants in {time.time() - start:.0f} s; refused: {dict(refused)}")

@@ -25,8 +25,10 @@ from obsynth.designs.hinf.lmis import (
 )
 from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units
 from obsynth.designs.lmi import (
+    Margin,
     Problem,
     Solution,
+    bisect_feasible,
     full,
     largest_margin,
     scalar,
@@ -207,12 +209,43 @@ def find_level(
     # Where alpha and beta of (45) want to be infinite the solver stops short of it, the sooner the
     # larger P may be.
     starts = (CAPS, CAPS[-1:]) if structure == "printed" else (CAPS,)
+    levels: list[float] = []
     try:
-        squares = [_solve_with_caps(state, caps).number("mu2") for caps in starts]
+        for caps in starts:
+            try:
+                square = _solve_with_caps(state, caps).number("mu2")
+                levels.append(float(np.sqrt(max(square, 0.0))))
+            except SolverTrouble:
+                continue
+        least = min(levels) if levels else _bisected(scaled, structure, decay, given)
     except InfeasibleDesign as refusal:
         raise _explained(scaled, structure, decay, given) from refusal
-    least = float(np.sqrt(max(min(squares), 0.0)))
     return max(least, LEAST_LEVEL) * units.f
+
+
+def _bisected(
+    scaled: FilterData, structure: Structure, decay: float | None, given: Filter | None
+) -> float:
+    """Find the least mu by margins alone, which the solver finds where it finds no minimum."""
+
+    def margin(mu: float | None) -> Margin:
+        problem = state_problem(scaled, structure, mu, decay, given, margin=0.0)
+        return largest_margin(problem, explain=False)
+
+    def feasible(mu: float) -> bool:
+        try:
+            return margin(mu).feasible
+        except SolverTrouble:
+            return False
+
+    first = margin(None)
+    if not first.feasible:
+        raise InfeasibleDesign("no level leaves room", first.lines(), margin=first.value)
+    inside = max(float(np.sqrt(first.found.solution.number("mu2"))), 2.0 * LEAST_LEVEL)
+    found = bisect_feasible(feasible, inside, LEAST_LEVEL, rtol=1e-4, logarithmic=True)
+    if found is None:
+        raise SolverTrouble(f"no level could be found, although mu = {inside:.4g} has room")
+    return found.feasible
 
 
 def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] = CAPS) -> Solution:
@@ -256,7 +289,12 @@ def find_filter(
     def state(cap: float) -> Problem:
         return state_problem(scaled, structure, mu / units.f, decay, cap=cap)
 
-    solution = _solve_with_caps(state)
+    try:
+        solution = _solve_with_caps(state)
+    except SolverTrouble:
+        # A filter with room is better than none with the smallest trace.
+        roomy = state_problem(scaled, structure, mu / units.f, decay, margin=0.0)
+        solution = largest_margin(roomy, explain=False).found.solution
     P = solution["P"]
     m, n_f = len(data.C), data.n_f
     K: FloatArray = np.asarray(np.linalg.solve(P, solution["N"]), dtype=float)

@@ -5,6 +5,8 @@ import pytest
 import sympy as sp
 
 import obsynth as ob
+from obsynth.designs import SolverTrouble
+from obsynth.designs.hinf import synthesis
 
 
 def two_faults(unknown=True):
@@ -104,6 +106,21 @@ def test_a_given_split(plant):
     assert second.record["linear"] == "jacobian"
     assert second.performance["least_mu"] == pytest.approx(first.performance["least_mu"], rel=1e-4)
     assert second.certificate.check().valid
+
+
+@pytest.mark.parametrize("options", [{"method": "general"}, {"multipliers": "per_row"}])
+def test_where_the_solver_finds_no_minimum(options, monkeypatch):
+    """The level is found by margins alone, and the filter is proved all the same."""
+
+    def trouble(problem):
+        raise SolverTrouble("no minimum")
+
+    plant = ob.plants.hinf_example()
+    least = ob.HinfUIO(**options).design(plant).performance["least_mu"]
+    monkeypatch.setattr(synthesis, "solve_reliably", trouble)
+    observer = ob.HinfUIO(**options).design(plant)
+    assert observer.certificate.valid
+    assert least <= observer.performance["least_mu"] <= least * (1 + 2e-4)
 
 
 def many(n=14):
