@@ -146,8 +146,8 @@ def _guarantee(design: SetDesign) -> Guarantee:
             "during that time it need not",
             f"the step is exact for the bounding systems: no discretisation error, for every Ts up "
             f"to {LARGEST_PRODUCT / design.mu:.3g} s",
-            "the exact solution of ode, fed with y(t) and u(t), gives bounds of the same kind; what "
-            "an integration formula leaves out is not covered",
+            "the exact solution of ode, fed with y(t) and u(t), gives bounds of the same kind; "
+            "what an integration formula leaves out is not covered",
         ]
     else:
         claims = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,8 +90,8 @@ class SetAdaptiveObserver:
     (8), (12)           a system with a nonnegative matrix N'N is not ordered: for coupled faults
                         the "upper" bound may end below the fault (a counterexample is among the
                         tests); averaging does not help, a cooperative law does
-    Theorem 1 (ii)      R_m^-1 b_m > theta_M contradicts Section 6 unless Theta = {0}: as a
-                        certificate it excludes that a fault is ever shown
+    Theorem 1 (ii)      R_m^-1 b_m > theta_M does not hold in Section 6 unless Theta = {0}; there
+                        it is a certificate against false alarms, not one of the fault's range
     (17)                in case (a) theta_m is the upper bound, so the test as printed is always 1
     Theorem 1, noise    with noisy outputs the printed A_m, A_M do not bound A (11.5 per cent of
                         samples violate an entry); y - v and y + v do, with -+ |L| v in (6), (14)
@@ -132,23 +132,14 @@ class SetAdaptiveObserver:
                     f"{', '.join(map(repr, values))}",
                     option=name,
                 )
-        gains = self.Gamma if isinstance(self.Gamma, Sequence) else (self.Gamma,)
-        positive = {
-            "Gamma": gains,
-            "gain_cap": (self.gain_cap,),
-            "Ts": (self.Ts,),
-            "window": (self.window,),
-            "filters": self.filters,
-        }
-        for name, numbers in positive.items():
-            for value in numbers:
-                if value is not None and not 0.0 < float(value) < np.inf:
-                    raise ObsynthError(
-                        f"{name} is {getattr(self, name)!r}; it has to be positive and finite",
-                        option=name,
-                    )
-        if not len(self.filters) or not len(gains):
-            raise ObsynthError("filters and Gamma need at least one number", option="filters")
+        for name in ("Gamma", "gain_cap", "Ts", "window", "filters"):
+            given = getattr(self, name)
+            if given is None and name in ("Ts", "window"):
+                continue
+            if not _positive(given):
+                raise ObsynthError(
+                    f"{name} is {given!r}; it has to be positive and finite", option=name
+                )
         if self.form == "printed":
             if self.robust:
                 raise ObsynthError(
@@ -158,9 +149,10 @@ class SetAdaptiveObserver:
                 )
             object.__setattr__(self, "law", "printed")
             object.__setattr__(self, "noise", False)
-        if isinstance(self.Gamma, Sequence):
-            object.__setattr__(self, "Gamma", tuple(float(g) for g in self.Gamma))
-        object.__setattr__(self, "filters", tuple(float(rate) for rate in self.filters))
+        if np.ndim(self.Gamma) == 1:
+            object.__setattr__(self, "Gamma", tuple(np.asarray(self.Gamma, dtype=float).tolist()))
+        rates = np.atleast_1d(np.asarray(self.filters, dtype=float))
+        object.__setattr__(self, "filters", tuple(rates.tolist()))
         if self.region is not None:
             box = tuple((float(low), float(high)) for low, high in self.region)
             object.__setattr__(self, "region", box)
@@ -335,6 +327,15 @@ class SetAdaptiveObserver:
             fault_outputs=np.array(outputs),
             options=options,
         )
+
+
+def _positive(given: Any) -> bool:
+    """Return whether something is a number, or some numbers, all positive and finite."""
+    try:
+        numbers = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return bool(numbers.ndim <= 1 and numbers.size and ((numbers > 0) & (numbers < np.inf)).all())
 
 
 def round_down(value: float) -> float:
