@@ -213,7 +213,7 @@ def _bounds(part: Split) -> tuple[JacobianBounds, str]:
         (str(s).split(":")[0] for s in bounds.status.ravel()),
         key=["exact", "converged", "budget"].index,
     )
-    varying = int((bounds.max > bounds.min).sum())
+    varying = int(bounds.varying.sum())
     words = "1 entry of dg/dx varies" if varying == 1 else f"{varying} entries of dg/dx vary"
     return bounds, f"{words}; worst status {worst}"
 

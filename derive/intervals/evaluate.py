@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive.intervals.arithmetic import Array
 from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.schedule import Schedule
 
 __all__ = ["Enclosure", "enclose", "evaluate", "first_failure"]
 
@@ -128,8 +129,9 @@ def first_failure(program: Program, lower: Array, upper: Array, output: int) -> 
     str
         A phrase such as "a division by an interval that contains zero".
     """
-    values = program.schedule([output], 0).run(lower[:, None], upper[:, None])
-    for index in program.decisive(output):
+    nodes = program.decisive(output)
+    values = Schedule(program, program.live([output]), nodes).run(lower[:, None], upper[:, None])
+    for index in nodes:
         node = program.nodes[index]
         finite = bool(np.isfinite(values.of(index)).all())
         if not finite and node.op != "input":

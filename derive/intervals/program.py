@@ -231,7 +231,8 @@ class Program(Graph):
         key = tuple(outputs), judged
         if key not in self._schedules:
             breaks = [self.breaks(k) for k in outputs[:judged]]
-            self._schedules[key] = Schedule(self, self.live(outputs), breaks)
+            wanted = [self.outputs[k] for k in outputs]
+            self._schedules[key] = Schedule(self, self.live(outputs), wanted, breaks)
         return self._schedules[key]
 
     def breaks(self, output: int) -> list[int]:

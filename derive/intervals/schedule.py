@@ -19,9 +19,9 @@ __all__ = ["Schedule", "Values"]
 
 Rows = slice | NDArray[np.int64]
 
-# Arrays of this many numbers stay in the fast part of the memory.
-_BLOCK = 16_384
-_NARROWEST, _WIDEST = 256, 4_096
+# Numbers in the working memory of a program, and limits of the boxes done together.
+_BLOCK = 1_000_000
+_NARROWEST, _WIDEST = 512, 4_096
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +36,14 @@ class _Step:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Ranges of all nodes over a batch.
+    """Ranges of the nodes that were asked for, over a batch.
 
     Attributes
     ----------
     table : ndarray, shape (2, n_rows, N)
         Lower and upper ends.
     row : dict of int to int
-        Row of every node.
+        Row of every node that was asked for.
     """
 
     table: Array
@@ -64,6 +64,8 @@ class Schedule:
         The nodes.
     live : sequence of int
         Nodes that are needed, operands first.
+    wanted : sequence of int
+        Nodes whose ranges are asked for.
     breaks : sequence of sequence of int
         For every output that is judged, the nodes under it that may jump or be undefined.
 
@@ -79,38 +81,47 @@ class Schedule:
     >>> x, y = (graph.append(Node("input", (), k)) for k in (0, 1))
     >>> squares = [graph.append(Node("power_int", (k,), 2)) for k in (x, y)]
     >>> total = graph.plain("add", squares)
-    >>> schedule = Schedule(graph, [x, y, *squares, total], [])
+    >>> schedule = Schedule(graph, [x, y, *squares, total], [total])
     >>> schedule.count
     2
     >>> schedule.run(np.array([[1.0], [2.0]]), np.array([[2.0], [3.0]])).of(total)
     (array([5.]), array([13.]))
     """
 
-    def __init__(self, graph: Graph, live: Sequence[int], breaks: Sequence[Sequence[int]]) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        live: Sequence[int],
+        wanted: Sequence[int],
+        breaks: Sequence[Sequence[int]] = (),
+    ) -> None:
         constants = [k for k in live if k in graph.constants]
         inputs = [k for k in live if graph.nodes[k].op == "input"]
-        self.row = {node: k for k, node in enumerate([*constants, *inputs])}
+        self._row = {node: k for k, node in enumerate([*constants, *inputs])}
         self._constants = np.array(
             [[float(graph.constants[k][side][0]) for k in constants] for side in (0, 1)]
         ).reshape(2, len(constants), 1)
         self._inputs = np.array([graph.nodes[k].number for k in inputs], dtype=np.int64)
-        self._steps = [self._step(graph, group) for group in _groups(graph, live, set(self.row))]
+        self._steps = [self._step(graph, group) for group in _groups(graph, live, set(self._row))]
         self.count = len(self._steps)
-        widest = max((s.target.stop - s.target.start for s in self._steps), default=1)
-        self._block = min(max(_BLOCK // widest, _NARROWEST), _WIDEST)
+        self._block = min(max(_BLOCK // max(len(self._row), 1), _NARROWEST), _WIDEST)
+        judged = sorted({k for some in breaks for k in some})
+        kept = [*wanted, *judged, *(a for k in judged for a in graph.nodes[k].args)]
+        self.row = {node: k for k, node in enumerate(dict.fromkeys(kept))}
+        self._kept = np.array([self._row[node] for node in self.row], dtype=np.int64)
         self._judge(graph, breaks)
 
     def _step(self, graph: Graph, group: list[int]) -> _Step:
-        start = len(self.row)
+        start = len(self._row)
         for node in group:
-            self.row[node] = len(self.row)
+            self._row[node] = len(self._row)
         first = graph.nodes[group[0]]
         operands = tuple(
-            _rows([self.row[graph.nodes[node].args[k]] for node in group])
+            _rows([self._row[graph.nodes[node].args[k]] for node in group])
             for k in range(len(first.args))
         )
         extra = (first.number,) if first.op == "power_int" else ()
-        return _Step(RULES[first.op], slice(start, len(self.row)), operands, extra)
+        return _Step(RULES[first.op], slice(start, len(self._row)), operands, extra)
 
     def _judge(self, graph: Graph, breaks: Sequence[Sequence[int]]) -> None:
         """Note which nodes decide whether an output is smooth."""
@@ -126,7 +137,7 @@ class Schedule:
         self._under = [np.array([position[k] for k in some], dtype=np.int64) for some in breaks]
 
     def run(self, lower: Array, upper: Array) -> Values:
-        """Enclose all nodes over every box of a batch.
+        """Enclose nodes over every box of a batch.
 
         Parameters
         ----------
@@ -139,14 +150,19 @@ class Schedule:
             With ``nan`` where nothing is known.
         """
         n = lower.shape[1]
-        table = np.empty((2, len(self.row), n))
-        first = self._constants.shape[1]
-        table[:, :first] = self._constants
-        table[0, first : first + len(self._inputs)] = lower[self._inputs]
-        table[1, first : first + len(self._inputs)] = upper[self._inputs]
+        size = min(n, self._block)
+        first, second = self._constants.shape[1], self._constants.shape[1] + len(self._inputs)
+        buffer = np.empty((2, len(self._row), size))
+        buffer[:, :first] = self._constants
+        table = np.empty((2, len(self._kept), n))
         with np.errstate(all="ignore"):
-            for start in range(0, n, self._block):
-                self._fill(table[:, :, start : start + self._block])
+            for start in range(0, n, max(size, 1)):
+                columns = slice(start, min(start + size, n))
+                part = buffer[:, :, : columns.stop - start]
+                part[0, first:second] = lower[self._inputs, columns]
+                part[1, first:second] = upper[self._inputs, columns]
+                self._fill(part)
+                table[:, :, columns] = part[:, self._kept]
         return Values(table, self.row)
 
     def _fill(self, table: Array) -> None:

@@ -75,6 +75,8 @@ def differ(schedule, program, seed):
 def test_groups_give_what_single_operations_give(column, seed):
     program = Program.from_casadi(ca.Function("f", [X], [column]))
     everything = range(len(program.outputs))
+    live = program.live(everything)
+    assert not differ(Schedule(program, live, live), program, seed)
     schedule = program.schedule(everything, len(everything))
     assert not differ(schedule, program, seed)
     lower, upper = boxes(seed)
@@ -99,11 +101,12 @@ def test_narrow_blocks_give_the_same(monkeypatch):
 def test_operands_in_the_wrong_row_are_caught(monkeypatch):
     column = ca.vertcat(X[0] - X[1], X[1] - X[2], X[0] * X[2])
     program = Program.from_casadi(ca.Function("f", [X], [column]))
-    right = Schedule(program, program.live(range(3)), [])
+    live = program.live(range(3))
+    right = Schedule(program, live, live)
     assert not differ(right, program, 0)
     rows = "obsynth.derive.intervals.schedule._rows"
     monkeypatch.setattr(rows, lambda found: np.array(found[::-1], dtype=np.int64))
-    assert differ(Schedule(program, program.live(range(3)), []), program, 0)
+    assert differ(Schedule(program, live, live), program, 0)
 
 
 @pytest.mark.parametrize("cost", [0.0, 1e9])
