@@ -233,7 +233,7 @@ class HinfUIO:
             if design is not None:
                 return self._assemble(design, prepared)
         if self.mu is not None:
-            raise self._refusal(data) from last
+            raise self._refusal(prepared) from last
         raise SolverTrouble(
             f"the least mu is {least:.6g}, but no filter was proved up to 1 % above it",
             [*(() if last is None else (str(last),)), "give a larger slack= or mu="],
@@ -272,6 +272,8 @@ class HinfUIO:
         prepared = self._prepare(model_or_split, bounds)
         data = prepared.design.data
         chosen = read_gains(prepared.design, gains)
+        if self.form == "printed" and chosen.D.any():
+            raise ObsynthError('form="printed" has no gain D; leave it out', option="D")
         unstable = unstable_vertex(data, chosen)
         if unstable is not None:
             raise unstable_gains(prepared, *unstable)
@@ -353,8 +355,9 @@ class HinfUIO:
 
         return assemble(design, derived=(prepared.split, prepared.bounds, prepared.majorant))
 
-    def _refusal(self, data: Any) -> InfeasibleDesign:
+    def _refusal(self, prepared: Prepared) -> InfeasibleDesign:
         """Say which level is feasible where the given one is not."""
+        data = prepared.design.data
         least = find_level(data, self._structure, self.decay)
         details = [f"the least level of this form is {least:.6g}"]
         if self.mu is not None and self.mu > least:
@@ -364,7 +367,7 @@ class HinfUIO:
                 mu=self.mu,
                 least_mu=least,
             )
-        if self.method != "general":
+        if self.method != "general" and prepared.design.family.vertex_count == len(data.vertices):
             other = find_level(replace(data, sector=None), "general", self.decay)
             details.append(f'method="general" reaches {other:.6g}')
         return InfeasibleDesign(

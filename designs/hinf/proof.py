@@ -115,8 +115,16 @@ def prove_level(design: HinfDesign) -> tuple[Claim, ...]:
         )
     if printed:
         least = float(min(bound.printed[0], bound.printed[1]))
+        # (45) knows neither an output feedthrough D nor a decay rate.
+        plain = not design.gains.D.any() and bound.decay is None
         claims.append(
-            Claim("multipliers", "alpha > 0 and beta > 0", least > 0.0, least, "comparison")
+            Claim(
+                "multipliers",
+                "alpha > 0, beta > 0, D = 0",
+                bool(least > 0.0 and plain),
+                least,
+                "comparison",
+            )
         )
     return tuple(claims)
 

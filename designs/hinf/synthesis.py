@@ -165,7 +165,7 @@ def _state_printed(
     problem: Problem, data: FilterData, P: Any, mu2: Any, gains: Filter | None, margin: float
 ) -> None:
     n, m = len(data.A), len(data.C)
-    loop = PrintedLoop.of(data)
+    loop = PrintedLoop.of(data, gains)
     N = full("N", n, m) if gains is None else P @ gains.K
     Q, alpha, beta = symmetric("Q", n), scalar("alpha"), scalar("beta")
     problem.add_lmi("(45)", printed_block(loop, P, N, Q, alpha, beta, mu2), ">>", margin=margin)

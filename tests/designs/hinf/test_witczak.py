@@ -372,9 +372,17 @@ def test_a_changed_sector_is_not_certified(change, claim, designs):
         assert claim in [c.name for c in caught.value.failed]
 
 
-def test_a_negative_beta_is_not_certified(designs):
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r["bound"]["printed"].__setitem__(1, -1e-3),
+        lambda r: r["gains"].update(D=[[0.5, 0.0]]),
+        lambda r: r["bound"].update(decay=0.1),
+    ],
+)
+def test_what_45_does_not_cover_is_not_certified(change, designs):
     record = json.loads(json.dumps(designs["printed"].record))
-    record["bound"]["printed"][1] = -1e-3
+    change(record)
     with pytest.raises(ob.CertificateError) as caught:
         replace(designs["printed"].certificate, record=record).check("lmi")
     assert "multipliers" in [c.name for c in caught.value.failed]
