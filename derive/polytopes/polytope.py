@@ -221,12 +221,22 @@ def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
         ) from error
     normals = np.unique(hull.equations[:, :-1], axis=0)
     kept = points[hull.vertices]
-    exact = [[Fraction(float(v)) for v in point] for point in points]
     offsets = []
     for row in normals:
         a = [Fraction(float(v)) for v in row]
-        largest = max(sum(x * y for x, y in zip(a, p, strict=True)) for p in exact)
+        largest = max(
+            sum(x * Fraction(float(y)) for x, y in zip(a, p, strict=True))
+            for p in points[_foremost(points, row)]
+        )
         near = float(largest)
         offsets.append(near if Fraction(near) >= largest else float(np.nextafter(near, np.inf)))
     order = np.lexsort(kept.T[::-1])
     return Polytope(normals, np.array(offsets), kept[order], np.zeros(n))
+
+
+def _foremost(points: Array, normal: Array) -> NDArray[np.int64]:
+    """Points that may be the furthest in a direction, as far as rounding leaves that open."""
+    values = points @ normal
+    error = 2.0 * (points.shape[1] + 2) * np.finfo(float).eps * (np.abs(points) @ np.abs(normal))
+    error += 1e-300
+    return np.flatnonzero(values + error >= (values - error).max())
