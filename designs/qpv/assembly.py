@@ -144,12 +144,12 @@ def _gains(design: QPVDesign) -> dict[str, FloatArray]:
 def _performance(design: QPVDesign) -> dict[str, float]:
     trace = float(design.rows.sum(axis=1).max(initial=0.0))
     values = {"decay": design.alpha, "error_decay": 0.5 * design.alpha}
-    if design.norm == "h2":
-        values |= {"h2_trace": trace, "mu": trace}
-    else:
+    if design.norm == "hinf":
         values |= {"l2_gain": float(np.sqrt(design.gamma)), "gamma": design.gamma}
+    elif design.noise is None:
+        values |= {"h2_trace": trace, "mu": trace}
     if design.noise is not None:
-        values["alpha_q"] = design.noise.rate
+        values |= {"alpha_q": design.noise.rate, "bound_trace": trace}
     values |= {
         "trace_P_inv": float(design.inverse_diagonal.sum()),
         "largest_gain": float(np.abs(design.L).max()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.lmi import Knob, MarginSolution, largest_margin, search_line, smallest_changes
+from obsynth.designs.qpv.choices import (
+    cover,
+    noise_centre,
+    one_of_each_pair,
+    reach,
+    read_performance_output,
+    start_corners,
+    unit_shape,
+)
 from obsynth.designs.qpv.design import NoiseBound, QPVDesign
 from obsynth.designs.qpv.members import ErrorSets, entering
-from obsynth.designs.qpv.polytopes import Shape, box, cross, hull
+from obsynth.designs.qpv.polytopes import Shape, box
 from obsynth.designs.qpv.prepare import Prepared, check_faults, prepare
 from obsynth.designs.qpv.proof import inverse_bounds, prove_design, region_factor
 from obsynth.designs.qpv.region import Ellipsoid
@@ -91,14 +99,14 @@ class Workspace:
                 'plant.disturbances(...), or use norm="h2"',
                 option="norm",
             )
-        unit = _unit_shape(options.polytope, region)
-        Cz = _performance_output(options.performance_output, prepared)
+        unit = unit_shape(options.polytope, region)
+        Cz = read_performance_output(options.performance_output, prepared)
         kappa = options.kappa
         if kappa is None:
             if options.E_x is None:
-                kappa = 1.0 / _reach(unit, region)
+                kappa = 1.0 / reach(unit, region)
             else:
-                kappa = _cover(unit, region) * (1.0 if options.eta is None else options.eta)
+                kappa = cover(unit, region) * (1.0 if options.eta is None else options.eta)
         work = cls(options, prepared, Cz, unit, kappa)
         work._check_polytope(region)
         return work
@@ -126,20 +134,20 @@ class Workspace:
     @property
     def largest_eta(self) -> float:
         """The largest eta with X inside the enlarged polytope, (21)."""
-        return min(self.kappa / _cover(self.unit, self.region), 1.0)
+        return min(self.kappa / cover(self.unit, self.region), 1.0)
 
     def _check_polytope(self, region: Ellipsoid) -> None:
-        reach, cover = _reach(self.unit, region), _cover(self.unit, region)
-        largest = 1.0 / reach
+        needed = cover(self.unit, region)
+        largest = 1.0 / reach(self.unit, region)
         eta = self.eta
-        smallest = 0.0 if eta is None else eta * cover
+        smallest = 0.0 if eta is None else eta * needed
         if self.kappa < smallest * (1.0 - _TOLERANCE):
             raise InfeasibleDesign(
                 f"kappa = {self.kappa:.6g} is too small for eta = {eta:g}: the region X does not "
                 "lie in the enlarged polytope of the state, (21)",
                 [
                     f"kappa has to be at least {smallest:.6g} at this eta",
-                    f"or eta at most {self.kappa / cover:.6g} at this kappa",
+                    f"or eta at most {self.kappa / needed:.6g} at this kappa",
                 ],
                 kappa=self.kappa,
                 smallest=smallest,
@@ -162,7 +170,7 @@ class Workspace:
         options, n = self.options, self.unit.dimension
         state_in, error_in = entering(self.prepared.form.vertices().N)
         if options.E_x is None or options.initial_error is None:
-            start = _half(base.vertices)
+            start = one_of_each_pair(base.vertices)
             places, error = tuple(range(n)), enlarged
         else:
             sides = np.asarray(options.E_x)
@@ -174,7 +182,7 @@ class Workspace:
                     option="E_x",
                 )
             places, error = tuple(range(sides.size)), box(sides)
-            start = _start_corners(np.asarray(options.initial_error), self.prepared.names)
+            start = start_corners(np.asarray(options.initial_error), self.prepared.names)
             missing = [self.prepared.names[k] for k in error_in if k not in places]
             if missing:
                 raise ObsynthError(
@@ -220,7 +228,7 @@ class Workspace:
                 option="alpha_q",
                 symbols=tuple(free),
             )
-        centre, w = _centre(model), model.box("w")
+        centre, w = noise_centre(model), model.box("w")
         radius = np.maximum(w[:, 1] - centre, centre - w[:, 0])
         moving = [k for k, s in enumerate(model.f) if s.rate]
         rates = [float(model.f[k].rate or 0.0) for k in moving]
@@ -292,7 +300,7 @@ class Workspace:
             noise=self.noise_bound(),
             polya=options.polya,
             Cz=self.Cz,
-            w_centre=_centre(form.model),
+            w_centre=noise_centre(form.model),
             P=P,
             L=unknowns.gains,
             gamma=unknowns.level if options.norm == "hinf" else np.inf,
@@ -390,75 +398,3 @@ class Workspace:
 
 def _solution(found: MarginSolution) -> dict[str, FloatArray]:
     return dict(found.values)
-
-
-def _centre(model: Any) -> FloatArray:
-    w = np.where(np.isfinite(model.box("w")).all(axis=1, keepdims=True), model.box("w"), 0.0)
-    return np.asarray(w.mean(axis=1))
-
-
-def _unit_shape(polytope: Any, region: Ellipsoid) -> Shape:
-    if isinstance(polytope, str):
-        return (box if polytope == "box" else cross)(region.half_widths)
-    if polytope.ndim != 2 or polytope.shape[1] != region.dimension:
-        raise ObsynthError(
-            f"polytope has shape {polytope.shape}; vertices of {region.dimension} coordinates are "
-            "rows, offsets from the centre c",
-            option="polytope",
-        )
-    return hull(polytope)
-
-
-def _reach(unit: Shape, region: Ellipsoid) -> float:
-    """Largest norm of a vertex in the region's metric: 1 on its boundary."""
-    vertices = unit.vertices
-    values = np.einsum("ki,ik->k", vertices, np.linalg.solve(region.Q, vertices.T))
-    return float(np.sqrt(values.max()))
-
-
-def _cover(unit: Shape, region: Ellipsoid) -> float:
-    """How much the polytope has to be enlarged to hold the region."""
-    normals = unit.normals.mid[:, 0, :]
-    return float(np.sqrt(np.einsum("ki,ij,kj->k", normals, region.Q, normals).max()))
-
-
-def _half(vertices: FloatArray) -> FloatArray:
-    """One of every pair v, -v, and those without a mirror image."""
-    seen: set[bytes] = set()
-    kept = []
-    for row in vertices + 0.0:
-        if (0.0 - row).tobytes() not in seen:
-            seen.add(row.tobytes())
-            kept.append(row)
-    return np.array(kept)
-
-
-def _start_corners(value: FloatArray, names: tuple[str, ...]) -> FloatArray:
-    n = len(names)
-    if value.ndim == 2 and value.shape[1] == n and len(value):
-        return _half(value)
-    if value.shape != (n,) or np.any(value < 0):
-        raise ObsynthError(
-            f"initial_error holds the half widths of {', '.join(names)}, or vertices in rows; "
-            f"given was {value.tolist()}",
-            option="initial_error",
-        )
-    ends = [(-side, side) if side > 0 else (0.0,) for side in value.tolist()]
-    return _half(np.array(list(itertools.product(*ends))))
-
-
-def _performance_output(value: Any, prepared: Prepared) -> FloatArray:
-    n, n_x = len(prepared.names), len(prepared.model.x)
-    count = prepared.vertices
-    if value is None:
-        value = np.eye(n)[n_x:] if n > n_x else np.eye(n)
-    Cz = np.atleast_2d(np.asarray(value, dtype=float))
-    if Cz.ndim == 2:
-        Cz = np.broadcast_to(Cz, (count, *Cz.shape)).copy()
-    if Cz.shape[0] != count or Cz.shape[2] != n:
-        raise ObsynthError(
-            f"performance_output has shape {np.shape(value)}; z = Cz e needs {n} columns "
-            f"({', '.join(prepared.names)}), and {count} matrices if it varies",
-            option="performance_output",
-        )
-    return Cz

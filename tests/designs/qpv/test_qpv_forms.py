@@ -130,6 +130,25 @@ def test_a_higher_order_is_never_worse():
     assert mu[1] <= mu[0] * (1 + 1e-3)
 
 
+def test_a_gain_cap_holds_and_costs():
+    plant = varying()
+    free, capped = small().design(plant), small(gain_cap=4.0).design(plant)
+
+    def largest(observer):
+        return max(np.linalg.norm(observer.gains[name], 2) for name in ("L1", "L2"))
+
+    assert largest(capped) <= 4.0 * (1 + 1e-6) < largest(free)
+    assert capped.performance["mu"] > free.performance["mu"]
+
+
+@pytest.mark.long
+def test_another_solver_agrees():
+    plant = varying()
+    problem = small().problem(plant).to_cvxpy()
+    problem.solve(solver="CLARABEL")
+    assert problem.value == pytest.approx(small().design(plant).performance["mu"], rel=1e-3)
+
+
 def test_actuator_faults_are_states_too():
     observer = small().design(varying(process=False))
     assert observer.certificate.valid and observer.model.names("f") == ("f",)

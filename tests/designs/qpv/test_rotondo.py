@@ -141,16 +141,6 @@ def test_eta_is_searched_together_with_the_gain_cap(method, designed, plant, mon
     assert max(sizes) <= 200.0 * (1 + 1e-6)
 
 
-@pytest.mark.long
-def test_a_gain_cap_holds_and_costs(method, designed, plant):
-    capped = method("box_tight", gain_cap=8.0).design(plant)
-    free = designed("box_tight")
-    largest = [np.linalg.norm(capped.gains[f"L{k}"], 2) for k in (1, 2, 3, 4)]
-    assert max(largest) <= 8.0 * (1 + 1e-6)
-    assert max(np.linalg.norm(free.gains[f"L{k}"], 2) for k in (1, 2, 3, 4)) > 8.0
-    assert capped.performance["h2_trace"] > free.performance["h2_trace"]
-
-
 @pytest.mark.parametrize(("name", "mu"), [("box_insc", 2.40004), ("cross1", 0.507478)])
 def test_the_printed_conditions_have_another_optimum_and_prove_nothing(name, mu, method, plant):
     with pytest.raises(ob.CertificateError, match="as printed") as refusal:
@@ -205,9 +195,19 @@ def test_the_example_start_is_certified_with_sets_apart(designed):
     assert e0 @ designed("box_tight").gains["P"] @ e0 > 1.0
 
 
+@pytest.mark.long
+def test_half_spaces_that_do_not_enter_are_no_exact_reduction(method, designed, plant):
+    """(20) for the errors of the faults, which Psi does not contain, costs nine per cent of mu."""
+    half = 0.2 * np.sqrt([0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
+    without = method("apart", E_x=half[:3] / 0.2, initial_error=half).design(plant)
+    ratio = without.performance["mu"] / designed("box_tight").performance["mu"]
+    assert ratio == pytest.approx(0.0046369 / 0.0050941, rel=2e-3)
+    assert without.certificate["error_set"].holds
+
+
 def test_sustained_noise_bounds_every_fault(designed):
     observer = designed("noise")
-    assert observer.performance["h2_trace"] == pytest.approx(0.22012, rel=1e-3)
+    assert observer.performance["bound_trace"] == pytest.approx(0.22012, rel=1e-3)
     assert observer.half_widths[5] == pytest.approx(0.469, abs=5e-4)
     assert np.isfinite(observer.half_widths).all()
     assert (observer.half_widths[:3] <= [2.0, 2.0, 3.0]).all()
@@ -319,14 +319,6 @@ def test_the_box_is_designed_and_proved_in_ten_seconds(method, plant):
     observer = method("box_tight").design(plant)
     assert time.process_time() - start < 10.0
     assert observer.certificate.valid
-
-
-@pytest.mark.long
-def test_another_solver_agrees(method, plant):
-    problem = method("cross_tight").problem(plant).to_cvxpy()
-    problem.solve(solver="CLARABEL")
-    assert problem.value == pytest.approx(0.0240057, rel=1e-3)
-    assert problem.size_metrics.num_scalar_variables > 90
 
 
 def test_analysis_recovers_the_guarantee_of_designed_gains(designed, method, plant):
