@@ -75,7 +75,8 @@ def _while_quick(search: Search, quick: Budget, budget: Budget) -> Outcome:
     while 0 < search.open.count <= _FEW and search.sweeps < budget.sweeps:
         before = search.excess()
         outcome = search.run(replace(budget, sweeps=search.sweeps + 2))
-        if search.excess() > _FAST * before:
+        after = search.excess()
+        if not np.isfinite(after) or after > _FAST * before:
             break
     return outcome
 

@@ -12,6 +12,7 @@ from obsynth.derive.intervals.branch import Budget, Search
 from obsynth.derive.intervals.problem import make_problem
 from obsynth.derive.intervals.rules import RULES, uncertain
 from obsynth.derive.intervals.schedule import Schedule
+from obsynth.derive.intervals.stages import staged
 
 QUICK = settings(max_examples=60, deadline=None, derandomize=True)
 X = ca.SX.sym("x", 3)
@@ -149,3 +150,12 @@ def test_a_search_goes_on_where_it_stopped():
     assert np.all(first.bound >= only.bound) and np.all(only.bound >= rest.bound)
     assert np.all(rest.bound >= at_once.attained) and np.all(at_once.bound >= rest.attained)
     assert np.allclose(rest.bound, at_once.bound, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("boxes", [1, 40, 300])
+def test_what_has_no_bound_does_not_keep_the_search_going(boxes):
+    f = ca.vertcat(1 / (X[0] - X[1]), ca.sin(5 * X[0]) * X[2])
+    problem = make_problem(f, X, [(0, 1), (0, 1), (-1, 2)])
+    found = staged(problem, 1e-9, Budget(boxes, 200))
+    assert found.bound[0] == found.bound[1] == np.inf
+    assert np.isfinite(found.bound[2:]).all()
