@@ -18,6 +18,7 @@ from obsynth.designs.set_adaptive.bank_step import (
     build_bank_step,
     first_memory,
 )
+from obsynth.designs.set_adaptive.bank_widths import steady_half_widths
 from obsynth.designs.set_adaptive.design import METHOD
 from obsynth.designs.set_adaptive.inputs import read_box, read_vector
 from obsynth.designs.storage import FORMAT, VERSION
@@ -105,7 +106,7 @@ def assemble_bank(design: BankDesign, level: Level) -> Observer:
         memory_layout=bank_layout(design),
         gains={"filters": design.filters},
         performance={"decay": float(design.filters.min())},
-        half_widths=None,
+        half_widths=steady_half_widths(design),
         certificate=certificate,
         guarantee=_guarantee(design),
         start=_make_start(design),

@@ -301,6 +301,24 @@ def test_through_simulate_and_the_fault_detector(bank, tanks):
     assert fine.outside == ()
 
 
+def test_steady_widths_are_predicted(tanks, closed_loop, bank):
+    # flows through zero have slopes without a bound, so nothing is predicted over a wide region
+    assert bank.half_widths is None
+    narrow = SetAdaptiveObserver(robust=True, Ts=0.01).design(tanks)
+    run = closed_loop(narrow)(bounded_noise(7, 40_000, [BOUND] * 2), x_range=START)
+    last = slice(30_000, None)
+    states = (run["x_upper"] - run["x_lower"])[last] / 2
+    faults = (run["f_upper"] - run["f_lower"])[last] / 2
+    found = np.concatenate([states.max(axis=0), faults.max(axis=0)])
+    assert (found <= narrow.half_widths).all()
+    # and not by much: faults within a quarter, the unmeasured level within a factor of two
+    assert (narrow.half_widths[3:] < 1.25 * found[3:]).all()
+    assert narrow.half_widths[2] < 2.0 * found[2]
+    smallest = ob.FaultDetector(narrow).smallest_detectable
+    assert smallest == pytest.approx(2.0 * narrow.half_widths[3:], rel=1e-6)
+    assert (smallest < [8e-5, 6e-5]).all()
+
+
 # -- monotone equations --------------------------------------------------------------
 
 
@@ -368,6 +386,7 @@ def test_parameters_disturbances_and_two_unmeasured_states():
         assert (theta <= np.array(f_high).ravel()).all()
         x = np.array(F(x, u, [], theta, [v, w], [1.05, 0.99], [])[0]).ravel()
     assert (np.array(f_high - f_low) < 0.4).all()
+    assert bank.half_widths is None
 
 
 @pytest.mark.parametrize(
