@@ -28,10 +28,10 @@ METHODS = {
 SECTORS = (sp.sin, sp.tanh, sp.atan)
 
 
-def random_plant(seed):
+def random_plant(seed, largest=4):
     """Return a stable plant whose nonlinearities have slopes in a sector."""
     rng = np.random.default_rng(seed)
-    n = int(rng.integers(2, 5))
+    n = int(rng.integers(2, largest + 1))
     m = int(rng.integers(1, n + 1))
     A = rng.standard_normal((n, n))
     A *= rng.uniform(0.2, 0.9) / np.abs(np.linalg.eigvals(A)).max()
@@ -59,11 +59,11 @@ def random_plant(seed):
     return plant
 
 
-def measure(seed, methods=METHODS, steps=4000, points=64):
+def measure(seed, methods=METHODS, steps=4000, points=64, largest=4):
     """Return (form, certified, found, limit), or (form, why there is no design)."""
     name = list(methods)[seed % len(methods)]
     try:
-        observer = methods[name].design(random_plant(seed))
+        observer = methods[name].design(random_plant(seed, largest))
     except (ob.StructureError, ob.InfeasibleDesign, SolverTrouble) as refusal:
         return name, type(refusal).__name__
     found = worst_case(observer, steps=steps, points=points)

@@ -18,7 +18,7 @@ from obsynth.designs.hinf.worst_case import _half_sine, _Loop, worst_case
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "hinf_worst_case.py"
 
 # The first 30 plants that have a design; the benchmark counts the refusals too.
-SEEDS = [seed for seed in range(37) if seed not in (1, 11, 12, 24, 29, 32, 34)]
+SEEDS = [seed for seed in range(37) if seed not in (2, 11, 12, 24, 29, 32, 34)]
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_a_level_that_is_claimed_too_low_is_exceeded(consistent):
 
 
 def test_random_plants_never_exceed_what_is_certified(bench):
-    measured = [bench["measure"](seed, steps=1000, points=24) for seed in SEEDS]
+    measured = [bench["measure"](seed, steps=1000, points=24, largest=3) for seed in SEEDS]
     designs = [row for row in measured if len(row) == 4]
     assert len(designs) == len(SEEDS) == 30
     share = np.array([found / certified for _, certified, found, _ in designs])
