@@ -18,7 +18,7 @@ from obsynth.designs.bounded_error.runtime import ellipsoid_first, ellipsoid_run
 from obsynth.designs.bounded_error.step import RuntimeBound, build_step, memory_layout
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.observer import Observer
-from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.designs.records import with_header
 
 __all__ = ["assemble", "prove", "to_record"]
 
@@ -27,12 +27,7 @@ FloatArray = NDArray[np.float64]
 
 def to_record(design: UioDesign) -> dict[str, Any]:
     """Return the JSON-able record of a design, with the header that `load` reads."""
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "method": METHOD,
-        **design.to_record(),
-    }
+    return with_header(METHOD, design.to_record())
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:

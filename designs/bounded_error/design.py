@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from obsynth.derive.affine_family import AffineFamily
 from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.error_system import ERRORS, ErrorKind, ModelData
-from obsynth.designs.errors import CertificateError
 from obsynth.designs.lmi import Enclosure
+from obsynth.designs.records import plain, read_array, read_family, reading
 from obsynth.symbolic import Plant
 
 __all__ = ["METHOD", "EllipsoidBound", "PeakData", "UioDesign"]
@@ -146,18 +146,7 @@ class UioDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        record: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value = value.tolist()
-            elif isinstance(value, Plant):
-                value = value.to_dict()
-            elif isinstance(value, AffineFamily | EllipsoidBound | PeakData):
-                value = _plain(value)
-            elif isinstance(value, Mapping):
-                value = dict(value)
-            record[field.name] = value
+        record: dict[str, Any] = plain(self)
         record["bound"]["kind"] = "peak" if isinstance(self.bound, PeakData) else "ellipsoid"
         return record
 
@@ -170,56 +159,22 @@ class UioDesign:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             plant = Plant.from_dict(record["plant"])
-            n = len(plant.x)
-            stored = record["family"]
-            family = AffineFamily(
-                constant=np.asarray(stored["constant"], dtype=float),
-                directions=np.asarray(stored["directions"], dtype=float).reshape(-1, n, n),
-                ranges=np.asarray(stored["ranges"], dtype=float).reshape(-1, 2),
-                radius=np.asarray(stored["radius"], dtype=float),
-                labels=tuple(stored["labels"]),
-                exact=bool(stored["exact"]),
-            )
-            arrays = {name: np.asarray(record[name], dtype=float) for name in _SHAPES}
-            bound = _read_bound(record["bound"])
-            design = cls(
+            sizes = _sizes(plant)
+            arrays = {
+                name: read_array(record[name], tuple(sizes[letter] for letter in letters), name)
+                for name, letters in _SHAPES.items()
+            }
+            n = sizes["n"]
+            return cls(
                 plant=plant,
                 linear=_read_linear(record["linear"]),
-                family=family,
-                bound=bound,
+                family=read_family(record["family"], (n, n)),
+                bound=_read_bound(record["bound"]),
                 options=dict(record["options"]),
                 **arrays,
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
-        design._check_shapes()
-        return design
-
-    def _check_shapes(self) -> None:
-        n, n_u, n_f = len(self.plant.x), len(self.plant.u), len(self.plant.f)
-        sizes = {
-            "n": n,
-            "n_u": n_u,
-            "n_f": n_f,
-            "m": len(self.plant.output),
-            "q": len(self.plant.d),
-            "n_w": len(self.plant.w),
-            "n_e": n + n_f,
-        }
-        for name, letters in _SHAPES.items():
-            value = getattr(self, name)
-            shape = tuple(sizes[letter] for letter in letters)
-            if value.size == 0 and 0 in shape:
-                object.__setattr__(self, name, np.zeros(shape))
-                continue
-            if value.shape != shape:
-                raise CertificateError(
-                    f"{name} has shape {value.shape} in the stored design; the plant needs {shape}"
-                )
-            if not np.all(np.isfinite(value)):
-                raise CertificateError(f"{name} of the stored design is not finite")
 
 
 _SHAPES: Mapping[str, tuple[str, ...]] = {
@@ -256,16 +211,17 @@ def _enclosed_vertices(family: AffineFamily) -> Enclosure:
     return total
 
 
-def _plain(value: Any) -> dict[str, Any]:
-    plain: dict[str, Any] = {}
-    for field in fields(value):
-        entry = getattr(value, field.name)
-        if isinstance(entry, np.ndarray):
-            entry = entry.tolist()
-        elif isinstance(entry, tuple):
-            entry = list(entry)
-        plain[field.name] = entry
-    return plain
+def _sizes(plant: Plant) -> dict[str, int]:
+    n, n_f = len(plant.x), len(plant.f)
+    return {
+        "n": n,
+        "n_u": len(plant.u),
+        "n_f": n_f,
+        "m": len(plant.output),
+        "q": len(plant.d),
+        "n_w": len(plant.w),
+        "n_e": n + n_f,
+    }
 
 
 def _read_linear(value: Any) -> LinearForm:

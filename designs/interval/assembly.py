@@ -15,14 +15,14 @@ from obsynth.designs.interval.proof import prove_design, prove_model
 from obsynth.designs.interval.start import make_start
 from obsynth.designs.interval.step import build_step, memory_layout
 from obsynth.designs.observer import Observer
-from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.designs.records import with_header
 
 __all__ = ["assemble", "prove", "to_record"]
 
 
 def to_record(design: IntervalDesign) -> dict[str, Any]:
     """Return the JSON-able record of a design, with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+    return with_header(METHOD, design.to_record())
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:

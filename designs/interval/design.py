@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.designs.errors import CertificateError
 from obsynth.designs.interval.decoupling import Decoupled, Transformation, decouple_exactly
 from obsynth.designs.interval.exact_arrays import (
     Exact,
@@ -37,6 +36,7 @@ from obsynth.designs.interval.widths import (
     part_width,
     row_widths,
 )
+from obsynth.designs.records import read_array, reading
 
 __all__ = ["METHOD", "Bound", "IntervalDesign"]
 
@@ -220,12 +220,12 @@ class IntervalDesign:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             model = IntervalModel.from_record(record["model"])
             n, q, m = model.n, model.q, len(model.C)
             shapes = {"H": (n, n), "N": (m, m), **dict.fromkeys(("R0", "K0", "R1", "K1"), (q, q))}
             stored = record["transformation"]
-            chosen = Transformation(**{k: _array(stored[k], s, k) for k, s in shapes.items()})
+            chosen = Transformation(**{k: read_array(stored[k], s, k) for k, s in shapes.items()})
             if record["bound"] not in ("vertex", "paper"):
                 raise ValueError(f"bound {record['bound']!r}")
             if record["precision"] not in UNIT:
@@ -233,26 +233,13 @@ class IntervalDesign:
             return cls(
                 model,
                 chosen,
-                _array(record["nominal"], (n, n), "nominal"),
-                _array(record["P"], (n - q, n - q), "P"),
-                _array(record["L"], (n - q, m - q), "L"),
+                read_array(record["nominal"], (n, n), "nominal"),
+                read_array(record["P"], (n - q, n - q), "P"),
+                read_array(record["L"], (n - q, m - q), "L"),
                 record["bound"],
                 bool(record["contraction"]),
                 record["precision"],
-                _array(record["error"], (n - q,), "error"),
-                _array(record["width"], (n - q,), "width"),
+                read_array(record["error"], (n - q,), "error"),
+                read_array(record["width"], (n - q,), "width"),
                 dict(record["options"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, CertificateError):
-                raise
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
-
-
-def _array(values: Any, shape: tuple[int, ...], name: str) -> FloatArray:
-    array = np.asarray(values, dtype=float)
-    if array.size == 0 and 0 in shape:
-        array = np.zeros(shape)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{name} has shape {array.shape}, not {shape}, or is not finite")
-    return array

@@ -13,7 +13,6 @@ import numpy as np
 from obsynth.derive.affine_family import AffineFamily
 from obsynth.derive.errors import StructureError
 from obsynth.derive.quasi_lpv import QuasiLPV
-from obsynth.designs.errors import CertificateError
 from obsynth.designs.interval.exact_arrays import (
     Exact,
     FloatArray,
@@ -21,6 +20,7 @@ from obsynth.designs.interval.exact_arrays import (
     from_text,
     to_text,
 )
+from obsynth.designs.records import plain, read_family, reading
 from obsynth.symbolic import Plant, Role
 
 __all__ = ["LARGEST_SIGNAL", "IntervalModel", "columns_of", "model_of"]
@@ -100,14 +100,7 @@ class IntervalModel:
         """Return the model as JSON-able data."""
         return {
             "plant": self.plant.to_dict(),
-            "family": {
-                "constant": self.family.constant.tolist(),
-                "directions": self.family.directions.tolist(),
-                "ranges": self.family.ranges.tolist(),
-                "radius": self.family.radius.tolist(),
-                "labels": list(self.family.labels),
-                "exact": self.family.exact,
-            },
+            "family": plain(self.family),
             **{name: to_text(getattr(self, name)) for name in ("F", "C", "W1", "W2")},
             "scheduled": list(self.scheduled),
         }
@@ -121,22 +114,10 @@ class IntervalModel:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             plant = Plant.from_dict(record["plant"])
             n, m, n_w = len(plant.x), len(plant.output), len(plant.w)
-            shape = (n, n + len(plant.u) + 1)
-            stored = record["family"]
-            family = AffineFamily(
-                constant=np.asarray(stored["constant"], dtype=float).reshape(shape),
-                directions=np.asarray(stored["directions"], dtype=float).reshape(-1, *shape),
-                ranges=np.asarray(stored["ranges"], dtype=float).reshape(-1, 2),
-                radius=np.asarray(stored["radius"], dtype=float).reshape(shape),
-                labels=tuple(stored["labels"]),
-                exact=bool(stored["exact"]),
-            )
-            numbers = (family.constant, family.directions, family.ranges, family.radius)
-            if not all(np.isfinite(a).all() for a in numbers) or np.any(family.radius < 0):
-                raise ValueError("the family is not finite")
+            family = read_family(record["family"], (n, n + len(plant.u) + 1))
             if np.any(family.ranges[:, 0] > family.ranges[:, 1]):
                 raise ValueError("a range has lower above upper")
             return cls(
@@ -148,8 +129,6 @@ class IntervalModel:
                 from_text(record["W2"], (m, n_w)),
                 tuple(record["scheduled"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"the stored model cannot be read: {error!r}") from error
 
 
 def model_of(form: QuasiLPV) -> IntervalModel:

@@ -384,7 +384,7 @@ def test_a_record_that_cannot_be_read(change, designs, tmp_path):
     change(record)
     path = tmp_path / "broken.json"
     path.write_text(json.dumps(record))
-    with pytest.raises(ob.CertificateError, match="cannot be read"):
+    with pytest.raises(ob.CertificateError, match="stored design"):
         ob.load(path)
 
 
