@@ -7,7 +7,7 @@ shares nothing with the conversion it checks.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import mpmath  # type: ignore[import-untyped]
+import mpmath
 import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
