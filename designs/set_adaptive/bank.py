@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.derive import StructureError
+from obsynth.derive import Split, StructureError
 from obsynth.derive.exact import round_number, substitute
 from obsynth.derive.quasi_lpv.measured import Reading, readings
 from obsynth.designs.errors import CertificateError
@@ -136,7 +136,7 @@ class BankDesign:
         return design
 
 
-def design_bank(model: Plant, method: SetAdaptiveObserver) -> BankDesign:
+def design_bank(model: Plant | Split, method: SetAdaptiveObserver) -> BankDesign:
     """Read a plant for the bank, or refuse it by name.
 
     Raises
@@ -175,18 +175,14 @@ def read_bank(
     fault_rows, gain = _faults(plant, rhs, outputs)
     monotone = Monotone(with_ranges(plant, region))
     signs = {
-        kind: np.array(
-            [monotone.signs(i, unknown_signals(plant, kind)) for i in range(len(plant.x))],
-            dtype=np.int64,
-        ).reshape(len(plant.x), -1)
+        kind: np.zeros((len(plant.x), len(getattr(plant, kind))), dtype=np.int64)
         for kind in UNKNOWN
     }
-    for kind in UNKNOWN:
-        wide = np.zeros((len(plant.x), len(getattr(plant, kind))), dtype=np.int64)
-        signals = getattr(plant, kind)
-        kept = [signals.index(s) for s in unknown_signals(plant, kind)]
-        wide[:, kept] = signs[kind]
-        signs[kind] = wide
+    for kind, table in signs.items():
+        unknown = unknown_signals(plant, kind)
+        columns = [getattr(plant, kind).index(signal) for signal in unknown]
+        for i in range(len(plant.x)):
+            table[i, columns] = monotone.signs(i, unknown)
     for i in range(len(plant.x)):
         if i not in outputs and signs["x"][i, i] > 0:
             raise StructureError(

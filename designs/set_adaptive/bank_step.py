@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.set_adaptive.bank import UNKNOWN, BankDesign
+from obsynth.designs.set_adaptive.inputs import known_signals
 from obsynth.designs.set_adaptive.rounding import outward
 from obsynth.designs.stepping import all_finite, finite_or, make_step, select, status_word
 
@@ -134,9 +135,9 @@ def build_bank_step(design: BankDesign) -> ca.Function:
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
-    y_finite, u_finite = all_finite(y), all_finite(u)
-    nominal = [0.0 if s.nominal is None else float(s.nominal) for s in plant.u]
-    corners = Corners(design, finite_or(u, nominal), theta)
+    y_finite = all_finite(y)
+    u_used, theta_used, u_finite, covered = known_signals(plant, u, theta)
+    corners = Corners(design, u_used, theta_used)
 
     initialised = memory[layout["initialised"]] > 0.5
     region = ca.DM(outward(design.region, design.precision))
@@ -145,7 +146,7 @@ def build_bank_step(design: BankDesign) -> ca.Function:
     for k, i in enumerate(design.outputs.tolist()):
         inside = ca.logic_and(inside, told[1][k] >= design.region[i, 0])
         inside = ca.logic_and(inside, told[0][k] <= design.region[i, 1])
-    inside = ca.if_else(y_finite, inside, 1)
+    inside = ca.logic_and(ca.if_else(y_finite, inside, 1), covered)
     again = ca.logic_and(memory[layout["left"]] > 0.5, inside)
     memory_now = select(again, ca.SX(first_memory(design, design.region)), memory)
     parts = {name: memory_now[part] for name, part in layout.items()}

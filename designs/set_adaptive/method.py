@@ -14,6 +14,7 @@ from obsynth.designs.set_adaptive.rounding import PRECISIONS
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
+    from obsynth.derive import Split
     from obsynth.designs.lmi import Problem
     from obsynth.designs.observer import Observer
     from obsynth.designs.set_adaptive.design import SetDesign
@@ -157,13 +158,14 @@ class SetAdaptiveObserver:
             box = tuple((float(low), float(high)) for low, high in self.region)
             object.__setattr__(self, "region", box)
 
-    def design(self, model: Plant) -> Observer:
+    def design(self, model: Plant | Split) -> Observer:
         """Design, prove and return the observer.
 
         Parameters
         ----------
-        model : Plant
-            Continuous, or a discretisation of a continuous plant.
+        model : Plant or Split
+            Continuous, or a discretisation of a continuous plant; of a split only the plant is
+            used.
 
         Returns
         -------
@@ -198,12 +200,12 @@ class SetAdaptiveObserver:
             gain = design_gain(A_lower_box, A_upper, structure.C, self.gain_cap, names)
         return assemble(self._complete(structure, gain, A_lower, A_upper, A_lower_box), structure)
 
-    def analyse(self, model: Plant, gains: Mapping[str, ArrayLike]) -> Observer:
+    def analyse(self, model: Plant | Split, gains: Mapping[str, ArrayLike]) -> Observer:
         """Return what a given gain guarantees, proved.
 
         Parameters
         ----------
-        model : Plant
+        model : Plant or Split
         gains : mapping
             ``L`` of shape (n, m).
 
@@ -237,7 +239,7 @@ class SetAdaptiveObserver:
             )
         return assemble(self._complete(structure, gain, A_lower, A_upper, A_lower_box), structure)
 
-    def problem(self, model: Plant, alpha: float) -> Problem:
+    def problem(self, model: Plant | Split, alpha: float) -> Problem:
         """Return the gain program for a decay alpha, see `Problem.to_cvxpy`.
 
         The decay is possible where the optimal ``margin`` is not negative; L = P^-1 W.

@@ -23,6 +23,7 @@ from obsynth.designs.set_adaptive.equations import (
     memory_layout,
     residuals,
 )
+from obsynth.designs.set_adaptive.inputs import known_signals
 from obsynth.designs.set_adaptive.ode import exact_arguments
 from obsynth.designs.set_adaptive.rounding import SHOWN, outward
 from obsynth.designs.set_adaptive.transition import apply, uniformisation
@@ -66,9 +67,8 @@ def build_step(design: SetDesign) -> ca.Function:
     scheduled = any(s.name in plant.names("rho") for s in design.bounds.exact)
     x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
 
-    y_finite, u_finite = all_finite(y), all_finite(u)
-    nominal = [0.0 if s.nominal is None else float(s.nominal) for s in plant.u]
-    u_used = finite_or(u, nominal)
+    y_finite = all_finite(y)
+    u_used, theta_used, u_finite, inside = known_signals(plant, u, theta)
     row_of = [int(np.flatnonzero(row)[0]) for row in design.C]
     scale = np.array([design.C[k, i] for k, i in enumerate(row_of)])
     y_box = scale[:, None] * x_box[row_of]
@@ -76,7 +76,6 @@ def build_step(design: SetDesign) -> ca.Function:
     v = ca.DM(design.noise) + SHOWN[design.precision] * (ca.DM(design.noise) + ca.fabs(shown))
     low = select(y_finite, shown - v, ca.SX(y_box[:, 0]))
     high = select(y_finite, shown + v, ca.SX(y_box[:, 1]))
-    inside = ca.SX(1)
     for k in range(m):
         inside = ca.logic_and(inside, high[k] >= y_box[k, 0])
         inside = ca.logic_and(inside, low[k] <= y_box[k, 1])
@@ -107,7 +106,7 @@ def build_step(design: SetDesign) -> ca.Function:
         design, memory, ca.logic_and(inside, consistent), (low, high), row_of
     )
 
-    lower, upper = _frozen(design, low, high, u_used, exact_arguments(design, u_used, theta))
+    lower, upper = _frozen(design, low, high, u_used, exact_arguments(design, u_used, theta_used))
     changed = {"theta_m": theta_m, "theta_M": theta_M}
     changed |= _predict(design, memory, lower, upper, smallest, largest)
     changed |= _monitor(design, memory, r, y_finite)

@@ -8,7 +8,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.derive import QuasiLPV, StructureError, quasi_lpv
+from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.exact import round_number, substitute
 from obsynth.derive.matrix_entries import matrix_entries
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
@@ -72,12 +72,12 @@ class Structure:
         return wide
 
 
-def read_structure(plant: Plant, noise: bool = True) -> Structure:
+def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
     """Read a continuous plant, or refuse it by name.
 
     Parameters
     ----------
-    plant : Plant
+    plant : Plant or Split
         Continuous, with nonnegative states.
     noise : bool
         Whether the declared disturbances are included in the bounds.
@@ -141,14 +141,16 @@ def read_structure(plant: Plant, noise: bool = True) -> Structure:
     return Structure(form, bounds, C, G, W1, W2, box.mean(axis=1), _radius(box), rate, input_rate)
 
 
-def continuous(plant: Plant) -> Plant:
-    """Return the continuous plant behind a discretisation made by the package.
+def continuous(plant: Plant | Split) -> Plant:
+    """Return the continuous plant of a split or behind a discretisation made by the package.
 
     Raises
     ------
     StructureError
         The plant is discrete from the start.
     """
+    if isinstance(plant, Split):
+        plant = plant.model
     if plant.Ts is None:
         return plant
     behind = plant.continuous

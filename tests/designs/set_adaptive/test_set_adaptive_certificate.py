@@ -297,6 +297,35 @@ def test_the_bank_has_no_indicators_of_the_paper(bank):
         bank.memory0([0.5, 0.1, 0.3], x_range=[(0.91, 0.92), (0.1, 0.2), (0.2, 0.3)])
 
 
+def test_a_split_is_its_plant(tanks, cooperative):
+    method = SetAdaptiveObserver(gain_cap=0.5, Ts=0.05)
+    again = method.design(ob.split(tanks))
+    assert again.gains["L"].tolist() == cooperative.gains["L"].tolist()
+
+
+def bilinear():
+    plant = ob.Plant("bilinear")
+    (a,) = plant.states("a", range=(0.2, 2))
+    (u,) = plant.inputs("u", range=(0.5, 2), nominal=1)
+    (f,) = plant.faults("f", range=(-0.2, 0.2))
+    plant.dynamics([1 - u * a + f])
+    plant.outputs([a])
+    return plant
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_an_input_beyond_its_range_where_that_matters(robust, cooperative):
+    observer = SetAdaptiveObserver(robust=robust, Ts=0.05).design(bilinear())
+    memory = observer.memory0([1.0])
+    assert int(observer.step(memory, [1.5], [1.0])[7]) == 0
+    beyond = observer.step(memory, [2.5], [1.0])
+    assert int(beyond[7]) == 4 + 16
+    assert int(observer.step(beyond[0], [1.0], [1.0])[7]) == 0
+    # the tanks are affine in their flows, so that any flow is covered
+    tank_memory = cooperative.memory0([0.5, 0.1, 0.3])
+    assert int(cooperative.step(tank_memory, [0.1, 0.0], [0.5, 0.1])[7]) == 0
+
+
 def test_a_scheduled_plant_reads_theta():
     plant = ob.Plant("valve")
     a, b = plant.states("a b", range=(0, 2))
@@ -317,4 +346,8 @@ def test_a_scheduled_plant_reads_theta():
         assert (np.array(low).ravel() <= x + 1e-9).all()
         assert (x <= np.array(high).ravel() + 1e-9).all()
         assert float(f_low) <= 0.1 <= float(f_high)
+        assert int(observer.step(memory, [1.0], x[:1], [1.6])[7]) == 4 + 16
+        blind = observer.step(memory, [1.0], x[:1], [np.nan])
+        assert int(blind[7]) == 2
+        assert np.isfinite(np.array(blind[0])).all()
         x = np.array(F(x, [1.0], [], [0.1], [], [], rho)[0]).ravel()
