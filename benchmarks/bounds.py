@@ -322,9 +322,9 @@ _WHY = """\
   Of the peer's two rules the textbook one, to halve the widest side, needs some 400 000 boxes here;
   to cut where the mean-value form loses most is what makes the peer fast: {best[boxes]} boxes of
   {each:.0f} microseconds, as no entry depends on more than four variables and every operator is one
-  call of compiled code. We take {mine[boxes]} boxes and {mine[seconds]:.3f} s, a quarter of it for
+  call of compiled code. We take {mine[boxes]} boxes and {mine[seconds]:.3f} s, a third of it for
   differentiation, translation and scheduling in Python, which every call does anew. Twenty times
-  would leave less for everything than that quarter."""
+  would leave less for everything than that third."""
 
 
 def main() -> None:
