@@ -141,8 +141,9 @@ def check_detectability(parts: Split, L: FloatArray, G: FloatArray, vertices: Fl
             if abs(mode) < 1.0 - RANK:
                 continue
             pencil = np.vstack([mode * np.eye(n) - matrix, parts.C.astype(complex)])
-            size = np.linalg.norm(pencil, axis=0)
-            size = np.where(size > 0.0, size, 1.0)
+            # Columns are measured before they cancel, so that what rounding leaves stays small.
+            terms = np.vstack([abs(mode) * np.eye(n) + np.abs(matrix), np.abs(parts.C)])
+            size = np.linalg.norm(terms, axis=0)
             _, values, vectors = np.linalg.svd(pencil / size)
             if values[-1] > RANK:
                 continue

@@ -77,6 +77,20 @@ def test_an_observable_plant_with_an_unstable_zero():
     assert ob.HinfUIO().design(stable).certificate.valid
 
 
+def test_an_integrator_that_the_fault_hides():
+    """A pendulum whose torque fails and whose speed alone is measured: the angle is lost."""
+    made = ob.Plant("pendulum")
+    phi, omega = made.states("phi omega", range=[(-3, 3), (-10, 10)])
+    (v,) = made.inputs("v", range=(-5, 5), nominal=0)
+    made.actuator_faults("f", of=[v])
+    w = made.disturbances("w1:3")
+    made.dynamics([omega + w[0], 10 * v - 9.81 * sp.sin(phi) - omega / 5 + w[1]])
+    made.outputs([omega])
+    error = refused(ob.StructureError, "Measure phi", made.discretise("euler", 0.01))
+    assert error.mode == pytest.approx(1.0, abs=1e-12)
+    assert error.symbols == ("phi",)
+
+
 def test_a_disturbance_in_an_output():
     made = ob.Plant("noisy")
     (x,), (f,) = made.states("x", range=(-1, 1)), made.faults("f")
