@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.lmi import Knob, MarginSolution, largest_margin, search_line, smallest_changes
+from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.lmi import Knob, largest_margin, search_line, smallest_changes
 from obsynth.designs.qpv.choices import (
     cover,
     noise_centre,
@@ -25,6 +25,7 @@ from obsynth.designs.qpv.members import ErrorSets, entering
 from obsynth.designs.qpv.polytopes import Shape, box
 from obsynth.designs.qpv.prepare import Prepared, check_faults, prepare
 from obsynth.designs.qpv.proof import inverse_bounds, prove_design, region_factor
+from obsynth.designs.qpv.refusals import Accepted, printed_refusal
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.schedule import choose_sample_time, fastest_mode
 from obsynth.designs.qpv.synthesis import (
@@ -53,13 +54,6 @@ _BELOW_ONE = 1.0 - 2.0**-48
 # Shares of the largest eta that are tried before the golden sections.
 _SHARES = (0.2, 0.4, 0.6, 0.8)
 _REFINE = 3
-
-
-@dataclass(frozen=True)
-class _Proved:
-    """What the LMI layer asks of a proof."""
-
-    all_proved: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +247,7 @@ class Workspace:
         setting = self.setting(eta)
         check_faults(setting.data, setting.sets, self.prepared.names)
         if setting.printed:
-            raise self._printed_refusal(setting, gains)
+            raise printed_refusal(setting, gains)
         try:
             unknowns, _ = solve(setting, lambda found: self._prove(found, setting, eta), gains)
         except InfeasibleDesign as error:
@@ -271,11 +265,11 @@ class Workspace:
         )
         return found.value
 
-    def _prove(self, unknowns: Unknowns, setting: Setting, eta: float) -> _Proved:
+    def _prove(self, unknowns: Unknowns, setting: Setting, eta: float) -> Accepted:
         if np.linalg.eigvalsh(unknowns.P)[0] <= 0 or not np.isfinite(unknowns.gains).all():
-            return _Proved(False)
+            return Accepted(False)
         claims = prove_design(self._complete(unknowns, setting, eta, check=False))
-        return _Proved(all(claim.holds for claim in claims))
+        return Accepted(all(claim.holds for claim in claims))
 
     def _complete(
         self, unknowns: Unknowns, setting: Setting, eta: float, check: bool = True
@@ -351,50 +345,25 @@ class Workspace:
             knobs.append(
                 Knob("alpha", self.options.alpha, 0.0, lambda a: margin(self.setting(eta, a)))
             )
-        if not self.apart and eta < 0.999 * self.largest_eta:
-            knobs.append(
-                Knob("eta", eta, self.largest_eta, lambda value: margin(self.setting(value)))
-            )
+        if not self.apart:
+            ends = [0.4 * eta, *([self.largest_eta] if eta < 0.999 * self.largest_eta else [])]
+            knobs += [Knob("eta", eta, end, lambda v: margin(self.setting(v))) for end in ends]
+        knobs.append(
+            Knob("size of the region", 1.0, 0.5, lambda v: margin(self._shrunk(v).setting(eta)))
+        )
         what = "these gains" if gains is not None else "any gains"
         facts = {name: getattr(error, name, None) for name in ("margin", "binding", "bound")}
         return InfeasibleDesign(
             f"no P shows the required decay and performance over the polytopes for {what} "
             f"(eta = {eta:g}, kappa = {self.kappa:g}, alpha = {self.options.alpha:g})",
-            [*getattr(error, "details", ()), *smallest_changes(knobs, rtol=0.05)],
+            [*getattr(error, "details", ()), *smallest_changes(knobs, rtol=0.1)],
             eta=eta,
             kappa=self.kappa,
             **facts,
         )
 
-    def _printed_refusal(self, setting: Setting, gains: FloatArray | None) -> CertificateError:
-        """Solve the printed inequalities and show what their solution does not satisfy."""
-        unknowns, found = solve(setting, lambda _: _Proved(True), gains)
-        P, sets = unknowns.P, setting.sets
-        start = float(np.einsum("ki,ij,kj->k", sets.start, P, sets.start).max())
-        normals = sets.normals.mid[:, 0, :]
-        inside = float(np.einsum("ki,ik->k", normals, np.linalg.solve(P, normals.T)).max())
-        letter = "mu" if self.options.norm == "h2" else "gamma"
-        return CertificateError(
-            f"the conditions (19) and (20) as printed have the solution {letter} = "
-            f"{found.objective:.6g}, and it does not prove what they are for",
-            [
-                "they describe e'P^-1 e <= 1, while V = e'P e decays",
-                f"E = {{V <= 1}} has to lie in the polytope of the error: the largest "
-                f"eta^2 a_k'P^-1 a_k is {inside:.6g}, above 1"
-                if inside > 1
-                else f"E lies in the polytope of the error ({inside:.6g})",
-                f"P_e has to lie in E: the largest V at its corners is {start:.6g}"
-                + (", above 1" if start > 1 else ""),
-                'form="corrected" states both for V',
-            ],
-            mu=found.objective,
-            P=P,
-            gains={f"L{k}": gain for k, gain in enumerate(unknowns.gains, 1)},
-            error_set=inside,
-            start=start,
-            solution=_solution(found),
-        )
-
-
-def _solution(found: MarginSolution) -> dict[str, FloatArray]:
-    return dict(found.values)
+    def _shrunk(self, share: float) -> Workspace:
+        """Return the same problem for a smaller region, its polytopes with it."""
+        region = Ellipsoid(share**2 * self.region.Q, self.region.c)
+        unit = self.unit.scaled(share)
+        return replace(self, options=replace(self.options, region=region), unit=unit)

@@ -9,7 +9,8 @@ QUESTION = """
     "largest": largest,
     "rms": rms,
     "first": sorted(set(runs["FS0"].status.astype(int).tolist())),
-    "fault": float(bounded.half_widths[5]),
+    "fault": float(for_f3.half_widths[5]),
+    "faults": list(map(float, bounded.half_widths[3:])),
     "coverage": min(run.coverage.values()),
     "valid": certificate.valid,
     "vectors": project.comparison.vectors if project.comparison else None,
@@ -38,12 +39,13 @@ def test_noise(executed):
     rms = executed.answers["rms"]
     assert rms["SC2"] / rms["SC1"] == pytest.approx(0.406, abs=0.03)
     assert executed.answers["fault"] == pytest.approx(0.469, abs=1e-3)
+    assert executed.answers["faults"] == pytest.approx([0.367, 0.255, 0.527], abs=2e-3)
     assert executed.answers["coverage"] == 1.0
 
 
 def test_the_rest_of_the_way(executed):
     assert executed.answers["valid"] is True
     assert executed.answers["vectors"] in (None, 2000)
-    assert executed.pictures == [1, 3, 1, 1, 1]
+    assert executed.pictures == [1, 3, 1, 1, 2]
     for words in ("is not seen everywhere", "as printed", "Runge-Kutta", "512 pairs"):
         assert words in executed.page, words
