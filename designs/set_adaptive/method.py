@@ -48,7 +48,8 @@ class SetAdaptiveObserver:
         Adaptation gains, one for all faults or one each.
     gain_cap : float
         Largest entry of L that the design may use; the best decay is a supremum that only an
-        unbounded gain reaches.
+        unbounded gain reaches. The gain multiplies the noise: a small cap often gives narrower
+        intervals.
     Ts : float, optional
         Sample time of `Observer.step`, which is exact for any; by default at most a 32nd of the
         longest step for which explicit Euler would keep the order and at most the time constant

@@ -78,6 +78,20 @@ def test_false_alarms_of_the_printed_indicators(noisy, numbers, Gamma):
             assert flags[part, i].sum() == pytest.approx(wanted, rel=0.01, abs=2), (name, i)
 
 
+@pytest.mark.parametrize("Gamma", [0.003, 0.01, 0.03])
+def test_delays_of_the_printed_indicators(noisy, numbers, Gamma):
+    expected = numbers["noise_splitmix64"][f"{Gamma:g}"]["d"]
+    indicators = noisy[Gamma][2]
+    for i, start in enumerate((20_000, 30_000)):
+        for name, flags in (("d", indicators.d), ("s", indicators.s)):
+            late = np.flatnonzero(flags[start:, i])
+            wanted = expected[f"{name}{i + 1}"]
+            if wanted is None:
+                assert not late.size
+            else:
+                assert late[0] * 0.01 == pytest.approx(wanted, abs=0.02)
+
+
 def test_the_printed_state_indicator_is_useless_with_noise(noisy):
     # two thirds of all fault-free samples
     assert noisy[0.01][2].s[2_000:20_000, 0].mean() > 0.6
