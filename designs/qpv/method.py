@@ -58,6 +58,8 @@ class QPVObserver:
     E_x : array_like of shape (n_x,) or (n,), optional
         Half widths of the box that the error may use, of the states or of states and faults: takes
         P_e apart from P_x, for which the polytope with kappa / eta as small as possible is taken.
+        Half-spaces for errors that Psi does not contain are then left out, which the coupled
+        conditions state as the paper does; that alone makes mu smaller.
     alpha_q : float, optional
         Rate of quadratic boundedness V' < alpha_q (1 - V) for the declared bounds of disturbances
         and fault rates: bounds every state and fault at all times. It takes the place of V' < w'w.

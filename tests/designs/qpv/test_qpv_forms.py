@@ -202,3 +202,69 @@ def test_without_disturbances_the_sets_shrink():
         rest = 5.0 / (1.0 - fault)
         truth = rest + (truth - rest) * np.exp((fault - 1.0) * observer.model.Ts)
     assert widths[-1] < 0.9 * widths[0]
+
+
+def squared():
+    made = ob.Plant("squared scheduling")
+    (x,) = made.states("x", range=(4, 6), nominal=5)
+    (u,) = made.inputs("u", range=(0, 20), nominal=5)
+    (theta,) = made.scheduling("theta", range=(-1, 2))
+    (f,) = made.process_faults("f", range=(-0.1, 0.1))
+    made.sensor_faults("s", of="y2", range=(-0.5, 0.5))
+    (w,) = made.disturbances("w", range=(0.1, 0.3))
+    made.dynamics([-(1 + theta**2) * x + f * x + u + w])
+    made.outputs([x + w, x + u / 10 + 2], names=["y1", "y2"])
+    return made
+
+
+def test_nonlinear_scheduling_sensor_faults_feedthrough_and_noise_off_centre():
+    """theta^2 schedules; y2 has feedthrough, an offset and a fault; w is not centred at zero."""
+    plant = squared()
+    region = ob.Ellipsoid([0.25, 0.01, 0.2], [5.0, 0.0, 0.0])
+    observer = ob.QPVObserver(
+        region=region,
+        E_x=[1.5],
+        initial_error=[0.5, 0.1, 0.5],
+        alpha_q=0.4,
+        gain_cap=40.0,
+    ).design(plant)
+    assert observer.certificate.check().valid
+    memory = observer.memory0([5.0])
+    u, y = np.array([5.0]), np.array([5.2, 7.5])
+
+    def rate(theta, shift=0.0):
+        return np.array(observer.ode(memory, u, y + np.array([shift, 0.0]), [theta])).ravel()[:3]
+
+    for theta in (-1.0, 0.5, 2.0):
+        share = theta**2 / 4.0
+        L = (1 - share) * observer.gains["L1"] + share * observer.gains["L2"]
+        np.testing.assert_allclose(rate(theta, 1.0) - rate(theta), L[:, 0], atol=1e-12)
+        # the innovation vanishes for the middle of w: what is left is the plant at w = .2
+        np.testing.assert_allclose(rate(theta), [-(1 + theta**2) * 5 + 5 + 0.2, 0, 0], atol=1e-12)
+    rng = np.random.default_rng(2)
+    steps = round(8.0 / observer.model.Ts)
+    Ts = observer.model.Ts
+    scenario = ob.Scenario(
+        "all at once",
+        steps,
+        x0=[5.2],
+        guess=[5.0],
+        inputs=lambda k: [5.0 * (1 + (0.5 + 1.5 * np.sin(k * Ts)) ** 2) - 0.2 + np.cos(5 * k * Ts)],
+        scheduling=lambda k: [0.5 + 1.5 * np.sin(k * Ts)],
+        faults=np.tile([0.05, -0.3], (steps + 1, 1)),
+        disturbances=rng.uniform(0.1, 0.3, (steps + 1, 1)),
+        x_range=[(4.8, 5.2)],
+        f_range=[(-0.1, 0.1), (-0.5, 0.5)],
+    )
+    run = ob.simulate(observer.model, observer, scenario, engine="joint")
+    assert min(run.coverage.values()) == 1.0
+    late = np.abs(run.f - run.fhat)[-len(run.t) // 4 :].max(axis=0)
+    assert (late < 0.5 * observer.half_widths[1:]).all()
+
+
+def test_a_form_serves_as_well_as_a_plant():
+    plant = varying()
+    given = small().design(ob.qpv(plant, augment="all"))
+    assert given.performance["mu"] == pytest.approx(small().design(plant).performance["mu"])
+    with pytest.raises(ob.StructureError, match="all 1 faults"):
+        small().design(ob.qpv(varying(process=False)))
