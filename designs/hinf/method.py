@@ -13,15 +13,14 @@ from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.hinf.design import Bound, HinfDesign
 from obsynth.designs.hinf.given import read_diagonal, read_gains, unstable_gains
 from obsynth.designs.hinf.prepare import Prepared, prepare
+from obsynth.designs.hinf.problems import Structure, state_problem
 from obsynth.designs.hinf.proof import prove_level
 from obsynth.designs.hinf.sector import MULTIPLIERS, Multipliers
 from obsynth.designs.hinf.synthesis import (
     Found,
-    Structure,
     find_filter,
     find_level,
     find_storage,
-    state_problem,
     unstable_vertex,
 )
 from obsynth.designs.hinf.system import Filter
@@ -336,8 +335,12 @@ class HinfUIO:
             more = find_storage(design.data, self._structure, level, gains, self.decay)
         except (InfeasibleDesign, SolverTrouble):
             return None
-        design = replace(design, bound=self._bound(level, more))
-        return design if all(claim.holds for claim in prove_level(design)) else None
+        # The nearer to the first one, the smaller is P.
+        for share in np.geomspace(1e-8, 1.0, 17):
+            design = replace(design, bound=self._bound(level, found.mixed(more, float(share))))
+            if all(claim.holds for claim in prove_level(design)):
+                return design
+        return None
 
     def _bound(self, level: float, found: Found) -> Bound:
         decays = self.decay is not None

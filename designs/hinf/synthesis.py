@@ -1,68 +1,41 @@
-"""Gains and attenuation levels by linear matrix inequalities: solved here, proved elsewhere.
-
-All problems are stated in the units of `find_units`, where the entries are about one, so that
-caps and margins mean the same for every plant.
-"""
+"""Gains and attenuation levels by linear matrix inequalities: solved here, proved elsewhere."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.hinf.lmis import (
-    Loop,
-    PrintedLoop,
-    decay_block,
-    dissipation_block,
-    loop_of_filter,
-    printed_block,
-    printed_bound,
-)
+from obsynth.designs.hinf.lmis import decay_block
+from obsynth.designs.hinf.problems import CAP, Structure, multipliers, open_loop, state_problem
 from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units
 from obsynth.designs.lmi import (
     Margin,
     Problem,
     Solution,
     bisect_feasible,
-    full,
     largest_margin,
-    scalar,
     solve_lazily,
     solve_with_retries,
     symmetric,
-    trace,
 )
 
-__all__ = [
-    "Found",
-    "Structure",
-    "find_filter",
-    "find_level",
-    "find_storage",
-    "state_problem",
-    "unstable_vertex",
-]
+__all__ = ["Found", "find_filter", "find_level", "find_storage", "unstable_vertex"]
 
 FloatArray = NDArray[np.float64]
 Values = Mapping[str, FloatArray]
-Structure = Literal["standard", "general", "printed"]
 
-# Several infima need one direction of P to go to infinity; within these limits, in units in
-# which the rest of P is about one, the least mu is off by less than 1e-6 of itself.
-CAP = 1e4
 # Asked for in turn where the solver does not cope with the one before.
 CAPS = (CAP, 1e3, 1e2)
-FLOOR = 1e-3
 # A level of zero, where w can be kept out of f - fhat altogether, is not worth endless gains: this
 # much of the typical size of f - fhat is asked for at least.
 LEAST_LEVEL = 1e-3
-# Room between the solver's answer and the boundary: large against the solver's tolerance.
-MARGIN = 1e-7
+# Violation left at vertices that are not stated when gains are sought: the storage function is
+# looked for again, with these gains, if the proof does not go through.
+LEFT = 1e-6
 # Largest relative duality gap of an answer that the solver does not call solved.
 GAP = 1e-6
 
@@ -84,95 +57,13 @@ class Found:
     tau_decay: FloatArray
     printed: FloatArray
 
-
-def state_problem(
-    data: FilterData,
-    structure: Structure,
-    mu: float | None,
-    decay: float | None = None,
-    gains: Filter | None = None,
-    margin: float = MARGIN,
-    cap: float = CAP,
-) -> Problem:
-    """State the design LMI, or with `gains` the analysis LMI.
-
-    Parameters
-    ----------
-    data : FilterData
-        In any units.
-    structure : {"standard", "general", "printed"}
-    mu : float or None
-        A level to keep at the smallest trace of P; None minimises ``mu2``, its square.
-    decay : float, optional
-        Also ask for V+ < decay V where w = 0.
-    gains : Filter, optional
-    margin : float
-        Smallest eigenvalue asked of the inequalities.
-    cap : float
-        Largest eigenvalue of P.
-
-    Returns
-    -------
-    Problem
-        With ``P``, ``N`` = P K, ``tau1``, ...; ``N2`` = P Z Pi, ``Y`` = Y Pi in coordinates of
-        the rows of `FilterData.null` and ``D`` for the general filter; ``Q``, ``alpha`` and
-        ``beta`` for (45).
-    """
-    name = "least mu" if mu is None else f"mu = {mu:.6g}"
-    problem = Problem(f"H-infinity {'analysis' if gains else 'design'}, {name}")
-    P = symmetric("P", len(data.A))
-    mu2: Any = scalar("mu2") if mu is None else mu**2
-    if structure == "printed":
-        _state_printed(problem, data, P, mu2, gains, margin)
-        loop = None
-    else:
-        loop = _loop(data, structure, P, gains)
-        tau = _multipliers("tau", data)
-        block = dissipation_block(loop, mu2, data.sector, tau)
-        problem.add_lmi("dissipation", block, ">>", margin=margin)
-    if decay is not None and loop is not None:
-        block = decay_block(loop, decay, data.sector, _multipliers("decay.tau", data))
-        problem.add_lmi("decay", block, ">>", margin=margin)
-    problem.add_lmi("P.cap", cap * np.eye(len(data.A)) - P, ">>", strict=False)
-    problem.add_lmi("P.floor", P - FLOOR * np.eye(len(data.A)), ">>", strict=False)
-    problem.minimise(trace(P) if mu is not None else mu2)
-    return problem
-
-
-def _multipliers(name: str, data: FilterData) -> list[Any]:
-    groups = 0 if data.sector is None else data.sector.groups
-    return [scalar(f"{name}{k + 1}") for k in range(groups)]
-
-
-def _loop(data: FilterData, structure: Structure, P: Any, gains: Filter | None) -> Loop:
-    if gains is not None:
-        return loop_of_filter(data, gains, P)
-    n, m = len(data.A), len(data.C)
-    standard = data.standard_filter(np.zeros((n, m)))
-    PG: Any = P @ data.G
-    HC: Any = standard.H @ data.C
-    DC: Any = np.zeros((data.n_f, n))
-    if structure == "general":
-        r = len(data.null)
-        DC = full("D", data.n_f, m) @ data.C
-        if r:
-            PG = PG - full("N2", n, r) @ (data.null @ data.C)
-            HC = full("Y", data.n_f, r) @ (data.null @ data.C) + HC
-    return Loop(P, PG, full("N", n, m) @ data.C, HC, DC, data.dynamics(), data.W)
-
-
-def _state_printed(
-    problem: Problem, data: FilterData, P: Any, mu2: Any, gains: Filter | None, margin: float
-) -> None:
-    n, m = len(data.A), len(data.C)
-    loop = PrintedLoop.of(data, gains)
-    N = full("N", n, m) if gains is None else P @ gains.K
-    Q, alpha, beta = symmetric("Q", n), scalar("alpha"), scalar("beta")
-    problem.add_lmi("(45)", printed_block(loop, P, N, Q, alpha, beta, mu2), ">>", margin=margin)
-    problem.add_lmi("(37)", printed_bound(loop, P, alpha), ">>", margin=margin)
-    problem.add_lmi("Q", Q, ">>", margin=margin)
-    # Not implied by (45): with beta < 0 the Lipschitz condition (35) would count backwards.
-    problem.add_lmi("beta", beta, ">>", margin=margin)
+    def mixed(self, other: Found, share: float) -> Found:
+        """Return a convex combination: for given gains all inequalities are linear in these."""
+        pairs = (
+            (getattr(self, name), getattr(other, name))
+            for name in ("P", "tau", "tau_decay", "printed")
+        )
+        return Found(*((1.0 - share) * a + share * b for a, b in pairs))
 
 
 def solve_reliably(problem: Problem) -> Solution:
@@ -183,7 +74,7 @@ def solve_reliably(problem: Problem) -> Solution:
             stated, second_solvers=(), good_enough=lambda found: 0 <= found.gap < GAP
         )
 
-    return solve_lazily(problem, floor=-0.5 * MARGIN, solve=solve).solution
+    return solve_lazily(problem, floor=-LEFT, solve=solve).solution
 
 
 def find_level(
@@ -371,9 +262,9 @@ def _explained(
     if structure != "printed":
         problem = Problem("decay of V")
         P = symmetric("P", len(scaled.A))
-        loop = _loop(scaled, structure, P, gains)
+        loop = open_loop(scaled, structure, P, gains)
         keep = 1.0 if decay is None else decay
-        block = decay_block(loop, keep, scaled.sector, _multipliers("tau", scaled))
+        block = decay_block(loop, keep, scaled.sector, multipliers("tau", scaled))
         problem.add_lmi("decay", block, ">>")
         try:
             margin = largest_margin(problem, caps={"size": P << np.eye(len(scaled.A))})

@@ -171,3 +171,12 @@ def test_more_vertices_than_can_be_used():
     observer = ob.HinfUIO(multipliers="per_entry").design(plant)
     assert observer.certificate.valid
     assert len(observer.record["bound"]["tau"]) == 14
+
+
+def test_a_set_with_many_vertices_is_found_lazily_and_proved_whole():
+    """256 vertices: a few are stated, all are proved, and P stays far below its cap."""
+    observer = ob.HinfUIO(method="polytopic").design(many(9))
+    assert "all 256 vertices" in observer.certificate["lmi"].statement
+    assert observer.certificate.valid
+    assert observer.performance["least_mu"] == pytest.approx(1.005006, abs=3e-5)
+    assert observer.performance["trace_P"] < 1e7
