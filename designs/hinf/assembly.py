@@ -158,7 +158,9 @@ def _guarantee(design: HinfDesign) -> Guarantee:
         "rounding errors of the step, about 1e-16 of the signals, are not counted as disturbances",
     ]
     if residual > 0.0:
-        assumptions.append(f"so is what rounding leaves of the faults, {residual:.1e} of them")
+        assumptions.append(
+            f"nor is what rounding of F and H leaves of the faults, {residual:.1e} of their size"
+        )
     return Guarantee(tuple(claims), tuple(assumptions))
 
 

@@ -105,6 +105,8 @@ def hold_points(
         matrix = (_batch(slopes, *parts(z)) - selector) * weight
         usable = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
         z, matrix, residual = z[usable], matrix[usable], residual[usable]
+        if not len(z):
+            break
         step = weight * (np.linalg.pinv(matrix) @ residual[:, :, None])[:, :, 0]
         z = z - step
         z[:, : n + n_u] = np.clip(z[:, : n + n_u], boxes[:, 0], boxes[:, 1])

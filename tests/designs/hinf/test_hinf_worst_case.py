@@ -180,6 +180,17 @@ def test_a_search_that_leaves_the_domain_counts_for_nothing(bench):
     assert loop.run(inner, 1e6 * small, limit[0], frequency[0]).gain == 0.0
 
 
+def test_a_plant_that_cannot_be_held_anywhere():
+    """x grows by at least one at every step, whatever f does."""
+    plant = ob.Plant("clock")
+    x, (f,), w = plant.states("x1:3", range=(-5, 5)), plant.faults("f"), plant.disturbances("w1:3")
+    plant.dynamics([x[0] + 3 + w[0], x[1] / 2 + f + w[1]], Ts=1)
+    plant.outputs(list(x))
+    observer = ob.HinfUIO(method="general").design(plant)
+    with pytest.raises(ob.ObsynthError, match="cannot be held"):
+        worst_case(observer)
+
+
 def test_other_methods_are_refused():
     with pytest.raises(ob.ObsynthError, match="bounded_error_uio"):
         worst_case(SimpleNamespace(method="bounded_error_uio"))
