@@ -15,7 +15,7 @@ from obsynth.designs.errors import CertificateError
 from obsynth.designs.storage import FORMAT, VERSION
 from obsynth.symbolic import Plant
 
-__all__ = ["plain", "read_array", "read_family", "reading", "with_header"]
+__all__ = ["plain", "plain_fields", "read_array", "read_family", "reading", "with_header"]
 
 FloatArray = NDArray[np.float64]
 
@@ -34,6 +34,8 @@ def with_header(method: str, record: Mapping[str, Any]) -> dict[str, Any]:
 def plain(value: Any) -> Any:
     """Return a value as JSON-able data: plants, dataclasses, arrays and containers of them.
 
+    What has a ``to_record`` of its own is asked for it.
+
     Examples
     --------
     >>> plain({"K": np.eye(2), "names": ("a", "b")})
@@ -43,13 +45,20 @@ def plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Plant):
         return value.to_dict()
+    if hasattr(value, "to_record"):
+        return value.to_record()
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return plain_fields(value)
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple | list):
         return [plain(entry) for entry in value]
     return value
+
+
+def plain_fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON-able data, for a ``to_record`` of its own."""
+    return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from obsynth.derive.affine_family import AffineFamily
 from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.error_system import ERRORS, ErrorKind, ModelData
 from obsynth.designs.lmi import Enclosure
-from obsynth.designs.records import plain, read_array, read_family, reading
+from obsynth.designs.records import plain_fields, read_array, read_family, reading
 from obsynth.symbolic import Plant
 
 __all__ = ["METHOD", "EllipsoidBound", "PeakData", "UioDesign"]
@@ -146,7 +146,7 @@ class UioDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        record: dict[str, Any] = plain(self)
+        record = plain_fields(self)
         record["bound"]["kind"] = "peak" if isinstance(self.bound, PeakData) else "ellipsoid"
         return record
 

@@ -16,7 +16,7 @@ from obsynth.designs.qpv.prepare import derive_form
 from obsynth.designs.qpv.proof import prove_design
 from obsynth.designs.qpv.schedule import FASTEST, fastest_mode, measured_schedule
 from obsynth.designs.qpv.step import build_ode, build_step, make_start, memory_layout
-from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.designs.records import with_header
 from obsynth.symbolic.text import write_text
 
 __all__ = ["assemble", "prove", "to_record"]
@@ -26,7 +26,7 @@ FloatArray = NDArray[np.float64]
 
 def to_record(design: QPVDesign) -> dict[str, Any]:
     """Return the JSON-able record of a design, with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+    return with_header(METHOD, design.to_record())
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:

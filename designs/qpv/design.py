@@ -18,6 +18,7 @@ from obsynth.designs.qpv.members import ErrorSets, entering
 from obsynth.designs.qpv.polytopes import Shape
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.synthesis import Norm
+from obsynth.designs.records import plain_fields, read_family, reading
 from obsynth.symbolic import Plant
 
 __all__ = ["METHOD", "NoiseBound", "QPVDesign"]
@@ -157,46 +158,8 @@ class QPVDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        family, noise = self.family, self.noise
-        return {
-            "plant": self.plant.to_dict(),
-            "form_of_N": self.form_of_N,
-            "family": {
-                "constant": family.constant.tolist(),
-                "directions": family.directions.tolist(),
-                "ranges": family.ranges.tolist(),
-                "radius": family.radius.tolist(),
-                "labels": list(family.labels),
-                "exact": family.exact,
-            },
-            "scheduling": list(self.scheduling),
-            "region": {"Q": self.region.Q.tolist(), "c": self.region.c.tolist()},
-            "state": self.state.to_record(),
-            "error": self.error.to_record(),
-            "error_coordinates": list(self.error_coordinates),
-            "start": self.start.tolist(),
-            "norm": self.norm,
-            "alpha": self.alpha,
-            "noise": None
-            if noise is None
-            else {
-                "rate": noise.rate,
-                "weights": noise.weights.tolist(),
-                "radius": noise.radius.tolist(),
-                "faults": list(noise.faults),
-            },
-            "polya": self.polya,
-            "Cz": self.Cz.tolist(),
-            "w_centre": self.w_centre.tolist(),
-            "P": self.P.tolist(),
-            "L": self.L.tolist(),
-            "gamma": self.gamma if np.isfinite(self.gamma) else None,
-            "rows": self.rows.tolist(),
-            "inverse_diagonal": self.inverse_diagonal.tolist(),
-            "reset": self.reset,
-            "Ts": self.Ts,
-            "options": dict(self.options),
-        }
+        gamma = self.gamma if np.isfinite(self.gamma) else None
+        return {**plain_fields(self), "gamma": gamma}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> QPVDesign:
@@ -207,25 +170,16 @@ class QPVDesign:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             design = cls._read(record)
-        except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
         design._check()
         return design
 
     @classmethod
     def _read(cls, record: Mapping[str, Any]) -> QPVDesign:
-        stored, noise = record["family"], record["noise"]
-        constant = np.asarray(stored["constant"], dtype=float)
-        family = AffineFamily(
-            constant=constant,
-            directions=np.asarray(stored["directions"], dtype=float).reshape(-1, *constant.shape),
-            ranges=np.asarray(stored["ranges"], dtype=float).reshape(-1, 2),
-            radius=np.asarray(stored["radius"], dtype=float),
-            labels=tuple(map(str, stored["labels"])),
-            exact=bool(stored["exact"]),
-        )
+        noise = record["noise"]
+        shape = np.asarray(record["family"]["constant"], dtype=float).shape
+        family = read_family(record["family"], (shape[0], shape[1]))
         norm: Norm = "hinf" if record["norm"] == "hinf" else "h2"
         if record["norm"] != norm or record["form_of_N"] not in ("upper", "symmetric"):
             raise ValueError(f"norm {record['norm']!r}, form_of_N {record['form_of_N']!r}")

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.observer import Observer
+from obsynth.designs.records import with_header
 from obsynth.designs.set_adaptive.bank import BankDesign
 from obsynth.designs.set_adaptive.bank_assembly import assemble_bank, prove_bank
 from obsynth.designs.set_adaptive.design import METHOD, SetDesign
@@ -20,7 +21,6 @@ from obsynth.designs.set_adaptive.proof import prove_design
 from obsynth.designs.set_adaptive.step import build_step, initial_memory
 from obsynth.designs.set_adaptive.structure import Structure
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
-from obsynth.designs.storage import FORMAT, VERSION
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]
@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 
 def to_record(design: SetDesign) -> dict[str, Any]:
     """Return the JSON-able record of a design, with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+    return with_header(METHOD, design.to_record())
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:

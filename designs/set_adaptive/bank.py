@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from obsynth.derive import Split, StructureError
 from obsynth.derive.exact import round_number, substitute
 from obsynth.derive.quasi_lpv.measured import Reading, readings
 from obsynth.designs.errors import CertificateError
+from obsynth.designs.records import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.monotone import Monotone, exact_slope, with_ranges
 from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.designs.set_adaptive.structure import continuous
@@ -86,19 +87,7 @@ class BankDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        record: dict[str, Any] = {"kind": "bank"}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value = value.tolist()
-            elif isinstance(value, Plant):
-                value = value.to_dict()
-            elif field.name == "signs":
-                value = {kind: signs.tolist() for kind, signs in value.items()}
-            elif isinstance(value, Mapping):
-                value = dict(value)
-            record[field.name] = value
-        return record
+        return {"kind": "bank", **plain_fields(self)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> BankDesign:
@@ -109,28 +98,26 @@ class BankDesign:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             plant = Plant.from_dict(record["plant"])
             n, m, q = len(plant.x), len(plant.output), len(plant.f)
             shapes = {kind: (n, len(getattr(plant, kind))) for kind in UNKNOWN}
             design = cls(
                 plant=plant,
                 Ts=float(record["Ts"]),
-                region=_floats(record, "region", (n, 2)),
+                region=read_array(record["region"], (n, 2), "region"),
                 outputs=_integers(record["outputs"], (m,), n),
-                scale=_floats(record, "scale", (m,)),
-                noise=_floats(record, "noise", (m, 2)),
+                scale=read_array(record["scale"], (m,), "scale"),
+                noise=read_array(record["noise"], (m, 2), "noise"),
                 fault_rows=_integers(record["fault_rows"], (q,), n),
-                gain=_floats(record, "gain", (q,)),
+                gain=read_array(record["gain"], (q,), "gain"),
                 signs={
                     kind: np.asarray(record["signs"][kind], dtype=np.int64).reshape(shapes[kind])
                     for kind in UNKNOWN
                 },
-                filters=_floats(record, "filters", (len(record["filters"]),)),
+                filters=read_array(record["filters"], (len(record["filters"]),), "filters"),
                 options=dict(record["options"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
         if design.precision not in PRECISIONS:
             raise CertificateError(f"precision = {design.precision!r} in the stored design")
         return design
@@ -169,7 +156,7 @@ def read_bank(
     """Derive everything that the bank rests on from the equations."""
     _check_plant(plant)
     shown = _readings(plant)
-    outputs = [plant.names("x").index(str(reading.state)) for reading in shown]
+    outputs = [plant.names("x").index(str(item.state)) for item in shown]
     values = plant.constant_values
     rhs = [sp.expand(substitute(row, values)) for row in plant.rhs]
     fault_rows, gain = _faults(plant, rhs, outputs)
@@ -236,7 +223,7 @@ def _check_plant(plant: Plant) -> None:
 
 def _readings(plant: Plant) -> tuple[Reading, ...]:
     shown = readings(plant)
-    told = {reading.output for reading in shown}
+    told = {item.output for item in shown}
     for name in plant.output_names:
         if name not in told:
             raise StructureError(
@@ -245,11 +232,11 @@ def _readings(plant: Plant) -> tuple[Reading, ...]:
                 symbol=name,
                 condition="outputs show states",
             )
-    for reading in shown:
-        if not reading.scale.is_positive:
+    for item in shown:
+        if not item.scale.is_positive:
             raise StructureError(
-                f"the output {reading.output} falls with {reading.state}; measure its negative",
-                symbol=reading.output,
+                f"the output {item.output} falls with {item.state}; measure its negative",
+                symbol=item.output,
                 condition="outputs rise with their states",
             )
     return shown
@@ -299,21 +286,14 @@ def _faults(plant: Plant, rhs: list[sp.Expr], outputs: list[int]) -> tuple[list[
     return rows, gains
 
 
-def _noise(plant: Plant, reading: Reading) -> tuple[float, float]:
+def _noise(plant: Plant, item: Reading) -> tuple[float, float]:
     bounds = {s.symbol: s for s in plant.w}
     low, high = 0.0, 0.0
-    for symbol, factor in reading.noise:
+    for symbol, factor in item.noise:
         ends = sorted(float(factor) * end for end in (bounds[symbol].lower, bounds[symbol].upper))
         low, high = low + ends[0], high + ends[1]
     ulp = 2.0**-50
     return low - ulp * abs(low), high + ulp * abs(high)
-
-
-def _floats(record: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> FloatArray:
-    value = np.asarray(record[name], dtype=float)
-    if value.shape != shape or not np.all(np.isfinite(value)):
-        raise ValueError(f"{name} has shape {value.shape} or is not finite; {shape} is needed")
-    return value
 
 
 def _integers(value: Any, shape: tuple[int, ...], end: int) -> Integers:

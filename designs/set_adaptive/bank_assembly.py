@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.derive import StructureError
 from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.observer import Observer
+from obsynth.designs.records import with_header
 from obsynth.designs.set_adaptive.bank import UNKNOWN, BankDesign, read_bank
 from obsynth.designs.set_adaptive.bank_step import (
     bank_layout,
@@ -21,7 +22,6 @@ from obsynth.designs.set_adaptive.bank_step import (
 from obsynth.designs.set_adaptive.bank_widths import steady_half_widths
 from obsynth.designs.set_adaptive.design import METHOD
 from obsynth.designs.set_adaptive.inputs import read_box, read_vector
-from obsynth.designs.storage import FORMAT, VERSION
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble_bank", "bank_record", "prove_bank"]
@@ -31,7 +31,7 @@ FloatArray = NDArray[np.float64]
 
 def bank_record(design: BankDesign) -> dict[str, Any]:
     """Return the JSON-able record of a bank, with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+    return with_header(METHOD, design.to_record())
 
 
 def prove_bank(design: BankDesign, level: Level) -> tuple[Claim, ...]:

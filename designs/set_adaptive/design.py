@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.errors import CertificateError
+from obsynth.designs.records import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.bounds import EndBounds
 from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.symbolic import Plant
@@ -107,19 +108,7 @@ class SetDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        record: dict[str, Any] = {"kind": "adaptive"}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value = value.tolist()
-            elif isinstance(value, Plant):
-                value = value.to_dict()
-            elif isinstance(value, EndBounds):
-                value = value.to_record()
-            elif isinstance(value, Mapping):
-                value = dict(value)
-            record[field.name] = value
-        return record
+        return {"kind": "adaptive", **plain_fields(self)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> SetDesign:
@@ -130,9 +119,20 @@ class SetDesign:
         CertificateError
             If an entry is missing, not finite, or of the wrong shape.
         """
-        try:
+        with reading():
             plant = Plant.from_dict(record["plant"])
-            arrays = {name: np.asarray(record[name], dtype=float) for name in _SHAPES}
+            sizes = {
+                "n": len(plant.x),
+                "m": len(plant.output),
+                "u": len(plant.u),
+                "q": len(plant.f),
+                "w": len(plant.w),
+                "2": 2,
+            }
+            arrays = {
+                name: read_array(record[name], tuple(sizes[letter] for letter in letters), name)
+                for name, letters in _SHAPES.items()
+            }
             design = cls(
                 plant=plant,
                 Ts=float(record["Ts"]),
@@ -143,32 +143,12 @@ class SetDesign:
                 options=dict(record["options"]),
                 **arrays,
             )
-        except (KeyError, TypeError, ValueError, StopIteration) as error:
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
         design._check()
         return design
 
     def _check(self) -> None:
-        sizes = {
-            "n": len(self.plant.x),
-            "m": len(self.plant.output),
-            "u": len(self.plant.u),
-            "q": len(self.plant.f),
-            "w": len(self.plant.w),
-            "2": 2,
-        }
-        for name, letters in _SHAPES.items():
-            value = getattr(self, name)
-            shape = tuple(sizes[letter] for letter in letters)
-            if value.size == 0 and 0 in shape:
-                object.__setattr__(self, name, np.zeros(shape))
-            elif value.shape != shape or not np.all(np.isfinite(value)):
-                raise CertificateError(
-                    f"{name} of the stored design has shape {value.shape} or is not finite; the "
-                    f"plant needs {shape}"
-                )
-        outputs = self.fault_outputs
-        if outputs.shape != (sizes["q"],) or np.any(outputs < 0) or np.any(outputs >= sizes["m"]):
+        outputs, m = self.fault_outputs, len(self.plant.output)
+        if outputs.shape != (len(self.plant.f),) or np.any((outputs < 0) | (outputs >= m)):
             raise CertificateError("fault_outputs of the stored design name no outputs")
         if self.precision not in PRECISIONS:
             raise CertificateError(f"precision = {self.precision!r} in the stored design")

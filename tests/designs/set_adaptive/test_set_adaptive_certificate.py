@@ -141,7 +141,7 @@ def test_other_damage_is_refused(cooperative, bank):
     for change in ({"L": [[1.0]]}, {"fault_outputs": [0, 7]}, {"options": {"law": "none"}}):
         with pytest.raises(ob.CertificateError):
             assemble({**cooperative.record, **change})
-    with pytest.raises(ob.CertificateError, match="cannot be read"):
+    with pytest.raises(ob.CertificateError, match="scale has shape"):
         assemble({**bank.record, "scale": [1.0]})
     with pytest.raises(ob.CertificateError, match="cannot be read"):
         assemble({**bank.record, "outputs": [0, 9]})
