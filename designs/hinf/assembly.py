@@ -15,7 +15,7 @@ from obsynth.designs.hinf.design import METHOD, HinfDesign
 from obsynth.designs.hinf.proof import decoupling_residual, prove_decoupling, prove_level
 from obsynth.designs.hinf.step import build_step, memory_layout
 from obsynth.designs.observer import Observer
-from obsynth.designs.storage import FORMAT, VERSION
+from obsynth.designs.records import with_header
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]
@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 
 def to_record(design: HinfDesign) -> dict[str, Any]:
     """Return the JSON-able record of a design, with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": METHOD, **design.to_record()}
+    return with_header(METHOD, design.to_record())
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:

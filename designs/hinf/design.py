@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -16,6 +16,7 @@ from obsynth.derive.split import LinearForm
 from obsynth.designs.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.hinf.system import Filter, FilterData, Sector
 from obsynth.designs.lmi import Enclosure
+from obsynth.designs.records import plain_fields, read_array, read_family, reading
 from obsynth.symbolic import Plant
 
 __all__ = ["METHOD", "Bound", "HinfDesign", "enclosed_vertices"]
@@ -126,11 +127,7 @@ class HinfDesign:
 
     def to_record(self) -> dict[str, Any]:
         """Return the design as JSON-able data."""
-        record: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            record[field.name] = value.to_dict() if isinstance(value, Plant) else _plain(value)
-        return record
+        return plain_fields(self)
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> HinfDesign:
@@ -139,57 +136,19 @@ class HinfDesign:
         Raises
         ------
         CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
+            If an entry is missing, not finite, of the wrong shape or out of range.
         """
-        try:
+        with reading():
             design = _read(record)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise CertificateError(f"the stored design cannot be read: {error!r}") from error
-        design.check_shapes()
-        return design
-
-    def check_shapes(self) -> None:
-        """Refuse what does not fit the plant or is not finite."""
-        plant = self.plant
-        n, m, n_f = len(plant.x), len(plant.output_names), len(plant.f)
-        s, n_w = n_f + len(plant.d), len(plant.w)
-        groups = 0 if self.sector is None else self.sector.groups
-        k = 0 if self.sector is None else len(self.sector.group)
-        printed = self.bound.printed.size
-        table: list[tuple[str, FloatArray, tuple[int, ...]]] = [
-            ("A", self.A, (n, n)),
-            ("B", self.B, (n, len(plant.u))),
-            ("C", self.C, (m, n)),
-            ("L", self.L, (n, s)),
-            ("W", self.W, (n, n_w)),
-            ("A_radius", self.A_radius, (n, n)),
-            ("W_radius", self.W_radius, (n, n_w)),
-            ("K", self.gains.K, (n, m)),
-            ("F", self.gains.F, (n, m)),
-            ("H", self.gains.H, (n_f, m)),
-            ("D", self.gains.D, (n_f, m)),
-            ("P", self.bound.P, (n, n)),
-            ("printed", self.bound.printed, (2 + n * n if printed else 0,)),
-            ("tau", self.bound.tau, (0 if printed else groups,)),
-        ]
-        if self.bound.tau_decay is not None:
-            table.append(("tau_decay", self.bound.tau_decay, (groups,)))
-        if self.sector is not None:
-            table += [("E", self.sector.E, (n, k)), ("R", self.sector.R, (groups, n))]
-        for name, value, shape in table:
-            if value.shape != shape and value.size + np.prod(shape) > 0:
-                raise CertificateError(
-                    f"{name} has shape {value.shape} in the stored design; {shape} is needed"
-                )
-            if not np.all(np.isfinite(value)):
-                raise CertificateError(f"{name} of the stored design is not finite")
-        radii = [self.A_radius, self.W_radius, self.family.radius]
-        if min(float(r.min(initial=0.0)) for r in radii) < 0.0 or not self.bound.mu > 0.0:
+        radii = (design.A_radius, design.W_radius)
+        if min(float(r.min(initial=0.0)) for r in radii) < 0.0 or not design.bound.mu > 0.0:
             raise CertificateError("a radius is negative, or mu is not positive")
-        if not np.array_equal(self.bound.P, self.bound.P.T):
+        if not np.array_equal(design.bound.P, design.bound.P.T):
             raise CertificateError("P of the stored design is not symmetric")
-        if self.sector is not None and not set(self.sector.group) <= set(range(groups)):
+        sector = design.sector
+        if sector is not None and not set(sector.group) <= set(range(sector.groups)):
             raise CertificateError("a group of the sector has no multiplier")
+        return design
 
 
 def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
@@ -229,64 +188,46 @@ def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
     )
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, AffineFamily | Sector | Filter | Bound):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return value
-
-
-def _array(value: Any) -> FloatArray:
-    return np.asarray(value, dtype=float)
-
-
 def _read(record: Mapping[str, Any]) -> HinfDesign:
     plant = Plant.from_dict(record["plant"])
     n, m, n_f = len(plant.x), len(plant.output_names), len(plant.f)
-    linear = next(form for form in LINEAR_FORMS if form == record["linear"])
-    stored = record["family"]
-    family = AffineFamily(
-        constant=_array(stored["constant"]),
-        directions=_array(stored["directions"]).reshape(-1, n, n),
-        ranges=_array(stored["ranges"]).reshape(-1, 2),
-        radius=_array(stored["radius"]),
-        labels=tuple(stored["labels"]),
-        exact=bool(stored["exact"]),
-    )
+    n_u, n_w, s = len(plant.u), len(plant.w), len(plant.f) + len(plant.d)
+    gains, bound, stored = record["gains"], record["bound"], record["sector"]
     sector = None
-    if record["sector"] is not None:
-        group = tuple(int(g) for g in record["sector"]["group"])
-        sector = Sector(_array(record["sector"]["E"]), group, _array(record["sector"]["R"]))
-    bound = record["bound"]
+    if stored is not None:
+        group = tuple(int(g) for g in stored["group"])
+        R = read_array(stored["R"], (len(stored["R"]), n), "R")
+        sector = Sector(read_array(stored["E"], (n, len(group)), "E"), group, R)
+    groups = 0 if sector is None else sector.groups
+    numbers = 2 + n * n if bound["printed"] else 0
     extra = bound["tau_decay"]
     return HinfDesign(
         plant=plant,
-        linear=linear,
-        x_at=_array(record["x_at"]),
-        u_at=_array(record["u_at"]),
-        B=_array(record["B"]).reshape(n, len(plant.u)),
-        L=_array(record["L"]).reshape(n, n_f + len(plant.d)),
-        family=family,
+        linear=next(form for form in LINEAR_FORMS if form == record["linear"]),
+        x_at=read_array(record["x_at"], (n,), "x_at"),
+        u_at=read_array(record["u_at"], (n_u,), "u_at"),
+        A=read_array(record["A"], (n, n), "A"),
+        B=read_array(record["B"], (n, n_u), "B"),
+        C=read_array(record["C"], (m, n), "C"),
+        L=read_array(record["L"], (n, s), "L"),
+        W=read_array(record["W"], (n, n_w), "W"),
+        A_radius=read_array(record["A_radius"], (n, n), "A_radius"),
+        W_radius=read_array(record["W_radius"], (n, n_w), "W_radius"),
+        family=read_family(record["family"], (n, n)),
         sector=sector,
         gains=Filter(
-            K=_array(record["gains"]["K"]).reshape(n, m),
-            F=_array(record["gains"]["F"]).reshape(n, m),
-            H=_array(record["gains"]["H"]).reshape(n_f, m),
-            D=_array(record["gains"]["D"]).reshape(n_f, m),
+            K=read_array(gains["K"], (n, m), "K"),
+            F=read_array(gains["F"], (n, m), "F"),
+            H=read_array(gains["H"], (n_f, m), "H"),
+            D=read_array(gains["D"], (n_f, m), "D"),
         ),
         bound=Bound(
             mu=float(bound["mu"]),
-            P=_array(bound["P"]),
-            tau=_array(bound["tau"]),
-            printed=_array(bound["printed"]),
+            P=read_array(bound["P"], (n, n), "P"),
+            tau=read_array(bound["tau"], (0 if numbers else groups,), "tau"),
+            printed=read_array(bound["printed"], (numbers,), "alpha, beta and Q"),
             decay=None if bound["decay"] is None else float(bound["decay"]),
-            tau_decay=None if extra is None else _array(extra),
+            tau_decay=None if extra is None else read_array(extra, (groups,), "tau_decay"),
         ),
         options=dict(record["options"]),
-        **{name: _array(record[name]) for name in ("A", "C", "W", "A_radius", "W_radius")},
     )
