@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.designs.bounded_error.design import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.error_system import kept_coordinates
 from obsynth.designs.bounded_error.step import RuntimeBound, memory_layout
+from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = [
@@ -175,7 +175,7 @@ def make_start(
         From the box of the first error to the first s of the runtime bound.
     """
     n, n_f = design.A.shape[0], design.rate.size
-    names = {"x": design.plant.names("x"), "f": design.plant.names("f")}
+    names, faults = design.plant.names("x"), design.plant.names("f")
 
     def start(
         guess: ArrayLike,
@@ -185,15 +185,15 @@ def make_start(
         z0: ArrayLike | None = None,
     ) -> FloatArray:
         """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
-        point = _vector(guess, n, "guess", names["x"])
-        x_box = design.plant.box("x") if x_range is None else _box(x_range, n, "x_range")
-        f_box = np.zeros((n_f, 2)) if f_range is None else _box(f_range, n_f, "f_range")
+        point = read_vector(guess, "guess", names)
+        x_box = design.plant.box("x") if x_range is None else read_box(x_range, "x_range", names)
+        f_box = np.zeros((n_f, 2)) if f_range is None else read_box(f_range, "f_range", faults)
         if not np.isfinite(x_box).all():
             raise ObsynthError(
                 "x_range is needed: the states have no finite declared range, so the first error "
                 "has no bound"
             )
-        z = design.T @ point if z0 is None else _vector(z0, n, "z0", names["x"])
+        z = design.T @ point if z0 is None else read_vector(z0, "z0", names)
         if z0 is not None and isinstance(design.bound, EllipsoidBound):
             _check_range_of_T(design, design.bound, z)
         fhat = f_box.mean(axis=1)
@@ -232,21 +232,3 @@ def ellipsoid_first(design: UioDesign) -> Callable[[StartBox], FloatArray]:
         return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])
 
     return first
-
-
-def _vector(value: Any, size: int, name: str, symbols: tuple[str, ...]) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.shape != (size,) or not np.all(np.isfinite(array)):
-        raise ObsynthError(
-            f"{name} has to be {size} finite numbers ({', '.join(symbols)}); got {value!r}"
-        )
-    return array
-
-
-def _box(value: Any, size: int, name: str) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.shape != (size, 2) or not np.all(np.isfinite(array)):
-        raise ObsynthError(f"{name} has to be {size} finite pairs (lower, upper); got {value!r}")
-    if np.any(array[:, 0] > array[:, 1]):
-        raise ObsynthError(f"{name} has a lower end above its upper end: {value!r}")
-    return array

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from obsynth.designs.interval.design import IntervalDesign
 from obsynth.designs.interval.exact_arrays import FloatArray
 from obsynth.designs.interval.step import first_box, memory_layout
+from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic import ObsynthError
 
 __all__ = ["make_start"]
@@ -28,20 +29,14 @@ def make_start(design: IntervalDesign) -> Callable[..., FloatArray]:
         y0: ArrayLike | None = None,
     ) -> FloatArray:
         """Start from a box of states; neither the first fault nor y0 are needed."""
-        names = ", ".join(plant.names("x"))
-        point = np.asarray(guess, dtype=float)
-        if point.shape != (n,) or not np.isfinite(point).all():
-            raise ObsynthError(f"guess has to be {n} finite numbers ({names}); got {guess!r}")
-        box = plant.box("x") if x_range is None else np.asarray(x_range, dtype=float)
-        if box.shape != (n, 2) or not np.all(box[:, 0] <= box[:, 1]):
-            raise ObsynthError(
-                f"x_range has to have the shape ({n}, 2), lower before upper ({names})"
-            )
-        if not np.isfinite(box).all():
+        names = plant.names("x")
+        point = read_vector(guess, "guess", names)
+        if x_range is None and not np.isfinite(plant.box("x")).all():
             raise ObsynthError(
                 "x_range is needed: the states have no finite declared range, so the first set "
                 "has no bound"
             )
+        box = plant.box("x") if x_range is None else read_box(x_range, "x_range", names)
         memory = np.zeros(layout["initialised"].stop)
         memory[layout["r_lower"]], memory[layout["r_upper"]] = first_box(design, box)
         memory[layout["prediction"]] = point

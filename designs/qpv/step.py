@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.designs.bounded_error.runtime import largest_level
 from obsynth.designs.qpv.design import QPVDesign
 from obsynth.designs.qpv.schedule import measured_schedule, vertex_weights
+from obsynth.designs.starting import read_box, read_vector
 from obsynth.designs.stepping import (
     all_finite,
     finite_or,
@@ -21,7 +21,6 @@ from obsynth.designs.stepping import (
     status_word,
 )
 from obsynth.symbolic import Plant
-from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["build_ode", "build_step", "make_start", "memory_layout"]
 
@@ -259,7 +258,8 @@ def _runge_kutta(rate: Callable[[ca.SX], ca.SX], state: ca.SX, step: float) -> c
 def make_start(design: QPVDesign) -> Callable[..., FloatArray]:
     """Return the function behind `Observer.memory0`."""
     plant = design.plant
-    n, n_f = len(plant.x), len(plant.f)
+    names, faults = plant.names("x"), plant.names("f")
+    n, n_f = len(names), len(faults)
     layout = memory_layout(n, n_f)
 
     def start(
@@ -270,10 +270,10 @@ def make_start(design: QPVDesign) -> Callable[..., FloatArray]:
         fhat0: ArrayLike | None = None,
     ) -> FloatArray:
         """Start at the guess; fhat0 is the middle of f_range, or given; y0 is not needed."""
-        point = _vector(guess, n, "guess", plant.names("x"))
-        x_box = plant.box("x") if x_range is None else _box(x_range, n, "x_range")
-        f_box = np.zeros((n_f, 2)) if f_range is None else _box(f_range, n_f, "f_range")
-        fhat = f_box.mean(axis=1) if fhat0 is None else _vector(fhat0, n_f, "fhat0", ())
+        point = read_vector(guess, "guess", names)
+        x_box = plant.box("x") if x_range is None else read_box(x_range, "x_range", names)
+        f_box = np.zeros((n_f, 2)) if f_range is None else read_box(f_range, "f_range", faults)
+        fhat = f_box.mean(axis=1) if fhat0 is None else read_vector(fhat0, "fhat0", faults)
         state = np.concatenate([point, fhat])
         box = np.concatenate([x_box, f_box]) - state[:, None]
         level = np.inf
@@ -289,20 +289,3 @@ def make_start(design: QPVDesign) -> Callable[..., FloatArray]:
         return memory
 
     return start
-
-
-def _vector(value: Any, size: int, name: str, symbols: tuple[str, ...]) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.shape != (size,) or not np.all(np.isfinite(array)):
-        listed = f" ({', '.join(symbols)})" if symbols else ""
-        raise ObsynthError(f"{name} has to be {size} finite numbers{listed}; got {value!r}")
-    return array
-
-
-def _box(value: Any, size: int, name: str) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.shape != (size, 2) or not np.all(np.isfinite(array)):
-        raise ObsynthError(f"{name} has to be {size} finite pairs (lower, upper); got {value!r}")
-    if np.any(array[:, 0] > array[:, 1]):
-        raise ObsynthError(f"{name} has a lower end above its upper end: {value!r}")
-    return array

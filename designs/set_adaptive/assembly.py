@@ -15,12 +15,12 @@ from obsynth.designs.set_adaptive.bank import BankDesign
 from obsynth.designs.set_adaptive.bank_assembly import assemble_bank, prove_bank
 from obsynth.designs.set_adaptive.design import METHOD, SetDesign
 from obsynth.designs.set_adaptive.equations import memory_layout
-from obsynth.designs.set_adaptive.inputs import read_box, read_vector
 from obsynth.designs.set_adaptive.ode import build_ode
 from obsynth.designs.set_adaptive.proof import prove_design
 from obsynth.designs.set_adaptive.step import build_step, initial_memory
 from obsynth.designs.set_adaptive.structure import Structure
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
+from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]
@@ -119,9 +119,10 @@ def _make_start(design: SetDesign) -> Callable[..., FloatArray]:
         y0: ArrayLike | None = None,
     ) -> FloatArray:
         """Start from boxes of the state and of the constant faults; guess and y0 are not used."""
-        read_vector(guess, plant)
-        x_box = read_box(x_range, plant.box("x"), "x_range", plant.names("x"))
-        f_box = read_box(f_range, plant.box("f"), "f_range", plant.names("f"))
+        names, faults = plant.names("x"), plant.names("f")
+        read_vector(guess, "guess", names)
+        x_box = read_box(plant.box("x") if x_range is None else x_range, "x_range", names)
+        f_box = read_box(plant.box("f") if f_range is None else f_range, "f_range", faults)
         if np.any(x_box[:, 0] < 0.0):
             raise ObsynthError("x_range reaches below zero, which the method excludes")
         return initial_memory(design, x_box, f_box)

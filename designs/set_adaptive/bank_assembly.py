@@ -21,7 +21,7 @@ from obsynth.designs.set_adaptive.bank_step import (
 )
 from obsynth.designs.set_adaptive.bank_widths import steady_half_widths
 from obsynth.designs.set_adaptive.design import METHOD
-from obsynth.designs.set_adaptive.inputs import read_box, read_vector
+from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble_bank", "bank_record", "prove_bank"]
@@ -123,8 +123,9 @@ def _make_start(design: BankDesign) -> Callable[..., FloatArray]:
         y0: ArrayLike | None = None,
     ) -> FloatArray:
         """Start from a box of the state; guess and y0 are not used, faults have declared ranges."""
-        read_vector(guess, plant)
-        box = read_box(x_range, design.region, "x_range", plant.names("x"))
+        read_vector(guess, "guess", plant.names("x"))
+        region = design.region if x_range is None else x_range
+        box = read_box(region, "x_range", plant.names("x"))
         inside = np.column_stack(
             [np.maximum(box[:, 0], design.region[:, 0]), np.minimum(box[:, 1], design.region[:, 1])]
         )

@@ -1,44 +1,14 @@
-"""Checks of what `Observer.memory0` and `Observer.step` are given."""
+"""Checks of the signals that the steps are given."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
-import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.designs.stepping import all_finite, finite_or
 from obsynth.symbolic import Plant
-from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["known_signals", "read_box", "read_vector"]
-
-FloatArray = NDArray[np.float64]
-
-
-def read_vector(value: Any, plant: Plant) -> FloatArray:
-    """Check the guess of `memory0`."""
-    array = np.asarray(value, dtype=float)
-    names = plant.names("x")
-    if array.shape != (len(names),) or not np.all(np.isfinite(array)):
-        raise ObsynthError(
-            f"guess has to be {len(names)} finite numbers ({', '.join(names)}); got {value!r}"
-        )
-    return array
-
-
-def read_box(value: Any, default: FloatArray, what: str, names: tuple[str, ...]) -> FloatArray:
-    """Check a box of `memory0`, or take the declared one."""
-    box = default if value is None else np.asarray(value, dtype=float)
-    if box.shape != default.shape or not np.all(np.isfinite(box)) or np.any(box[:, 0] > box[:, 1]):
-        raise ObsynthError(
-            f"{what} has to be {len(names)} finite pairs lower <= upper ({', '.join(names)}); got "
-            f"{value!r}",
-            option=what,
-        )
-    return box
+__all__ = ["known_signals"]
 
 
 def known_signals(plant: Plant, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:

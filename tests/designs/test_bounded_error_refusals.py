@@ -127,7 +127,7 @@ def test_unstable_gains(tank_split, tank_bounds, bounds):
         ({"guess": [1, 2, 3]}, "guess has to be 4 finite numbers"),
         ({"guess": [1, 2, 3, np.nan]}, "finite"),
         ({"guess": [1, 2, 3, 4], "x_range": [[0, 1]]}, "x_range has to be 4"),
-        ({"guess": [1, 2, 3, 4], "x_range": [[1, 0]] * 4}, "lower end above"),
+        ({"guess": [1, 2, 3, 4], "x_range": [[1, 0]] * 4}, "lower <= upper"),
         ({"guess": [1, 2, 3, 4], "f_range": [[0, np.inf]] * 2}, "f_range"),
     ],
 )

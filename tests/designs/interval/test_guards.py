@@ -276,7 +276,7 @@ def test_no_bit_for_a_box_on_which_nothing_rests(designs):
 def test_memory0_says_what_is_wrong(designs):
     with pytest.raises(ob.ObsynthError, match="guess has to be 3"):
         designs["d1"].memory0([1.0])
-    with pytest.raises(ob.ObsynthError, match="lower before upper"):
+    with pytest.raises(ob.ObsynthError, match="lower <= upper"):
         designs["d1"].memory0(np.ones(3), x_range=[[1, 0]] * 3)
 
 
