@@ -298,7 +298,10 @@ def test_the_table_sees_a_mutant(printed, integrate, numbers, monkeypatch, mutan
         return
     right = getattr(module, "theta_rates" if mutant == "theta" else "drives")
     if mutant == "theta":
-        wrong = lambda *given: tuple(-rate for rate in right(*given))  # noqa: E731
+
+        def wrong(*given):
+            return tuple(-rate for rate in right(*given))
+
         monkeypatch.setattr(module, "theta_rates", wrong)
     else:
         monkeypatch.setattr(module, "drives", lambda *given: right(*given)[::-1])
