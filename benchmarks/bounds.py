@@ -103,7 +103,7 @@ def scaled(plant: Any) -> Any:
 
 def entries_of(case: str) -> list[Any]:
     """List what is bounded: all entries with respect to states and to inputs, where there are."""
-    from obsynth.derive.jacobian_entries import jacobian_entries
+    from obsynth.derive.jacobian.entries import jacobian_entries
 
     plant, kind = plant_of(case), CASES[case][0]
     if kind == "values":
@@ -136,7 +136,7 @@ def ours(case: str) -> dict[str, Any]:
     import numpy as np
 
     from obsynth.derive import jacobian_bounds
-    from obsynth.derive.intervals import bound_ranges
+    from obsynth.derive.intervals.ranges import bound_ranges
 
     kind, rtol, _ = CASES[case]
     begin = time.process_time()

@@ -17,7 +17,7 @@ from obsynth.codegen.interface import FloatArray, ObserverLike, PlantLike
 from obsynth.codegen.kernel import STEP_INPUTS
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import project_name, unique
-from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
 
 __all__ = ["Description", "Field", "Port", "describe", "midpoints", "nominal_values"]
 

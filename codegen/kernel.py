@@ -9,7 +9,7 @@ import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.names import c_number
-from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
 
 __all__ = ["STEP_INPUTS", "Kernel", "generate_kernel"]
 

@@ -17,7 +17,7 @@ from obsynth.codegen.kernel import Kernel
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import c_comment, c_number
 from obsynth.codegen.vectors import Vectors
-from obsynth.designs.observer import STATUS
+from obsynth.designs.core.observer import STATUS
 
 __all__ = ["generator_name", "render"]
 

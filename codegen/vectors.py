@@ -14,7 +14,7 @@ from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.interface import FloatArray
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.sequences import Drive, random_memory
-from obsynth.designs.observer import STATUS, STEP_OUTPUTS
+from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 
 __all__ = ["MINIMUM", "SHARES", "Vectors", "bits", "make_vectors"]
 

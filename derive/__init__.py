@@ -1,49 +1,46 @@
 """What follows from a plant, with proof."""
 
-from obsynth.derive.affine_family import AffineFamily
-from obsynth.derive.decoupling import Decoupling, decouple
-from obsynth.derive.dependence import AffineDependence
-from obsynth.derive.diagnosis import (
-    Excitation,
-    FaultIsolability,
-    PolytopeZeros,
-    WeakestMember,
-    excitation,
-    fault_isolability,
-    system_zeros,
-    weakest_member,
-    zeros_over_polytope,
-)
+from obsynth.derive.algebra.identity import IdentityProof
+from obsynth.derive.constants.eigenvalue_search import Maximum
+from obsynth.derive.constants.lipschitz import InnerBound, LipschitzConstants, lipschitz
+from obsynth.derive.constants.majorant import Majorant, majorant
+from obsynth.derive.constants.majorant_parts import RowMajorant
 from obsynth.derive.equilibrium import Equilibrium, equilibrium
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
-from obsynth.derive.identity import IdentityProof
-from obsynth.derive.intervals import Ranges, Status, bound_ranges
-from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.lipschitz import InnerBound, LipschitzConstants, lipschitz
-from obsynth.derive.majorant import Majorant, majorant
-from obsynth.derive.majorant_parts import RowMajorant
-from obsynth.derive.polytopes import (
-    JacobianPolytope,
+from obsynth.derive.forms.qpv.build import qpv
+from obsynth.derive.forms.qpv.form import QPV, QPVVertices
+from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm
+from obsynth.derive.forms.quasi_lpv.polytopic import CentredForm, PolytopicForm
+from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
+from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.jacobian.dependence import AffineDependence
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
+from obsynth.derive.polytopes.polytope import (
     Polytope,
-    drop_scalars,
-    jacobian_polytope,
     polytope_from_halfspaces,
     polytope_from_vertices,
-    principal_family,
-    sampled_hull,
 )
-from obsynth.derive.qpv import QPV, QPVVertices, qpv
-from obsynth.derive.quasi_lpv import CentredForm, IntervalForm, PolytopicForm, QuasiLPV, quasi_lpv
-from obsynth.derive.remainder import FlowError, Remainder, discretisation_remainder
-from obsynth.derive.report import Check, StructureReport, analyse
-from obsynth.derive.spectrum import Maximum
+from obsynth.derive.polytopes.sampled import sampled_hull
+from obsynth.derive.polytopes.support import JacobianPolytope, jacobian_polytope
+from obsynth.derive.remainder.certify import discretisation_remainder
+from obsynth.derive.remainder.flow import FlowError
+from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.split import Split, split
-from obsynth.derive.structure import (
+from obsynth.derive.structure.conditions import (
     Detectability,
     augmented_pair,
     detectability,
     unknown_input_condition,
 )
+from obsynth.derive.structure.decoupling import Decoupling, decouple
+from obsynth.derive.structure.detectability import WeakestMember, weakest_member
+from obsynth.derive.structure.excitation import Excitation, excitation
+from obsynth.derive.structure.isolability import FaultIsolability, fault_isolability
+from obsynth.derive.structure.report import Check, StructureReport, analyse
+from obsynth.derive.structure.zeros import PolytopeZeros, system_zeros, zeros_over_polytope
 
 __all__ = [
     "QPV",

@@ -10,12 +10,12 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from obsynth.derive.algebra.factorise import expand_terms, factorise
+from obsynth.derive.algebra.identity import IdentityProof, prove_identity
+from obsynth.derive.algebra.linear_parts import constant_columns
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.exact import is_zero, rational, round_number, substitute
-from obsynth.derive.factorise import expand_terms, factorise
-from obsynth.derive.identity import IdentityProof, prove_identity
-from obsynth.derive.linear_parts import constant_columns
+from obsynth.derive.rigour.numbers import is_zero, rational, round_number, substitute
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 

@@ -1,21 +1,23 @@
 """What estimates: LMIs, certificates and observers."""
 
-from obsynth.designs.bounded_error import BoundedErrorUIO
-from obsynth.designs.certificate import Certificate, Claim, Guarantee
-from obsynth.designs.detection import Detection, FaultEvent
-from obsynth.designs.errors import (
+from obsynth.designs.bounded_error.method import BoundedErrorUIO
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee
+from obsynth.designs.core.errors import (
     CertificateError,
     DetectorError,
     InfeasibleDesign,
     SolverTrouble,
 )
-from obsynth.designs.fault_detector import FaultDetector
-from obsynth.designs.hinf import HinfUIO, WorstCase, worst_case
-from obsynth.designs.interval import IntervalObserver
-from obsynth.designs.observer import STATUS, Observer
-from obsynth.designs.qpv import Ellipsoid, QPVObserver
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
-from obsynth.designs.storage import load, save
+from obsynth.designs.core.observer import STATUS, Observer
+from obsynth.designs.core.registry import load, save
+from obsynth.designs.detection.comparison import Detection, FaultEvent
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.designs.hinf.method import HinfUIO
+from obsynth.designs.hinf.worst_case import WorstCase, worst_case
+from obsynth.designs.interval.method import IntervalObserver
+from obsynth.designs.qpv.method import QPVObserver
+from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 __all__ = [
     "STATUS",

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant, Scenario

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.observer import STATUS
+from obsynth.designs.core.observer import STATUS
 
 __all__ = ["Domain", "StatusCount"]
 

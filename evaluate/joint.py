@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.fault_detector import FaultDetector
+from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.calls import (
     first_memory,
     refuse_algebraic_loop,

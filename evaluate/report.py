@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.equations import constants_html, equations_html, signals_table
 from obsynth.evaluate.errors import ReportError
-from obsynth.evaluate.layout import panels
-from obsynth.evaluate.plots import plot_errors, plot_run
+from obsynth.evaluate.plotting.layout import panels
+from obsynth.evaluate.plotting.plots import plot_errors, plot_run
+from obsynth.evaluate.plotting.style import style
+from obsynth.evaluate.plotting.width_plot import plot_widths
 from obsynth.evaluate.run import Run, percent
-from obsynth.evaluate.style import style
 from obsynth.evaluate.svg import figure_svg
 from obsynth.evaluate.table import Table, text
-from obsynth.evaluate.width_plot import plot_widths
 
 if TYPE_CHECKING:
-    from obsynth.designs.observer import Observer
+    from obsynth.designs.core.observer import Observer
     from obsynth.symbolic import Plant
 
 __all__ = ["report"]

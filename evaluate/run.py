@@ -281,7 +281,7 @@ class Run:
 
     def plot(self, signals: tuple[str, ...] | None = None) -> Any:
         """Plot all estimated signals in a grid; see :func:`obsynth.evaluate.plot_run`."""
-        from obsynth.evaluate.plots import plot_run
+        from obsynth.evaluate.plotting.plots import plot_run
 
         return plot_run(self, signals)
 

@@ -5,7 +5,7 @@ import io
 import re
 from typing import Any
 
-from obsynth.evaluate.style import INK, SOFT
+from obsynth.evaluate.plotting.style import INK, SOFT
 
 __all__ = ["figure_svg", "math_svg"]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.intervals.arithmetic import Array
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.schedule import Schedule
+from obsynth.derive.rigour.interval import Array
 
 __all__ = ["Enclosure", "enclose", "evaluate", "first_failure"]
 

@@ -10,16 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from obsynth.derive.intervals.arithmetic import (
-    Array,
-    Interval,
-    Mask,
-    absolute,
-    hull,
-    negate,
-    up,
-    widen,
-)
+from obsynth.derive.rigour.interval import Array, Interval, Mask, absolute, hull, negate, up, widen
 
 __all__ = [
     "ULPS",

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.intervals.arithmetic import Array, Interval, point
 from obsynth.derive.intervals.rules import COMMUTATIVE, RULES
+from obsynth.derive.rigour.interval import Array, Interval, point
 
 __all__ = ["Graph", "Node"]
 

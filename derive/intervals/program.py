@@ -21,7 +21,7 @@ import casadi as ca
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.graph import Graph, Node
-from obsynth.derive.intervals.rewrites import REWRITES
+from obsynth.derive.intervals.rewriting.rewrites import REWRITES
 from obsynth.derive.intervals.rules import JUMPS, NAMES, PARTIAL
 from obsynth.derive.intervals.schedule import Schedule
 

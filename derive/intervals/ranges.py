@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.arithmetic import Array
-from obsynth.derive.intervals.batch import Problem
-from obsynth.derive.intervals.branch import Budget, Outcome
 from obsynth.derive.intervals.evaluate import first_failure
-from obsynth.derive.intervals.problem import make_problem
-from obsynth.derive.intervals.quotients import Quotients
-from obsynth.derive.intervals.stages import staged
+from obsynth.derive.intervals.rewriting.quotients import Quotients
+from obsynth.derive.intervals.search.batch import Problem
+from obsynth.derive.intervals.search.branch import Budget, Outcome
+from obsynth.derive.intervals.search.problem import make_problem
+from obsynth.derive.intervals.search.stages import staged
+from obsynth.derive.rigour.interval import Array
 
 __all__ = ["EFFORTS", "Failure", "Ranges", "Status", "bound_ranges", "make_problem"]
 

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.intervals import arithmetic as ar
 from obsynth.derive.intervals import functions as fn
-from obsynth.derive.intervals.arithmetic import Array, Interval
+from obsynth.derive.rigour import interval as ar
+from obsynth.derive.rigour.interval import Array, Interval
 
 __all__ = ["COMMUTATIVE", "JUMPS", "NAMES", "PARTIAL", "RULES", "uncertain"]
 

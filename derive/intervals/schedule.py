@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.intervals.arithmetic import Array, Interval, Mask
 from obsynth.derive.intervals.graph import Graph
 from obsynth.derive.intervals.rules import PARTIAL, RULES, uncertain
+from obsynth.derive.rigour.interval import Array, Interval, Mask
 
 __all__ = ["Schedule", "Values"]
 

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from obsynth.derive.intervals.arithmetic import Array, Mask, up
-from obsynth.derive.intervals.batch import RowRanges, Rows
-from obsynth.derive.intervals.curvature import Hessians, tangent_rise
+from obsynth.derive.intervals.search.batch import RowRanges, Rows
+from obsynth.derive.intervals.search.curvature import Hessians, tangent_rise
+from obsynth.derive.rigour.interval import Array, Mask, up
 
 __all__ = ["concave_bounds"]
 

@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.affine_family import AffineFamily
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.intervals import bound_ranges
-from obsynth.derive.jacobian_bounds import jacobian_bounds
-from obsynth.derive.jacobian_entries import jacobian_entries, sample_entries
+from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.jacobian.bounds import jacobian_bounds
+from obsynth.derive.jacobian.entries import jacobian_entries, sample_entries
+from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes.support import basis_entries
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.jacobian_bounds import jacobian_bounds
-from obsynth.derive.jacobian_entries import jacobian_entries
+from obsynth.derive.jacobian.bounds import jacobian_bounds
+from obsynth.derive.jacobian.entries import jacobian_entries
 from obsynth.derive.polytopes.polytope import Label, polytope_from_vertices
 from obsynth.derive.polytopes.support import basis_entries, scalar_values
 from obsynth.derive.split import Split

@@ -15,12 +15,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.affine_family import AffineFamily
-from obsynth.derive.dependence import entry_name
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals import bound_ranges
-from obsynth.derive.jacobian_bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.jacobian_entries import JacobianEntries, jacobian_entries
+from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.jacobian.dependence import entry_name
+from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries
+from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes.polytope import (
     Label,
     Polytope,

@@ -6,13 +6,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.continuity import refuse_jumps
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.intervals import Status
-from obsynth.derive.intervals.arithmetic import Interval, add, multiply
+from obsynth.derive.intervals.ranges import Status
+from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.remainder.system import system
 from obsynth.derive.remainder.work import Work
+from obsynth.derive.rigour.interval import Interval, add, multiply
 from obsynth.symbolic.discretise import check_method, sampling_time
 from obsynth.symbolic.plant import Plant
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.batch import Problem
-from obsynth.derive.intervals.branch import maximise
 from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.ranges import EFFORTS, make_problem
+from obsynth.derive.intervals.search.batch import Problem
+from obsynth.derive.intervals.search.branch import maximise
 from obsynth.derive.remainder.system import System
 
 __all__ = ["FlowError", "flow_box", "flow_tubes"]

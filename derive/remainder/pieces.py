@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.intervals import Program, evaluate
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.program import Program
 
 __all__ = ["PIECES", "hull_over_pieces", "plan_cuts"]
 

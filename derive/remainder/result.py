@@ -8,7 +8,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals import Status
+from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.plant import Plant
 
 __all__ = ["Remainder"]

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.exact import enclose_number
-from obsynth.derive.intervals import Program, Ranges, bound_ranges
 from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rules import JUMPS
+from obsynth.derive.rigour.numbers import enclose_number
 from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.plant import Plant
 

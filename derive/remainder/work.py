@@ -8,13 +8,13 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.exact import enclose_number
-from obsynth.derive.intervals.arithmetic import Interval, add, multiply, subtract
 from obsynth.derive.intervals.evaluate import enclose, evaluate
 from obsynth.derive.remainder.flow import flow_box, flow_tubes
 from obsynth.derive.remainder.pieces import PIECES, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.system import System, step_derivatives, time_derivatives
 from obsynth.derive.remainder.trees import difference_term
+from obsynth.derive.rigour.interval import Interval, add, multiply, subtract
+from obsynth.derive.rigour.numbers import enclose_number
 
 __all__ = ["Work", "step_factor"]
 

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds, Split, decouple
+from obsynth.designs.bounded_error.claims import prove_ellipsoid
 from obsynth.designs.bounded_error.derivation_proof import prove_derivation
-from obsynth.designs.bounded_error.design import METHOD, EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.noise import noise_box
-from obsynth.designs.bounded_error.peak import peak_runtime, peak_start, prove_peak_claims
-from obsynth.designs.bounded_error.proof import prove_ellipsoid
+from obsynth.designs.bounded_error.peak.design import peak_runtime, peak_start, prove_peak_claims
+from obsynth.designs.bounded_error.record import METHOD, EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.runtime import ellipsoid_first, ellipsoid_runtime, make_start
 from obsynth.designs.bounded_error.step import RuntimeBound, build_step, memory_layout
-from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.observer import Observer
-from obsynth.designs.records import with_header
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import with_header
 
 __all__ = ["assemble", "prove", "to_record"]
 

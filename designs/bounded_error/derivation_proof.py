@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive import AffineFamily, JacobianBounds, Split, jacobian_bounds, split
-from obsynth.designs.bounded_error.design import UioDesign
-from obsynth.designs.certificate import Claim
+from obsynth.designs.bounded_error.record import UioDesign
+from obsynth.designs.core.certificate import Claim
 
 __all__ = ["covers", "prove_derivation"]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.bounded_error.design import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
 from obsynth.designs.bounded_error.error_system import (
     ERRORS,
     ErrorKind,
@@ -17,9 +17,9 @@ from obsynth.designs.bounded_error.error_system import (
     build_error_system,
     kept_coordinates,
 )
+from obsynth.designs.bounded_error.model import Prepared, prepare
 from obsynth.designs.bounded_error.noise import NoiseBox
-from obsynth.designs.bounded_error.prepare import Prepared, prepare
-from obsynth.designs.bounded_error.proof import inverse_diagonal_bounds, prove_ellipsoid
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.synthesis import (
     OBJECTIVES,
     EllipsoidSolution,
@@ -31,13 +31,13 @@ from obsynth.designs.bounded_error.synthesis import (
     search_gamma,
     synthesise,
 )
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import JacobianBounds, Split
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.observer import Observer
     from obsynth.symbolic import Plant
 
 __all__ = ["BoundedErrorUIO"]
@@ -193,7 +193,7 @@ class BoundedErrorUIO:
 
         prepared = prepare(model_or_split, bounds)
         if self.bounds == "peak":
-            from obsynth.designs.bounded_error.peak import design_peak
+            from obsynth.designs.bounded_error.peak.design import design_peak
 
             design = design_peak(prepared, self)
         else:
@@ -226,7 +226,7 @@ class BoundedErrorUIO:
         K, F = _read_gains(prepared.design, gains)
         given = replace(prepared.design, K=K, F=F, options=asdict(self))
         if self.bounds == "peak":
-            from obsynth.designs.bounded_error.peak import bound_peak
+            from obsynth.designs.bounded_error.peak.design import bound_peak
 
             return assemble(bound_peak(given), derived=(prepared.split, prepared.bounds))
         system, noise, weights = self._setting(prepared)

@@ -21,7 +21,7 @@ from obsynth.designs.bounded_error.synthesis import (
     set_objective,
     solve_reliably,
 )
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, symmetric
 
 __all__ = [

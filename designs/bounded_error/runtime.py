@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.bounded_error.design import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.error_system import kept_coordinates
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.step import RuntimeBound, memory_layout
 from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic.errors import ObsynthError

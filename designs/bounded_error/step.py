@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.stepping import (
+from obsynth.designs.core.stepping import (
     FINITE,
     all_finite,
     clip,

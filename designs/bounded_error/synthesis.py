@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.error_system import ErrorSystem
 from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Affine,
     Margin,

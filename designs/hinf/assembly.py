@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive import JacobianBounds, Majorant, Split
-from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import with_header
+from obsynth.designs.hinf.claims import decoupling_residual, prove_decoupling, prove_level
 from obsynth.designs.hinf.derivation import prove_derivation
-from obsynth.designs.hinf.design import METHOD, HinfDesign
-from obsynth.designs.hinf.proof import decoupling_residual, prove_decoupling, prove_level
+from obsynth.designs.hinf.record import METHOD, HinfDesign
 from obsynth.designs.hinf.step import build_step, memory_layout
-from obsynth.designs.observer import Observer
-from obsynth.designs.records import with_header
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["assemble", "prove", "to_record"]

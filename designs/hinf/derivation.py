@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, majorant, split
 from obsynth.derive.errors import DerivationError
 from obsynth.designs.bounded_error.derivation_proof import covers
-from obsynth.designs.certificate import Claim
-from obsynth.designs.hinf.design import HinfDesign
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.sector import build_sector, covers_sector, derive_majorant
 
 __all__ = ["prove_derivation"]

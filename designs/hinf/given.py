@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.hinf.design import HinfDesign
-from obsynth.designs.hinf.prepare import Prepared
-from obsynth.designs.hinf.proof import RESIDUAL, decoupling_residual
+from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.hinf.claims import RESIDUAL, decoupling_residual
+from obsynth.designs.hinf.model import Prepared
+from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.system import Filter
 from obsynth.symbolic.errors import ObsynthError
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.hinf.design import Bound, HinfDesign
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.hinf.claims import prove_level
 from obsynth.designs.hinf.given import read_diagonal, read_gains, unstable_gains
-from obsynth.designs.hinf.prepare import Prepared, prepare
+from obsynth.designs.hinf.model import Prepared, prepare
 from obsynth.designs.hinf.problems import Structure, state_problem
-from obsynth.designs.hinf.proof import prove_level
+from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.sector import MULTIPLIERS, Multipliers
 from obsynth.designs.hinf.synthesis import (
     Found,
@@ -28,8 +28,8 @@ from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import JacobianBounds, Split
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.observer import Observer
     from obsynth.symbolic import Plant
 
 __all__ = ["HinfUIO"]
@@ -68,7 +68,7 @@ class HinfUIO:
     decay : float, optional
         Also guarantee V+ < decay V where w = 0, in (0, 1).
     majorant : sequence of float, optional
-        Diagonal of M'M in (5), proved to be one; `obsynth.derive.majorant` by default. For
+        Diagonal of M'M in (5), proved to be one; `obsynth.majorant` by default. For
         ``multipliers="single"``.
     form : {"corrected", "printed"}
         (45) with (37) as printed, with ``method="standard"`` and one multiplier.

@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.hinf.system import Filter
-from obsynth.designs.stepping import (
+from obsynth.designs.core.stepping import (
     all_finite,
     clip,
     finite_or,
@@ -18,6 +17,7 @@ from obsynth.designs.stepping import (
     select,
     status_word,
 )
+from obsynth.designs.hinf.system import Filter
 
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.hinf.lmis import decay_block
 from obsynth.designs.hinf.problems import CAP, Structure, multipliers, open_loop, state_problem
 from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units

@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.hinf.design import METHOD, HinfDesign
-from obsynth.designs.hinf.frozen import OperatingPoints, frozen_gain, search_points
-from obsynth.designs.observer import Observer
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.hinf.operating_points import OperatingPoints, frozen_gain, search_points
+from obsynth.designs.hinf.record import METHOD, HinfDesign
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = ["WorstCase", "worst_case"]

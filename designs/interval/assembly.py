@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.interval.design import METHOD, IntervalDesign
-from obsynth.designs.interval.exact_arrays import Exact, FloatArray, exact, nearest
+from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, nearest
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import with_header
+from obsynth.designs.interval.claims import prove_design, prove_model
 from obsynth.designs.interval.model import LARGEST_SIGNAL, IntervalModel
-from obsynth.designs.interval.proof import prove_design, prove_model
+from obsynth.designs.interval.record import METHOD, IntervalDesign
 from obsynth.designs.interval.start import make_start
 from obsynth.designs.interval.step import build_step, memory_layout
-from obsynth.designs.observer import Observer
-from obsynth.designs.records import with_header
 
 __all__ = ["assemble", "prove", "to_record"]
 

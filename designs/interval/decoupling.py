@@ -17,13 +17,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.designs.interval.exact_arrays import (
-    Exact,
-    FloatArray,
-    exact,
-    inverse,
-    nearest,
-)
+from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, inverse, nearest
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic import ObsynthError
 

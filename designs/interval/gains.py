@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.derive.rigour.exact_arrays import FloatArray, nearest
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.interval.decoupling import Decoupled
-from obsynth.designs.interval.exact_arrays import FloatArray, nearest
 from obsynth.designs.interval.model import IntervalModel, columns_of
 from obsynth.designs.lmi import Problem, diagonal, full
 from obsynth.symbolic import ObsynthError

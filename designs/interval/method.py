@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.quasi_lpv import QuasiLPV, quasi_lpv
+from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.rigour.exact_arrays import FloatArray
 from obsynth.designs.interval.decoupling import decouple_exactly, transformation
-from obsynth.designs.interval.design import Bound, IntervalDesign
-from obsynth.designs.interval.exact_arrays import FloatArray
 from obsynth.designs.interval.gains import Reduced, check_detectable, lp_problem
 from obsynth.designs.interval.model import IntervalModel, model_of
+from obsynth.designs.interval.record import Bound, IntervalDesign
 from obsynth.designs.interval.rows import UNIT, Precision
 from obsynth.designs.interval.synthesis import (
     given_gains,
@@ -29,8 +30,8 @@ from obsynth.symbolic import ObsynthError, Plant
 if TYPE_CHECKING:
     import casadi as ca
 
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.observer import Observer
 
 __all__ = ["IntervalObserver"]
 

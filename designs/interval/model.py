@@ -10,17 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.affine_family import AffineFamily
 from obsynth.derive.errors import StructureError
-from obsynth.derive.quasi_lpv import QuasiLPV
-from obsynth.designs.interval.exact_arrays import (
-    Exact,
-    FloatArray,
-    exact,
-    from_text,
-    to_text,
-)
-from obsynth.designs.records import plain, read_family, reading
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, from_text, to_text
+from obsynth.designs.core.record import plain, read_family, reading
 from obsynth.symbolic import Plant, Role
 
 __all__ = ["LARGEST_SIGNAL", "IntervalModel", "columns_of", "model_of"]

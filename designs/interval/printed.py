@@ -6,9 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import (
+from obsynth.derive.rigour.exact_arrays import (
     FloatArray,
     exact,
     inverse,
@@ -16,7 +14,9 @@ from obsynth.designs.interval.exact_arrays import (
     negative,
     positive,
 )
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.model import columns_of
+from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Part
 from obsynth.symbolic import ObsynthError
 

@@ -14,8 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.designs.interval.decoupling import Decoupled
-from obsynth.designs.interval.exact_arrays import (
+from obsynth.derive.rigour.exact_arrays import (
     Exact,
     FloatArray,
     above,
@@ -25,6 +24,7 @@ from obsynth.designs.interval.exact_arrays import (
     negative,
     positive,
 )
+from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel, columns_of
 
 __all__ = [

@@ -9,10 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.interval.design import SWEEPS, IntervalDesign
-from obsynth.designs.interval.exact_arrays import Exact, FloatArray, exact, hull, nearest
-from obsynth.designs.interval.rows import Rows
-from obsynth.designs.stepping import (
+from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, hull, nearest
+from obsynth.designs.core.stepping import (
     all_finite,
     finite_or,
     inside,
@@ -20,6 +18,8 @@ from obsynth.designs.stepping import (
     select,
     status_word,
 )
+from obsynth.designs.interval.record import SWEEPS, IntervalDesign
+from obsynth.designs.interval.rows import Rows
 
 __all__ = ["build_step", "first_box", "memory_layout"]
 

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import FloatArray, exact, nearest
+from obsynth.derive.rigour.exact_arrays import FloatArray, exact, nearest
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.gains import (
     Reduced,
     lp_gain,
@@ -17,6 +16,7 @@ from obsynth.designs.interval.gains import (
     refined,
     sylvester_gain,
 )
+from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import FloatArray, exact, nearest, negative, positive
+from obsynth.derive.rigour.exact_arrays import FloatArray, exact, nearest, negative, positive
+from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.interval.record import IntervalDesign
 
 __all__ = ["NEGATIVE", "comparison_radius", "divergence", "largest_alpha", "lipschitz_alpha"]
 

@@ -28,11 +28,11 @@ as it is stored:
 True
 """
 
+from obsynth.derive.rigour.definite import ProofResult, prove_positive_definite
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.blocks import block, he, symmetric_block
 from obsynth.designs.lmi.caps import cap_condition, cap_gain
-from obsynth.designs.lmi.definite import ProofResult, prove_positive_definite
-from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.lmi.exact import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,

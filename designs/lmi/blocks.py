@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.lmi.exact import ExactMatrix
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.derive.rigour.exact_matrix import ExactMatrix
 from obsynth.designs.lmi.expression import Affine, ExpressionError, constant
 
 __all__ = ["block", "he", "symmetric_block"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.lmi.definite import prove_positive_definite
+from obsynth.derive.rigour.definite import prove_positive_definite
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Block
 

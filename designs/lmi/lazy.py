@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import SolverTrouble
+from obsynth.designs.core.errors import SolverTrouble
 from obsynth.designs.lmi.family import Family
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.retry import solve_with_retries

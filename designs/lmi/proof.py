@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import CertificateError
-from obsynth.designs.lmi.definite import prove_positive_definite
-from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.lmi.exact import ExactMatrix, is_positive_definite
+from obsynth.derive.rigour.definite import prove_positive_definite
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
+from obsynth.designs.core.errors import CertificateError
 
 __all__ = ["FamilyProof", "prove_family"]
 

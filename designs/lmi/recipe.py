@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.dual import Binding, MarginBound, binding_blocks, bound_margin
 from obsynth.designs.lmi.expression import Inequality, scalar
 from obsynth.designs.lmi.family import Family

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.clarabel_backend import solve_form
 from obsynth.designs.lmi.cones import Cone, ConicForm, conic_form
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.symbolic.errors import ObsynthError
 
 __all__ = [

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive import QPV
-from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.observer import Observer
-from obsynth.designs.qpv.design import METHOD, QPVDesign
-from obsynth.designs.qpv.prepare import derive_form
-from obsynth.designs.qpv.proof import prove_design
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import with_header
+from obsynth.designs.qpv.claims import prove_design
+from obsynth.designs.qpv.model import derive_form
+from obsynth.designs.qpv.record import METHOD, QPVDesign
 from obsynth.designs.qpv.schedule import FASTEST, fastest_mode, measured_schedule
 from obsynth.designs.qpv.step import build_ode, build_step, make_start, memory_layout
-from obsynth.designs.records import with_header
 from obsynth.symbolic.text import write_text
 
 __all__ = ["assemble", "prove", "to_record"]

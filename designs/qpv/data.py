@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.affine_family import AffineFamily
-from obsynth.derive.qpv import QPVLayout, QPVVertices
-from obsynth.designs.qpv.members import ErrorSets, psi_kept
+from obsynth.derive.forms.qpv.form import QPVVertices
+from obsynth.derive.forms.qpv.layout import QPVLayout
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.designs.qpv.error_matrix import ErrorSets, psi_kept
 from obsynth.designs.qpv.polya import PolyaTerm, collapsed_terms, polya_terms
 
 __all__ = ["VertexData", "read_vertices"]

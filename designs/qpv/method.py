@@ -14,8 +14,8 @@ from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import QPV
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.observer import Observer
     from obsynth.designs.qpv.work import Workspace
     from obsynth.symbolic import Plant
 

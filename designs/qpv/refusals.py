@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import CertificateError
+from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.qpv.synthesis import Setting, solve
 
 __all__ = ["Accepted", "printed_refusal"]

@@ -9,7 +9,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.designs.qpv.design import QPVDesign
+from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.errors import ObsynthError

@@ -10,16 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.bounded_error.runtime import largest_level
-from obsynth.designs.qpv.design import QPVDesign
+from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
+from obsynth.designs.qpv.record import QPVDesign
 from obsynth.designs.qpv.schedule import measured_schedule, vertex_weights
 from obsynth.designs.starting import read_box, read_vector
-from obsynth.designs.stepping import (
-    all_finite,
-    finite_or,
-    make_step,
-    select,
-    status_word,
-)
 from obsynth.symbolic import Plant
 
 __all__ = ["build_ode", "build_step", "make_start", "memory_layout"]

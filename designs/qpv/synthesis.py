@@ -25,6 +25,7 @@ from obsynth.designs.lmi import (
     trace,
 )
 from obsynth.designs.qpv.data import VertexData
+from obsynth.designs.qpv.error_matrix import ErrorSets
 from obsynth.designs.qpv.lmis import (
     Closed,
     close,
@@ -35,7 +36,6 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
-from obsynth.designs.qpv.members import ErrorSets
 from obsynth.designs.qpv.polya import PolyaTerm
 
 __all__ = ["Norm", "Setting", "Unknowns", "rough_objective", "solve", "state_problem"]

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import Knob, largest_margin, search_line, smallest_changes
-from obsynth.designs.qpv.choices import (
+from obsynth.designs.qpv.claims import inverse_bounds, prove_design, region_factor
+from obsynth.designs.qpv.error_matrix import ErrorSets, entering
+from obsynth.designs.qpv.model import Prepared, check_faults, prepare
+from obsynth.designs.qpv.option_meanings import (
     cover,
     noise_centre,
     one_of_each_pair,
@@ -20,11 +23,8 @@ from obsynth.designs.qpv.choices import (
     start_corners,
     unit_shape,
 )
-from obsynth.designs.qpv.design import NoiseBound, QPVDesign
-from obsynth.designs.qpv.members import ErrorSets, entering
 from obsynth.designs.qpv.polytopes import Shape, box
-from obsynth.designs.qpv.prepare import Prepared, check_faults, prepare
-from obsynth.designs.qpv.proof import inverse_bounds, prove_design, region_factor
+from obsynth.designs.qpv.record import NoiseBound, QPVDesign
 from obsynth.designs.qpv.refusals import Accepted, printed_refusal
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.schedule import choose_sample_time, fastest_mode
@@ -39,7 +39,7 @@ from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.text import write_text
 
 if TYPE_CHECKING:
-    from obsynth.designs.observer import Observer
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.qpv.method import QPVObserver
 
 __all__ = ["Workspace"]

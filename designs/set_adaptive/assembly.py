@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.observer import Observer
-from obsynth.designs.records import with_header
-from obsynth.designs.set_adaptive.bank import BankDesign
-from obsynth.designs.set_adaptive.bank_assembly import assemble_bank, prove_bank
-from obsynth.designs.set_adaptive.design import METHOD, SetDesign
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import with_header
+from obsynth.designs.filter_bank.claims import assemble_bank, prove_bank
+from obsynth.designs.filter_bank.model import BankDesign
+from obsynth.designs.set_adaptive.claims import prove_design
 from obsynth.designs.set_adaptive.equations import memory_layout
+from obsynth.designs.set_adaptive.model import Structure
 from obsynth.designs.set_adaptive.ode import build_ode
-from obsynth.designs.set_adaptive.proof import prove_design
+from obsynth.designs.set_adaptive.record import METHOD, SetDesign
 from obsynth.designs.set_adaptive.step import build_step, initial_memory
-from obsynth.designs.set_adaptive.structure import Structure
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic.errors import ObsynthError

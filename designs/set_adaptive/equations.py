@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.set_adaptive.design import SetDesign
+from obsynth.designs.set_adaptive.record import SetDesign
 
 __all__ = ["Drive", "Memory", "drives", "ends", "memory_layout", "residuals", "theta_rates"]
 

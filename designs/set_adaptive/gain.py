@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi import Problem, diagonal, full, scalar, trace
 
 __all__ = ["Gain", "analyse_gain", "design_gain", "gain_problem", "off_diagonal"]

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.set_adaptive.bank import BankDesign
-from obsynth.designs.set_adaptive.design import SetDesign
+from obsynth.designs.filter_bank.model import BankDesign
+from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
-    from obsynth.designs.observer import Observer
+    from obsynth.designs.core.observer import Observer
 
 __all__ = ["Indicators", "Monitors", "bank_intervals", "fault_indicators", "monitors"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import sympy as sp
 
-from obsynth.designs.stepping import all_finite, finite_or
+from obsynth.designs.core.stepping import all_finite, finite_or
 from obsynth.symbolic import Plant
 
 __all__ = ["known_signals"]

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.set_adaptive.rounding import PRECISIONS
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import Split
+    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.observer import Observer
-    from obsynth.designs.set_adaptive.design import SetDesign
     from obsynth.designs.set_adaptive.gain import Gain
-    from obsynth.designs.set_adaptive.structure import Structure
+    from obsynth.designs.set_adaptive.model import Structure
+    from obsynth.designs.set_adaptive.record import SetDesign
     from obsynth.symbolic import Plant
 
 __all__ = ["SetAdaptiveObserver"]
@@ -183,10 +183,10 @@ class SetAdaptiveObserver:
         """
         from obsynth.designs.set_adaptive.assembly import assemble
         from obsynth.designs.set_adaptive.gain import design_gain
-        from obsynth.designs.set_adaptive.structure import read_structure
+        from obsynth.designs.set_adaptive.model import read_structure
 
         if self.robust:
-            from obsynth.designs.set_adaptive.bank import design_bank
+            from obsynth.designs.filter_bank.model import design_bank
 
             return assemble(design_bank(model, self), level="full")
         structure = read_structure(model, self.noise)
@@ -217,7 +217,7 @@ class SetAdaptiveObserver:
         """
         from obsynth.designs.set_adaptive.assembly import assemble
         from obsynth.designs.set_adaptive.gain import analyse_gain
-        from obsynth.designs.set_adaptive.structure import read_structure
+        from obsynth.designs.set_adaptive.model import read_structure
 
         if self.robust:
             raise ObsynthError("the bank (robust=True) has no gains: use design", option="robust")
@@ -251,7 +251,7 @@ class SetAdaptiveObserver:
             For the bank, which needs no program.
         """
         from obsynth.designs.set_adaptive.gain import gain_problem
-        from obsynth.designs.set_adaptive.structure import read_structure
+        from obsynth.designs.set_adaptive.model import read_structure
 
         if self.robust:
             raise ObsynthError("the bank (robust=True) needs no program", option="robust")
@@ -268,8 +268,8 @@ class SetAdaptiveObserver:
         A_upper: FloatArray,
         A_lower_box: FloatArray,
     ) -> SetDesign:
-        from obsynth.designs.set_adaptive.design import SetDesign
-        from obsynth.designs.set_adaptive.structure import output_of_fault
+        from obsynth.designs.set_adaptive.model import output_of_fault
+        from obsynth.designs.set_adaptive.record import SetDesign
         from obsynth.designs.set_adaptive.transition import uniformisation
 
         plant = structure.form.model

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import casadi as ca
 
-from obsynth.designs.set_adaptive.design import SetDesign
 from obsynth.designs.set_adaptive.equations import (
     Memory,
     drives,
@@ -13,6 +12,7 @@ from obsynth.designs.set_adaptive.equations import (
     residuals,
     theta_rates,
 )
+from obsynth.designs.set_adaptive.record import SetDesign
 
 __all__ = ["build_ode"]
 

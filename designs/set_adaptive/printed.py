@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, off_diagonal
 
 __all__ = ["printed_gain", "solve_printed"]

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.set_adaptive.design import SetDesign
+from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.set_adaptive.equations import (
     Drive,
     Memory,
@@ -25,9 +25,9 @@ from obsynth.designs.set_adaptive.equations import (
 )
 from obsynth.designs.set_adaptive.inputs import known_signals
 from obsynth.designs.set_adaptive.ode import exact_arguments
+from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.rounding import SHOWN, outward
 from obsynth.designs.set_adaptive.transition import apply, uniformisation
-from obsynth.designs.stepping import all_finite, finite_or, make_step, select, status_word
 
 __all__ = ["build_step", "initial_memory"]
 

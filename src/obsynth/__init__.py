@@ -54,8 +54,7 @@ if TYPE_CHECKING:
     from obsynth.symbolic import Plant as Plant
     from obsynth.symbolic import PlantError as PlantError
     from obsynth.symbolic import Scenario as Scenario
-    from obsynth.symbolic import plants as plants
-    from obsynth.symbolic import scenarios as scenarios
+    from obsynth.symbolic import plants, scenarios
 
 __version__ = "0.1.0"
 

@@ -22,7 +22,7 @@ from obsynth.codegen import (
     find_compiler,
     generate_c,
 )
-from obsynth.designs.observer import STATUS
+from obsynth.designs.core.observer import STATUS
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals import Status, batch, bound_ranges, branch
+from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.search import batch, branch
 
 X = ca.SX.sym("x", 3)
 UNIT = [(-1, 2)] * 3

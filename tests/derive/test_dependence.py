@@ -5,10 +5,10 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, jacobian_bounds, split
-from obsynth.derive.affine_family import AffineFamily, build_family
-from obsynth.derive.dependence import AffineDependence, find_dependences
+from obsynth.derive.jacobian.dependence import AffineDependence, find_dependences
+from obsynth.derive.jacobian.family import AffineFamily, build_family
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants import lorenz
+from obsynth.symbolic.plants.lorenz import lorenz
 
 x, y = sp.symbols("x y", real=True)
 POINTS = np.random.default_rng(0).random((2, 60)) + 0.5

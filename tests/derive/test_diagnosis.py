@@ -8,17 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import StructureError, analyse, jacobian_bounds, split, unknown_input_condition
-from obsynth.derive.diagnosis import (
-    excitation,
-    fault_isolability,
-    isolability,
-    pair_margin,
-    system_zeros,
-    weakest_member,
-    zeros_over_polytope,
-)
-from obsynth.derive.diagnosis.frozen import balls, precision, rank
 from obsynth.derive.faults import invariant_zeros
+from obsynth.derive.structure import isolability
+from obsynth.derive.structure.detectability import pair_margin, weakest_member
+from obsynth.derive.structure.excitation import excitation
+from obsynth.derive.structure.frozen import balls, precision, rank
+from obsynth.derive.structure.isolability import fault_isolability
+from obsynth.derive.structure.zeros import system_zeros, zeros_over_polytope
 from obsynth.symbolic import Plant, plants
 
 # -- zeros -----------------------------------------------------------------------------------------

@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals import Program, arithmetic, cancelling, evaluate, functions, rules
-from obsynth.derive.intervals.program import constant_interval
+from obsynth.derive.intervals import functions, rules
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.program import Program, constant_interval
+from obsynth.derive.intervals.rewriting import cancelling
+from obsynth.derive.rigour import interval as arithmetic
 
 QUICK = settings(max_examples=120, deadline=None, derandomize=True)
 UNARY = {

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from obsynth.derive import Status, UnboundedError, jacobian_bounds, split
+from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
+from obsynth.derive.constants.lipschitz import lipschitz
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.lipschitz import lipschitz
-from obsynth.derive.spectrum import eigenvalue_over_interval
 from obsynth.symbolic import Plant, plants
 
 

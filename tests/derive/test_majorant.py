@@ -8,8 +8,8 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import Status, split
+from obsynth.derive.constants.majorant import majorant
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.majorant import majorant
 from obsynth.symbolic import Plant, plants
 
 

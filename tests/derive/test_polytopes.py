@@ -12,20 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, jacobian_bounds, polytopes
-from obsynth.derive.affine_family import AffineFamily
-from obsynth.derive.polytopes import (
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.polytopes import fewer, support
+from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
+from obsynth.derive.polytopes.polytope import (
     Label,
-    drop_scalars,
-    fewer,
-    jacobian_polytope,
     polytope_from_halfspaces,
     polytope_from_vertices,
-    principal_family,
-    sampled_hull,
-    support,
 )
+from obsynth.derive.polytopes.sampled import sampled_hull
+from obsynth.derive.polytopes.support import jacobian_polytope
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants import exothermic_cstr, quadruple_tank, three_tanks, van_der_pol
+from obsynth.symbolic.plants.exothermic_cstr import exothermic_cstr
+from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants.three_tanks import three_tanks
+from obsynth.symbolic.plants.van_der_pol import van_der_pol
 
 QUICK = settings(max_examples=30, deadline=None, derandomize=True)
 

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.derive import Status, jacobian_bounds, jacobian_entries, products_to_sums
-from obsynth.derive.products_to_sums import same_waves
+from obsynth.derive import Status, jacobian_bounds
+from obsynth.derive.algebra import products_to_sums
+from obsynth.derive.algebra.products_to_sums import same_waves
+from obsynth.derive.jacobian import entries as jacobian_entries
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants import planar_arm_bias, quadrotor
+from obsynth.symbolic.plants.planar_arm import planar_arm_bias
+from obsynth.symbolic.plants.quadrotor import quadrotor
 
 fu = import_module("sympy.simplify.fu")
 a, b, v, m = sp.symbols("a b v m", real=True)

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, StructureError, UnboundedError
-from obsynth.derive.qpv import augment_plant, build, qpv
-from obsynth.derive.qpv.build import prove_quadratic
+from obsynth.derive.forms.qpv import build
+from obsynth.derive.forms.qpv.augment import augment_plant
+from obsynth.derive.forms.qpv.build import prove_quadratic, qpv
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational

@@ -7,15 +7,12 @@ import sympy as sp
 
 from obsynth.derive import StructureError, UnboundedError
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals import Program, evaluate
-from obsynth.derive.remainder import (
-    FlowError,
-    Remainder,
-    discretisation_remainder,
-    flow,
-    flow_box,
-    work,
-)
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.remainder import flow, work
+from obsynth.derive.remainder.certify import discretisation_remainder
+from obsynth.derive.remainder.flow import FlowError, flow_box
+from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.remainder.system import step_derivatives, system, time_derivatives
 from obsynth.derive.remainder.trees import difference_term, trees
 from obsynth.symbolic import Plant, plants

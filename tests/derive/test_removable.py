@@ -8,7 +8,10 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import UnboundedError, jacobian_bounds
-from obsynth.derive.intervals import Status, arithmetic, bound_ranges, quotients, removable, rules
+from obsynth.derive.intervals import rules
+from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.rewriting import quotients, removable
+from obsynth.derive.rigour import interval as arithmetic
 from obsynth.symbolic import Plant
 from obsynth.symbolic.functions import BY_NAME, phi1, tanhc
 

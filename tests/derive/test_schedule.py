@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.intervals import Program
-from obsynth.derive.intervals.batch import Entries
-from obsynth.derive.intervals.branch import Budget, Search
-from obsynth.derive.intervals.problem import make_problem
+from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import RULES, uncertain
 from obsynth.derive.intervals.schedule import Schedule
-from obsynth.derive.intervals.stages import staged
+from obsynth.derive.intervals.search.batch import Entries
+from obsynth.derive.intervals.search.branch import Budget, Search
+from obsynth.derive.intervals.search.problem import make_problem
+from obsynth.derive.intervals.search.stages import staged
 
 QUICK = settings(max_examples=60, deadline=None, derandomize=True)
 X = ca.SX.sym("x", 3)
@@ -116,8 +116,8 @@ def test_shared_and_single_programs_give_the_same(monkeypatch, cost):
     program = Program.from_casadi(ca.Function("f", [X], [column]))
     lower, upper = boxes(3, 30)
     entry = np.arange(30) % 3
-    monkeypatch.setattr("obsynth.derive.intervals.batch._COST_BOX", 1.0)
-    monkeypatch.setattr("obsynth.derive.intervals.batch._COST_CALL", cost)
+    monkeypatch.setattr("obsynth.derive.intervals.search.batch._COST_BOX", 1.0)
+    monkeypatch.setattr("obsynth.derive.intervals.search.batch._COST_CALL", cost)
     found = Entries(program, np.array([[0, 1], [1, -1], [2, 0]])).enclose(
         entry, lower, upper, judged=True
     )

@@ -5,9 +5,9 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive import secants
-from obsynth.derive.secants import at_zero, quotients, secant
-from obsynth.derive.zero_test import prove_zero
+from obsynth.derive.algebra import secants
+from obsynth.derive.algebra.secants import at_zero, quotients, secant
+from obsynth.derive.algebra.zero_test import prove_zero
 from obsynth.symbolic.functions import phi1, tanhc
 
 x, y, z = sp.symbols("x y z", real=True)

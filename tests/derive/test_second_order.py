@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.intervals import Status, bound_ranges, branch, curvature, reduction, stages
-from obsynth.derive.intervals.curvature import Hessians, is_concave
-from obsynth.derive.intervals.reduction import SxGraph, reduce_variables
+from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.search import branch, curvature, reduction, stages
+from obsynth.derive.intervals.search.curvature import Hessians, is_concave
+from obsynth.derive.intervals.search.reduction import SxGraph, reduce_variables
 
 X = ca.SX.sym("x", 4)
 NONE = ca.SX(0, 1)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.intervals import bound_ranges
+from obsynth.derive.intervals.ranges import bound_ranges
 
 X = ca.SX.sym("x", 3)
 JUDGED = 40

@@ -10,19 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.intervals import Status, bound_ranges
-from obsynth.derive.intervals.ranges import make_problem
-from obsynth.derive.spectrum import (
-    SymmetricField,
+from obsynth.derive.constants import eigenvalue_search as search
+from obsynth.derive.constants import interval_matrix
+from obsynth.derive.constants.eigenvalue_search import largest_over_box
+from obsynth.derive.constants.interval_matrix import (
     augment,
     eigenvalue_over_interval,
-    interval_matrix,
-    largest_eigenvalue,
-    largest_over_box,
     norm_over_interval,
-    search,
-    symmetric,
 )
+from obsynth.derive.constants.symmetric_field import SymmetricField
+from obsynth.derive.intervals.ranges import Status, bound_ranges, make_problem
+from obsynth.derive.rigour import eigenvalues as symmetric
+from obsynth.derive.rigour.eigenvalues import largest_eigenvalue
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
 

@@ -15,7 +15,7 @@ from obsynth.derive import (
 )
 from obsynth.derive.faults import invariant_zeros, separable_faults
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants import quadruple_tank
+from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
 
 
 def linear_plant(A, D=None, F=None, C=None, Ts=1.0, sensor=()):

@@ -3,8 +3,8 @@
 import pytest
 import sympy as sp
 
-from obsynth.derive import zero_test
-from obsynth.derive.zero_test import NUMERIC, FormProof, prove_zero
+from obsynth.derive.algebra import zero_test
+from obsynth.derive.algebra.zero_test import NUMERIC, FormProof, prove_zero
 
 x, y = sp.symbols("x y", real=True)
 

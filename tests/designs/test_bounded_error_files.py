@@ -9,7 +9,7 @@ import pytest
 
 import obsynth as ob
 from obsynth.designs.bounded_error.assembly import assemble, to_record
-from obsynth.designs.bounded_error.design import UioDesign
+from obsynth.designs.bounded_error.record import UioDesign
 
 # M_min and M_max as printed in section 6 of the paper.
 PRINTED_RANGES = {"m11": (0.0026, 0.0065), "m22": (0.0008, 0.0033)}

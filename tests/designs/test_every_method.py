@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.certificate import Certificate
-from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.designs.core.certificate import Certificate
+from obsynth.designs.core.observer import STEP_OUTPUTS
 
 
 def tank():
@@ -101,7 +101,7 @@ def test_a_design_has_a_checked_certificate(name, monkeypatch):
 
 def test_an_unproved_claim_stops_the_design(name, monkeypatch):
     """Mutant: one claim that does not hold."""
-    from obsynth.designs.certificate import Claim
+    from obsynth.designs.core.certificate import Claim
 
     method, plant = METHODS[name]
     original = Certificate.__init__

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import obsynth as ob
 from obsynth.designs import STATUS, FaultDetector
-from obsynth.designs.errors import DetectorError
-from obsynth.designs.observer import STEP_OUTPUTS
+from obsynth.designs.core.errors import DetectorError
+from obsynth.designs.core.observer import STEP_OUTPUTS
 
 NOISE = 0.05
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.errors import DetectorError
+from obsynth.designs.core.errors import DetectorError
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
 

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.designs.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.peak import bound as peak_bound_module
-from obsynth.designs.peak.attained import attained
-from obsynth.designs.peak.bound import PeakBound, peak_bound, prove_peak
-from obsynth.designs.peak.responses import power_sum, response
-from obsynth.designs.peak.small_gain import small_gain_solution
-from obsynth.designs.peak.system import PeakSystem, peak_system, projected_gains
-from obsynth.designs.peak.transient import Transient, transient
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.designs.bounded_error.peak import bound as peak_bound_module
+from obsynth.designs.bounded_error.peak.attained import attained
+from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
+from obsynth.designs.bounded_error.peak.responses import power_sum, response
+from obsynth.designs.bounded_error.peak.small_gain import small_gain_solution
+from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
+from obsynth.designs.bounded_error.peak.transient import Transient, transient
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.symbolic.errors import ObsynthError
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "bounded_error_uio.json"

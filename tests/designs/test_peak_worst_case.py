@@ -13,14 +13,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.lmi.enclosure import Enclosure
-from obsynth.designs.peak import bound as peak_bound_module
-from obsynth.designs.peak.attained import Attained, attained
-from obsynth.designs.peak.bound import PeakBound, peak_bound
-from obsynth.designs.peak.responses import response
-from obsynth.designs.peak.system import PeakSystem, peak_system, projected_gains
-from obsynth.designs.peak.transient import transient
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.designs.bounded_error.peak import bound as peak_bound_module
+from obsynth.designs.bounded_error.peak.attained import Attained, attained
+from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound
+from obsynth.designs.bounded_error.peak.responses import response
+from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
+from obsynth.designs.bounded_error.peak.transient import transient
+from obsynth.designs.core.errors import InfeasibleDesign
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "bounded_error_uio.json"
 WBAR, EPSBAR = np.full(3, 0.1), np.full(2, 0.05)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.designs.certificate import Certificate, Claim, Guarantee
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee
 from obsynth.symbolic import Plant, Scenario
 
 N = 200

@@ -130,7 +130,7 @@ def test_ink_follows_the_page(page):
 
 
 def test_a_claim_that_does_not_hold_is_shown_as_such(toy, tmp_path):
-    from obsynth.designs.certificate import Certificate, Claim
+    from obsynth.designs.core.certificate import Certificate, Claim
 
     class Doubtful(toy.observer):
         @property

@@ -8,8 +8,8 @@ import pytest
 
 from obsynth.evaluate import ReportError, SimulationError
 from obsynth.evaluate.folder import check_target, complete_folder
-from obsynth.evaluate.studies import printed, quadruple_tank
-from obsynth.evaluate.studies.quadruple_tank import ELLIPSOID, PEAK, shortened
+from obsynth.evaluate.studies import printed
+from obsynth.evaluate.studies.quadruple_tank import ELLIPSOID, PEAK, quadruple_tank, shortened
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth.symbolic import Plant, PlantError, Scenario
-from obsynth.symbolic.plants import quadruple_tank
-from obsynth.symbolic.scenarios import quadruple_tank as scenario
+from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.scenarios.quadruple_tank import quadruple_tank as scenario
 
 
 def fault_one(k):

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, UnboundedError
-from obsynth.derive.quasi_lpv import quasi_lpv
+from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.symbolic import Plant
 
 R = sp.Rational

@@ -5,7 +5,8 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, StructureError, split
-from obsynth.derive.quasi_lpv import UNMEASURED_NOTE, quasi_lpv
+from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
+from obsynth.derive.forms.quasi_lpv.form import UNMEASURED_NOTE
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational

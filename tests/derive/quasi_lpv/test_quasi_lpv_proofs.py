@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError
-from obsynth.derive.quasi_lpv import build, quasi_lpv
-from obsynth.derive.quasi_lpv.build import prove_form
-from obsynth.derive.quasi_lpv.terms import stacked_rows
-from obsynth.derive.zero_test import NUMERIC, FormProof
+from obsynth.derive.algebra.zero_test import NUMERIC, FormProof
+from obsynth.derive.forms.quasi_lpv import build
+from obsynth.derive.forms.quasi_lpv.build import prove_form, quasi_lpv
+from obsynth.derive.forms.quasi_lpv.terms import stacked_rows
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational

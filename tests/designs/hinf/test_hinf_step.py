@@ -6,7 +6,7 @@ import pytest
 
 import obsynth as ob
 from obsynth.codegen import find_compiler
-from obsynth.designs.observer import STATUS
+from obsynth.designs.core.observer import STATUS
 
 
 def run(step, memory, inputs, outputs):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.hinf.design import HinfDesign
-from obsynth.designs.hinf.frozen import frozen_gain, hold_points
-from obsynth.designs.hinf.prepare import prepare
+from obsynth.designs.hinf.model import prepare
+from obsynth.designs.hinf.operating_points import frozen_gain, hold_points
+from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.worst_case import _half_sine, _Loop, worst_case
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "hinf_worst_case.py"

@@ -11,7 +11,7 @@ import sympy as sp
 
 import obsynth as ob
 from obsynth.designs.hinf.lmis import dissipation_block, loop_of_filter
-from obsynth.designs.hinf.prepare import prepare
+from obsynth.designs.hinf.model import prepare
 from obsynth.designs.hinf.problems import state_problem
 from obsynth.designs.hinf.synthesis import find_level
 from obsynth.designs.lmi import Affine

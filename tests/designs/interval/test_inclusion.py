@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import nearest
+from obsynth.derive.rigour.exact_arrays import nearest
+from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.step import build_step
 

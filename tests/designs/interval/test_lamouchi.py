@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import exact, nearest
+from obsynth.derive.rigour.exact_arrays import exact, nearest
 from obsynth.designs.interval.gains import Reduced, lp_problem, sylvester_gain
 from obsynth.designs.interval.printed import FLAWS, printed_faults
+from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.synthesis import with_gains
 from obsynth.designs.interval.theorem import comparison_radius, largest_alpha, lipschitz_alpha
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.interval.design import IntervalDesign
-from obsynth.designs.interval.exact_arrays import exact
+from obsynth.derive.rigour.exact_arrays import exact
+from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.step import build_step, first_box
 
 BOX = np.tile([0.5, 1.5], (3, 1))

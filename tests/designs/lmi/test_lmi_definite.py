@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from obsynth.derive.rigour import definite
 from obsynth.designs.lmi import (
     Enclosure,
     Problem,
-    definite,
     full,
     is_positive_definite,
     prove_positive_definite,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.designs.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi import (
     Enclosure,
     ExactMatrix,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi import Problem, retry, solve_with_retries, symmetric, trace
 from obsynth.designs.lmi.cones import conic_form
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
-from obsynth.designs.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi import (
     Knob,
     bisect_feasible,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from obsynth.designs.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Enclosure,
     Knob,

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import obsynth as ob
-from obsynth.designs.qpv.members import ErrorSets, entering, psi_family, psi_kept
+from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family, psi_kept
+from obsynth.designs.qpv.model import prepare
 from obsynth.designs.qpv.polytopes import box, cross, hull
-from obsynth.designs.qpv.prepare import prepare
 from obsynth.designs.qpv.work import Workspace
 
 REGION = ob.Ellipsoid([1.0, 0.1], [5.0, 0.0])

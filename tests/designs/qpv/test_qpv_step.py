@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.observer import STATUS, STEP_OUTPUTS
+from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 
 U = [1945 / 34, 0.0, 17.5]
 CENTRE = np.array([10.0, 10.0, 10.0])

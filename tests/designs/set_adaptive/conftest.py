@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
-from obsynth.designs.set_adaptive.structure import read_structure
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.model import read_structure
 
 PAPER_GAIN = {"L": 3.0 * np.eye(3, 2)}
 A13 = A32 = 1.329e-4

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
 from obsynth.designs.set_adaptive import step as step_module
 from obsynth.designs.set_adaptive.assembly import assemble
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT, apply, uniformisation
 
 BOUND = 4.5e-3

@@ -8,10 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import obsynth as ob
-from obsynth.designs.errors import InfeasibleDesign
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.set_adaptive.gain import analyse_gain, design_gain
 from obsynth.designs.set_adaptive.indicators import fault_indicators, monitors
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.printed import solve_printed
 
 TABLE = {

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.indicators import fault_indicators
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.symbolic.noise import bounded_noise, splitmix64
 from obsynth.symbolic.scenarios.three_tanks import three_tanks_control
 

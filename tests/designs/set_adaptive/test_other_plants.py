@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 NOISE = 0.02
 

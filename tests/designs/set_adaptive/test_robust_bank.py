@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver, bank_intervals
-from obsynth.designs.set_adaptive import bank_step as step_module
+from obsynth.derive.jacobian.slope_signs import Monotone, with_ranges
+from obsynth.designs.filter_bank import step as step_module
 from obsynth.designs.set_adaptive.assembly import assemble
-from obsynth.designs.set_adaptive.monotone import Monotone, with_ranges
+from obsynth.designs.set_adaptive.indicators import bank_intervals
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.symbolic.noise import bounded_noise
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.assembly import assemble, prove
 from obsynth.designs.set_adaptive.indicators import fault_indicators, monitors
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
 

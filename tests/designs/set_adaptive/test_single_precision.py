@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from obsynth.designs.set_adaptive import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.rounding import outward
 
 BOUND = 4.5e-3

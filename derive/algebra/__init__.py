@@ -1,0 +1,1 @@
+"""Exact symbolic algebra: zero tests, factors, secants, linear parts, identities."""

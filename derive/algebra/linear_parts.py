@@ -1,0 +1,120 @@
+"""Constant matrices with which signals enter a plant, or the reason why they do not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour.numbers import is_zero, round_number, substitute
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["LinearPart", "constant_columns", "rounded"]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPart:
+    """A constant matrix, exactly and as doubles.
+
+    Attributes
+    ----------
+    exact : sympy.Matrix
+        Exact entries.
+    value : ndarray
+        Nearest doubles.
+    rounding : ndarray
+        Bounds of |exact - value|; zero where the entry is a double.
+    """
+
+    exact: sp.Matrix
+    value: NDArray[np.float64]
+    rounding: NDArray[np.float64]
+
+
+def rounded(exact: sp.Matrix) -> LinearPart:
+    """Round a matrix of exact numbers to doubles, with bounds of the errors.
+
+    Parameters
+    ----------
+    exact : sympy.Matrix
+        Real numbers.
+
+    Returns
+    -------
+    LinearPart
+        Exact and rounded.
+
+    Examples
+    --------
+    >>> part = rounded(sp.Matrix([[sp.Rational(1, 2), sp.Rational(1, 3)]]))
+    >>> part.value[0, 0], part.rounding[0, 0], bool(part.rounding[0, 1] > 0)
+    (np.float64(0.5), np.float64(0.0), True)
+    """
+    value, error = np.zeros(exact.shape), np.zeros(exact.shape)
+    for i in range(exact.rows):
+        for j in range(exact.cols):
+            value[i, j], error[i, j] = round_number(exact[i, j])
+    return LinearPart(sp.ImmutableMatrix(exact), value, error)
+
+
+def constant_columns(
+    model: Plant, rows: sp.Matrix, symbols: Sequence[sp.Symbol], what: str, row_names: Sequence[str]
+) -> LinearPart:
+    """Matrix M of rows = M symbols + (something free of the symbols).
+
+    Parameters
+    ----------
+    model : Plant
+        Where the constants have their values.
+    rows : sympy.Matrix, shape (n, 1)
+        Right-hand side or output map.
+    symbols : sequence of sympy.Symbol
+        Signals that have to enter linearly, with constant coefficients.
+    what : str
+        What these signals are, for messages.
+    row_names : sequence of str
+        Names of the rows, for messages.
+
+    Returns
+    -------
+    LinearPart
+        Shape (n, number of symbols).
+
+    Raises
+    ------
+    StructureError
+        A signal enters nonlinearly or with a coefficient that is not constant; ``symbol`` and
+        ``row`` say which and where.
+    """
+    exact = sp.zeros(rows.rows, len(symbols))
+    values = model.constant_values
+    for i, row in enumerate(rows):
+        for j, symbol in enumerate(symbols):
+            if not row.has(symbol):
+                continue
+            slope = sp.diff(row, symbol)
+            if slope.free_symbols - set(values):
+                slope = sp.simplify(slope)
+            others = sorted(str(s) for s in slope.free_symbols - set(values))
+            if others:
+                raise StructureError(
+                    f"the {what} {symbol} enters the row of {row_names[i]} with the coefficient "
+                    f"{slope}, which depends on {', '.join(others)}; it has to enter linearly with "
+                    "a constant coefficient",
+                    symbol=str(symbol),
+                    row=row_names[i],
+                    coefficient=slope,
+                )
+            exact[i, j] = substitute(slope, values)
+        rest = row - sum((exact[i, j] * s for j, s in enumerate(symbols)), sp.Integer(0))
+        rest = substitute(rest, values)
+        zero = substitute(row.subs(dict.fromkeys(symbols, 0)), values)
+        if not is_zero(rest - zero):
+            raise StructureError(
+                f"the {what} signals do not enter the row of {row_names[i]} linearly",
+                symbol=", ".join(str(s) for s in symbols if row.has(s)),
+                row=row_names[i],
+            )
+    return rounded(exact)

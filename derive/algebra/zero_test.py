@@ -1,0 +1,236 @@
+"""Proof that an expression is identically zero, or evidence at 60 digits, or a counterexample."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from random import Random
+from typing import Any
+
+import sympy as sp
+
+from obsynth.derive.algebra.secants import quotients
+
+__all__ = ["NUMERIC", "FormProof", "prove_zero"]
+
+Box = Mapping[sp.Symbol, tuple[float, float]]
+NUMERIC = "numerically zero at 60 digits"
+_ORDER = ("syntactic", "expand", "cancel", "simplify", NUMERIC)
+_DIGITS = 60
+_WORKING = 100
+_POINTS = 6
+_TRIES = 40
+# Beyond this size cancel and simplify take minutes, and numbers are the better evidence.
+_LARGEST_CANCEL = 3000
+_LARGEST_EXPONENTIAL = 1000
+_LARGEST_NUMERATOR = 3000
+_LARGEST_POWER = 8
+_LARGEST_SIMPLIFY = 600
+_GRID = 10**6
+
+
+@dataclass(frozen=True, eq=False)
+class FormProof:
+    """Proof that the parts of a form add up to the plant, row by row.
+
+    Attributes
+    ----------
+    rows : tuple of str
+        Names of the rows: states, then outputs.
+    methods : tuple of str
+        How every row was proved: ``"syntactic"``, ``"expand"``, ``"cancel"``, ``"simplify"``, or
+        that it is numerically zero at 60 digits only.
+    """
+
+    rows: tuple[str, ...]
+    methods: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """True when every row is proved symbolically."""
+        return all(method and method != NUMERIC for method in self.methods)
+
+    @property
+    def numeric_rows(self) -> tuple[str, ...]:
+        """Rows for which numbers are the only evidence."""
+        return tuple(r for r, m in zip(self.rows, self.methods, strict=True) if m == NUMERIC)
+
+    def __str__(self) -> str:
+        ways = ", ".join(sorted(set(self.methods) - {NUMERIC}))
+        if self.holds:
+            return f"identity proved in all {len(self.rows)} rows ({ways})"
+        others = len(self.rows) - len(self.numeric_rows)
+        proved = f"proved in {others} rows ({ways}), " if others else ""
+        return f"identity {proved}{NUMERIC} in the rows of {', '.join(self.numeric_rows)}"
+
+
+def prove_zero(expression: sp.Expr, box: Box) -> str:
+    """Prove that an expression is zero, or find that it is not.
+
+    Parameters
+    ----------
+    expression : sympy.Expr
+        Exact, without floating-point numbers.
+    box : mapping of sympy.Symbol to (float, float)
+        Where the symbols live; random points and signs are taken from there. Symbols that are
+        missing are unbounded.
+
+    Returns
+    -------
+    str
+        ``"syntactic"``, ``"expand"``, ``"cancel"`` or ``"simplify"`` for a proof, `NUMERIC` for an
+        expression that vanishes to 60 digits at random points of the box and resisted the proof,
+        empty for one that is not zero. Quotients like sinc(x) = sin(x)/x are compared away from
+        x = 0; what is equal there is equal at x = 0 by continuity.
+
+    Examples
+    --------
+    >>> x = sp.Symbol("x", real=True)
+    >>> prove_zero(sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), {})
+    'cancel'
+    >>> prove_zero(sp.sqrt(x) - x, {x: (1, 2)})
+    ''
+    """
+    expression = sp.sympify(expression)
+    if expression == 0:
+        return "syntactic"
+    expression = sp.expand(quotients(expression))
+    if expression == 0:
+        return "expand"
+    known = _positive(expression, box)
+    signed = sp.expand(expression.xreplace(known))
+    if signed == 0:
+        return "expand"
+    terms = list(sp.Add.make_args(signed))
+    values = _values(terms, {known.get(s, s): bounds for s, bounds in box.items()})
+    if values is None or not _vanish(values):
+        return ""
+    return max((_prove(sp.Add(*group)) for group in _groups(terms, values)), key=_ORDER.index)
+
+
+def _prove(expression: sp.Expr) -> str:
+    """Prove what numbers say is zero."""
+    if expression == 0:
+        return "expand"
+    for name, attempt, limit in (
+        ("cancel", _cancel, _LARGEST_CANCEL),
+        ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL),
+        ("simplify", sp.simplify, _LARGEST_SIMPLIFY),
+    ):
+        if expression.count_ops() > limit or _size_over_one(expression) > _LARGEST_NUMERATOR:
+            continue
+        try:
+            if attempt(expression) == 0:
+                return name
+        except (sp.PolynomialError, NotImplementedError):
+            continue
+    return NUMERIC
+
+
+def _cancel(expression: sp.Expr) -> sp.Expr:
+    if _size_over_one(expression) > _LARGEST_NUMERATOR:
+        return expression
+    return sp.cancel(expression)
+
+
+def _cancel_exponentials(expression: sp.Expr) -> sp.Expr:
+    """Cancel after writing trigonometric and hyperbolic functions as exponentials of single terms.
+
+    Addition theorems are then identities between monomials.
+    """
+    written = sp.expand_log(expression).rewrite(sp.exp)
+    return _cancel(sp.expand(written, trig=False))
+
+
+def _size_over_one(expression: sp.Expr) -> int:
+    """Estimate how many terms there are over one common denominator."""
+    terms = sp.Add.make_args(expression)
+    powers: dict[sp.Expr, int] = {}
+    for term in terms:
+        for factor in sp.Mul.make_args(term):
+            base, exponent = factor.as_base_exp()
+            if base.is_Add and exponent.is_number and exponent < 0:
+                powers[base] = max(powers.get(base, 0), int(sp.ceiling(-exponent)))
+    size = len(terms)
+    for base, power in powers.items():
+        size *= min(len(base.args), _LARGEST_NUMERATOR) ** min(power, _LARGEST_POWER)
+    return size
+
+
+def _groups(terms: list[sp.Expr], values: list[list[Any]]) -> list[list[sp.Expr]]:
+    """Parts of a sum that vanish by themselves: terms that are connected by common functions.
+
+    What does not vanish by itself stays in one part.
+    """
+    parts: list[tuple[list[int], set[sp.Expr]]] = []
+    for k, term in enumerate(terms):
+        joined: tuple[list[int], set[sp.Expr]] = ([k], _functions(term))
+        rest = []
+        for part in parts:
+            if part[1] & joined[1] or not part[1] | joined[1]:
+                joined = (part[0] + joined[0], part[1] | joined[1])
+            else:
+                rest.append(part)
+        parts = [*rest, joined]
+    alone = [part for part, _ in parts if _vanish([values[k] for k in part])]
+    settled = {k for part in alone for k in part}
+    left = [k for k in range(len(terms)) if k not in settled]
+    return [[terms[k] for k in part] for part in ([*alone, left] if left else alone)]
+
+
+def _functions(term: sp.Expr) -> set[sp.Expr]:
+    """Factors of a term that are no powers of symbols, without their exponents."""
+    bases = (factor.as_base_exp()[0] for factor in sp.Mul.make_args(term))
+    return {base for base in bases if not base.is_Symbol and not base.is_number}
+
+
+def _positive(expression: sp.Expr, box: Box) -> dict[sp.Symbol, sp.Symbol]:
+    """Symbols of which SymPy may know that they are positive over the box."""
+    return {
+        symbol: sp.Dummy(symbol.name, positive=True)
+        for symbol in expression.free_symbols
+        if box.get(symbol, (-1.0, 1.0))[0] > 0.0
+    }
+
+
+def _points(symbols: list[sp.Symbol], box: Box) -> Iterator[list[sp.Rational]]:
+    random = Random(0)
+    for _ in range(_TRIES):
+        point = []
+        for symbol in symbols:
+            lower, upper = box.get(symbol, (-1.0, 1.0))
+            low = sp.Rational(lower) if lower > -sp.oo else sp.Integer(-2)
+            high = sp.Rational(upper) if upper < sp.oo else low + 4
+            share = sp.Rational(2 * random.randrange(_GRID) + 1, 2 * _GRID)
+            point.append(low + share * (high - low))
+        yield point
+
+
+def _values(terms: list[sp.Expr], box: Box) -> list[list[Any]] | None:
+    """Values of terms at random points of the box, to 100 digits; None where there are too few."""
+    mpmath: Any = import_module("mpmath")
+    symbols = sorted(set().union(*(term.free_symbols for term in terms)), key=str)
+    function = sp.lambdify(symbols, terms, "mpmath", cse=True)
+    found: list[list[Any]] = []
+    with mpmath.workdps(_WORKING):
+        for point in _points(symbols, box):
+            try:
+                values = function(*[mpmath.mpf(int(v.p)) / int(v.q) for v in point])
+                if not all(mpmath.isfinite(v) for v in values):
+                    continue
+            except (ZeroDivisionError, ValueError, TypeError, OverflowError):
+                continue
+            found.append(values)
+            if len(found) == _POINTS:
+                return [list(column) for column in zip(*found, strict=True)]
+    return None
+
+
+def _vanish(values: list[list[Any]]) -> bool:
+    """Tell whether terms add up to zero to 60 digits, relative to their size, at every point."""
+    mpmath: Any = import_module("mpmath")
+    with mpmath.workdps(_WORKING):
+        limit = mpmath.mpf(10) ** -_DIGITS
+        return all(
+            abs(mpmath.fsum(column)) <= limit * mpmath.fsum(abs(v) for v in column)
+            for column in zip(*values, strict=True)
+        )

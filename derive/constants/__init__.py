@@ -1,0 +1,1 @@
+"""Guaranteed constants: Lipschitz and one-sided constants, majorants, extreme eigenvalues."""

@@ -1,0 +1,184 @@
+"""Extreme eigenvalue and norm over interval matrices: Hertz and Rohn, with verified eigenvalues.
+
+x'Ax over the matrices with |A - C| <= R is x'Cx + |x|'R|x|, which is x'(C + S R S)x with the signs
+of x on the diagonal of S. So the largest eigenvalue over all of them is the largest over the sign
+matrices (Hertz 1992), and it is attained there. The norm is the largest eigenvalue of [0 A; A' 0],
+with one sign per row and one per column (Rohn). A sign matters only where R couples it with
+others: one sign per connected part of R is free.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.rigour.eigenvalues import UNIT, largest_eigenvalue, perron_bound
+
+__all__ = [
+    "MOST_SIGNS",
+    "IntervalExtreme",
+    "augment",
+    "eigenvalue_over_interval",
+    "norm_over_interval",
+    "sign_patterns",
+]
+
+Array = NDArray[np.float64]
+MOST_SIGNS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalExtreme:
+    """Largest eigenvalue or norm over an interval matrix.
+
+    Attributes
+    ----------
+    upper : float
+        Guaranteed bound for every matrix of the interval.
+    attained : float
+        Guaranteed lower bound of the value at ``matrix``.
+    matrix : ndarray
+        A matrix of the interval where the value is ``attained``.
+    exact : bool
+        True when all sign matrices were looked at, so that only rounding lies between the two;
+        False for the cheap bound, centre plus norm of the radius.
+    """
+
+    upper: float
+    attained: float
+    matrix: Array
+    exact: bool
+
+
+def augment(matrix: Array) -> Array:
+    """Return [0 A; A' 0], whose largest eigenvalue is the norm of A.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (..., m, n)
+        One matrix or a batch.
+
+    Returns
+    -------
+    ndarray, shape (..., m + n, m + n)
+        Symmetric.
+    """
+    *front, m, n = matrix.shape
+    result = np.zeros((*front, m + n, m + n))
+    result[..., :m, m:] = matrix
+    result[..., m:, :m] = np.swapaxes(matrix, -1, -2)
+    return result
+
+
+def sign_patterns(coupled: NDArray[np.bool_], most: int = MOST_SIGNS) -> Array | None:
+    """List the sign vectors that can make a difference.
+
+    Parameters
+    ----------
+    coupled : ndarray of bool, shape (k, k)
+        Where the radius is positive; symmetric.
+    most : int
+        Largest number of free signs.
+
+    Returns
+    -------
+    ndarray, shape (2^s, k), or None
+        None when there are more than ``most`` free signs.
+
+    Examples
+    --------
+    >>> len(sign_patterns(np.ones((3, 3), dtype=bool))), len(sign_patterns(np.eye(3, dtype=bool)))
+    (4, 1)
+    """
+    k = len(coupled)
+    free: list[int] = []
+    seen = np.zeros(k, dtype=bool)
+    for start in range(k):
+        if seen[start]:
+            continue
+        seen[start] = True
+        stack = [start]
+        while stack:
+            for other in np.flatnonzero(coupled[stack.pop()] & ~seen).tolist():
+                seen[other] = True
+                free.append(other)
+                stack.append(other)
+    if len(free) > most:
+        return None
+    patterns = np.ones((1 << len(free), k))
+    for pattern, signs in zip(patterns, product((1.0, -1.0), repeat=len(free)), strict=True):
+        pattern[free] = signs
+    return patterns
+
+
+def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
+    """Bound the largest eigenvalue of all symmetric matrices of an interval.
+
+    Parameters
+    ----------
+    centre, radius : ndarray, shape (k, k)
+        Symmetric; the interval is centre +- radius, elementwise.
+
+    Returns
+    -------
+    IntervalExtreme
+        By the sign matrices of Hertz; by the cheap bound when more than 16 signs are free.
+
+    References
+    ----------
+    D. Hertz, The extreme eigenvalues and stability of real symmetric interval matrices, IEEE
+    Transactions on Automatic Control 37(4), 1992.
+
+    Examples
+    --------
+    >>> found = eigenvalue_over_interval(np.zeros((2, 2)), np.array([[0.0, 2.0], [2.0, 0.0]]))
+    >>> round(found.upper, 12), round(found.attained, 12), found.exact
+    (2.0, 2.0, True)
+    """
+    patterns = sign_patterns(radius > 0.0)
+    if patterns is None:
+        lower, upper = largest_eigenvalue(centre[None])
+        wide = float(np.nextafter(upper[0] + perron_bound(radius[None])[0], np.inf))
+        return IntervalExtreme(wide, float(lower[0]), centre, False)
+    best, attained, matrix = -np.inf, -np.inf, centre
+    for block in np.array_split(patterns, max(1, len(patterns) // 4096)):
+        corners = centre + block[:, :, None] * radius * block[:, None, :]
+        rounding = UNIT * np.abs(corners) * 1.01
+        lower, upper = largest_eigenvalue(corners, rounding)
+        best = max(best, float(upper.max()))
+        k = int(np.argmax(lower))
+        if float(lower[k]) > attained:
+            attained, matrix = float(lower[k]), corners[k]
+    return IntervalExtreme(best, attained, matrix, True)
+
+
+def norm_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
+    """Bound the norm of all matrices of an interval.
+
+    Parameters
+    ----------
+    centre, radius : ndarray, shape (m, n)
+        The interval is centre +- radius, elementwise.
+
+    Returns
+    -------
+    IntervalExtreme
+        ``matrix`` has the shape of ``centre``.
+
+    References
+    ----------
+    J. Rohn, Bounds on eigenvalues of interval matrices, ZAMM 78(S3), 1998; M. Hladik, D. Daney,
+    E. Tsigaridas, Bounds on real eigenvalues and singular values of interval matrices, SIAM Journal
+    on Matrix Analysis and Applications 31(4), 2010.
+
+    Examples
+    --------
+    >>> found = norm_over_interval(np.zeros((1, 2)), np.array([[3.0, 4.0]]))
+    >>> round(found.upper, 12)
+    5.0
+    """
+    found = eigenvalue_over_interval(augment(centre), augment(radius))
+    return IntervalExtreme(
+        found.upper, found.attained, found.matrix[: len(centre), len(centre) :], found.exact
+    )

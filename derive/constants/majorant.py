@@ -1,0 +1,271 @@
+"""Diagonal majorants: |g(a) - g(b)|^2 <= (a - b)' M'M (a - b) over the box, with proof."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.constants.eigenvalue_search import Maximum
+from obsynth.derive.constants.majorant_parts import (
+    UP,
+    RowMajorant,
+    connected_groups,
+    is_rounding,
+    largest_together,
+    row_majorant,
+    scaled,
+)
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals.ranges import Status
+from obsynth.derive.jacobian.continuity import refuse_jumps
+from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
+from obsynth.derive.split import Split
+
+__all__ = ["Majorant", "RowMajorant", "majorant"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Majorant:
+    """A diagonal M'M with J(x)'J(x) <= M'M at every point of the box, J = dg/dx.
+
+    Attributes
+    ----------
+    diagonal : ndarray, shape (n,)
+        Of M'M; zero for states on which g does not depend.
+    rows : tuple of RowMajorant
+        One per row of g that is not zero; the sum of their R is a majorant too, no smaller.
+    groups : tuple of (rows, columns, Maximum)
+        Parts of g that share no state, each with sup of the largest eigenvalue of
+        D^(-1/2) J'J D^(-1/2), D = M'M: at most 1, attained value and point.
+    rounding : ndarray, shape (n, n)
+        |difference between the plant's own linear coefficients and the doubles in A|, which g
+        takes up and which is not in ``diagonal``: a design counts it as an uncertainty of A.
+    split : Split
+        Where g comes from.
+    """
+
+    diagonal: Array
+    rows: tuple[RowMajorant, ...]
+    groups: tuple[tuple[tuple[int, ...], tuple[int, ...], Maximum], ...]
+    rounding: Array
+    split: Split
+
+    @property
+    def matrix(self) -> Array:
+        """M'M as a matrix, shape (n, n)."""
+        return np.diag(self.diagonal)
+
+    @property
+    def entry_bounds(self) -> Array:
+        """Guaranteed bounds of |dg_i/dx_j|, shape (n, n): one multiplier per entry."""
+        bounds = np.zeros((len(self.diagonal), len(self.diagonal)))
+        for part in self.rows:
+            bounds[part.row] = part.entries
+        return bounds
+
+    @property
+    def status(self) -> Status:
+        """The worst status of all groups."""
+        order = list(Status)
+        found = [group[2].status for group in self.groups]
+        return max(found, key=order.index, default=Status.EXACT)
+
+    def _lines(self) -> list[tuple[str, str]]:
+        names = self.split.model.names("x")
+        lines = [("M'M", f"diag({', '.join(f'{v:.8g}' for v in self.diagonal)})")]
+        for rows, columns, largest in self.groups:
+            what = (
+                f"g of {', '.join(names[i] for i in rows)} by "
+                f"{', '.join(names[j] for j in columns)}"
+            )
+            word = str(largest.status).split(":")[0]
+            where = ", ".join(f"{k} = {v:.6g}" for k, v in largest.at.items())
+            lines.append((what, f"{largest.attained:.10g} of 1 attained ({word}) at {where}"))
+        return lines
+
+    def __str__(self) -> str:
+        lines = self._lines()
+        width = max(len(name) for name, _ in lines)
+        return "\n".join(
+            [
+                f"Majorant of g of {self.split.model.name}: |g(a) - g(b)|^2 <= (a - b)'M'M(a - b)",
+                *(f"  {name:<{width}}  {text}" for name, text in lines),
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{escape(text)}</td></tr>"
+            for name, text in self._lines()
+        )
+        return (
+            f"<table><caption>Majorant of g of {escape(self.split.model.name)}</caption>{rows}"
+            "</table>"
+        )
+
+
+def majorant(
+    split: Split,
+    fixed: Mapping[str, float] | None = None,
+    shape: Literal["diagonal", "scalar"] = "diagonal",
+    rtol: float = 1e-9,
+    effort: Literal["fast", "normal", "tight"] = "normal",
+) -> Majorant:
+    """Find a diagonal M'M that bounds how much g can change, row by row and as a whole.
+
+    A row with the entries a_j(x) satisfies (sum_j a_j e_j)^2 <= sum_j d_j e_j^2 for all e exactly
+    when sum_j a_j(x)^2 / d_j <= 1, so the smallest d of a given direction is the largest value of
+    that sum over the box, which branch and bound encloses from both sides. Rows that share states
+    are scaled together: sup of the largest eigenvalue of D^(-1/2) J'J D^(-1/2). Both conditions
+    are convex in J, so they hold for the mean of J along a segment as well, hence for differences.
+
+    Equations (5)-(14) of Witczak et al. want M with M_x'M_x <= M'M from entrywise bounds, by (11)
+    with an M inside the same bounds. That fails in general, since matrices have no largest one in
+    this order. For one row [a b] with a and b in [-1, 1], every M = [m1 m2] within the bounds
+    vanishes on e = (m2, -m1), where another row of the box does not: for M = [1 1], M_x = [1 -1]
+    and e = (1, -1) the left side is 4 and the right side 0. A diagonal M'M needs no such M. It is
+    not unique: every d with sup_x sum_j a_j^2 / d_j <= 1 will do, and ``fixed`` picks one.
+
+    Parameters
+    ----------
+    split : Split
+        Of which g is bounded.
+    fixed : mapping of str to float, optional
+        Diagonal elements by state; the others are made as small as they can be. By default the
+        direction is d_j = r_j sum_k r_k with r_j the bound of |a_j|, which has the smallest trace
+        when the a_j take their extremes independently.
+    shape : {"diagonal", "scalar"}
+        ``"scalar"``: one number for all states, gamma^2 I of equation (14).
+    rtol : float
+        Wanted gap between guaranteed and attained value.
+    effort : {"fast", "normal", "tight"}
+        How many boxes may be spent.
+
+    Returns
+    -------
+    Majorant
+        Guaranteed, with attained values.
+
+    Raises
+    ------
+    DerivationError
+        A name that is no state; a fixed element that is too small, with the least it could be.
+    StructureError
+        The dynamics jump inside the box.
+    UnboundedError
+        An entry of the Jacobian of g has no finite bound over the box.
+
+    References
+    ----------
+    M. Witczak, J. Korbicz, R. Jozefowicz, A H-infinity approach to robust fault estimation of
+    non-linear discrete-time systems, equations (5)-(14) and (51)-(52).
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from obsynth.derive.split import split
+    >>> from obsynth.symbolic import Plant
+    >>> plant = Plant("sine")
+    >>> (x,) = plant.states("x", range=(-1, 1))
+    >>> plant.dynamics([sp.sin(x) / 2], Ts=1)
+    >>> plant.outputs([x])
+    ('y1',)
+    >>> majorant(split(plant, linear="terms")).diagonal.round(9).tolist()
+    [0.25]
+    """
+    model = split.model
+    refuse_jumps(model.check())
+    names = model.names("x")
+    given = _fixed(fixed, names, shape)
+    exact = exact_jacobian(split)
+    n = exact.rows
+    rounding, kept = np.zeros((n, n)), {}
+    for i in range(n):
+        for j in range(n):
+            if is_rounding(exact[i, j], split.A[i, j]):
+                rounding[i, j] = abs(float(exact[i, j])) * UP
+            elif exact[i, j] != 0:
+                kept[(i, j)] = exact[i, j]
+    entries = matrix_entries(kept, model)
+    ranges = entries.ranges(min(rtol, 1e-6), effort, "dg/dx")
+    sizes = np.zeros((n, n))
+    for k, place in enumerate(entries.places):
+        sizes[place] = max(abs(ranges.lower[k]), abs(ranges.upper[k]))
+    if shape == "scalar":
+        return _scalar(split, entries, sizes, rounding, rtol, effort)
+    shared = (sizes > 0.0).sum(axis=0)
+    rows = []
+    for i in np.flatnonzero(sizes.any(axis=1)).tolist():
+        part = {j: d / shared[j] for j, d in given.items() if sizes[i, j] > 0.0}
+        rows.append(row_majorant(entries, sizes[i], i, part, names, rtol, effort))
+    diagonal = np.zeros(n)
+    groups = []
+    for members, columns in connected_groups(sizes):
+        inside = [part for part in rows if part.row in members]
+        total = np.sum([part.diagonal for part in inside], axis=0)
+        if len(inside) == 1:
+            largest = inside[0].largest
+        else:
+            largest = largest_together(entries, sizes, members, total, rtol, effort)
+            free = [j for j in columns if j not in given]
+            # the sum of the rows' own majorants is one: at most 1 but for rounding
+            largest = scaled(largest, 1.0)
+            if len(free) == len(columns) and largest.upper < 1.0:
+                total = total * (largest.upper * UP)
+                ratio = 1.0 / (largest.upper * UP)
+                largest = scaled(largest, ratio)
+        diagonal[list(columns)] = np.nextafter(total[list(columns)], np.inf)
+        groups.append((members, columns, largest))
+    for j, value in given.items():
+        diagonal[j] = value
+    return Majorant(diagonal, tuple(rows), tuple(groups), rounding, split)
+
+
+def _fixed(
+    fixed: Mapping[str, float] | None, names: tuple[str, ...], shape: str
+) -> dict[int, float]:
+    if shape not in ("diagonal", "scalar"):
+        raise DerivationError(
+            f"shape={shape!r} is not known; choose 'diagonal' or 'scalar'", shape=shape
+        )
+    given: dict[int, float] = {}
+    for name, value in (fixed or {}).items():
+        if str(name) not in names or shape == "scalar":
+            raise DerivationError(
+                f"fixed= names {name}, but "
+                + ("a scalar majorant has nothing to fix" if shape == "scalar" else "")
+                + ("" if shape == "scalar" else f"the states are {', '.join(names)}"),
+                symbol=str(name),
+            )
+        if not 0.0 < float(value) < np.inf:
+            raise DerivationError(
+                f"the fixed element of {name} has to be positive and finite; given was {value}",
+                symbol=str(name),
+            )
+        given[names.index(str(name))] = float(value)
+    return given
+
+
+def _scalar(
+    split: Split, entries: MatrixEntries, sizes: Array, rounding: Array, rtol: float, effort: str
+) -> Majorant:
+    """Bound J'J by one number times the identity."""
+    n = len(sizes)
+    rows = tuple(np.flatnonzero(sizes.any(axis=1)).tolist())
+    if not rows:
+        return Majorant(np.zeros(n), (), (), rounding, split)
+    found = largest_together(entries, sizes, rows, np.ones(n), rtol, effort)
+    value = float(np.nextafter(found.upper, np.inf))
+    columns = tuple(np.flatnonzero(sizes.any(axis=0)).tolist())
+    parts = []
+    for i in rows:
+        members = np.where(sizes[i] > 0.0, value, 0.0)
+        # phi_i^2 <= |grad g_i|^2 |e|^2, and |grad g_i| is no larger than the norm of J
+        parts.append(RowMajorant(i, members, sizes[i], scaled(found, 1.0 / value)))
+    group = (rows, columns, scaled(found, 1.0 / value))
+    return Majorant(np.full(n, value), tuple(parts), (group,), rounding, split)

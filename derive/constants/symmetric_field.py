@@ -1,0 +1,158 @@
+"""Symmetric matrices whose entries are functions of a box."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.search.batch import Problem
+from obsynth.derive.rigour.eigenvalues import UNIT
+
+__all__ = ["FieldRange", "SymmetricField"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRange:
+    """What the matrices and their derivatives can be over a batch of boxes.
+
+    Attributes
+    ----------
+    centre, radius : ndarray, shape (N, k, k)
+        The matrices lie within centre +- radius.
+    slope_centre, slope_radius : ndarray, shape (N, v, k, k)
+        So do their partial derivatives.
+    smooth : ndarray of bool, shape (N,)
+        Where the derivatives say how the matrices change over the box.
+    """
+
+    centre: Array
+    radius: Array
+    slope_centre: Array
+    slope_radius: Array
+    smooth: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetricField:
+    """S(z) = fixed + sum over e of s_e(z) at (row_e, column_e) and its mirror image.
+
+    Attributes
+    ----------
+    problem : Problem
+        The expressions s_e with their gradients and the box.
+    rows, columns : sequence of int
+        Place of every expression, row <= column.
+    fixed : ndarray, shape (k, k)
+        Symmetric part that does not depend on z.
+    lower, upper : ndarray, shape (m,)
+        Guaranteed ranges of the expressions over the whole box.
+    """
+
+    problem: Problem
+    rows: Sequence[int]
+    columns: Sequence[int]
+    fixed: Array
+    lower: Array
+    upper: Array
+
+    @property
+    def size(self) -> int:
+        """Rows of the matrices."""
+        return len(self.fixed)
+
+    @property
+    def variables(self) -> int:
+        """Number of variables of the box."""
+        return len(self.problem.lower)
+
+    def _place(self, values: Array) -> Array:
+        """Put values, shape (m, ...), at both places of every expression."""
+        k = self.size
+        result = np.zeros((k, k, *values.shape[1:]))
+        for value, i, j in zip(values, self.rows, self.columns, strict=True):
+            result[i, j] = value
+            result[j, i] = value
+        return np.moveaxis(result, (0, 1), (-2, -1))
+
+    def over(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Enclose the matrices over boxes.
+
+        Parameters
+        ----------
+        lower, upper : ndarray, shape (v, N)
+            The boxes.
+
+        Returns
+        -------
+        centre, radius : ndarray, shape (N, k, k)
+            Radius infinite where nothing is known.
+        """
+        m = len(self.rows)
+        found = enclose(self.problem.program, lower, upper, range(m), 0)
+        return self._matrices(found.lower, found.upper)
+
+    def matrix_of_ranges(self) -> tuple[Array, Array]:
+        """Return centre and radius, shape (k, k), of the entrywise ranges over the whole box."""
+        centre, radius = self._matrices(self.lower[:, None], self.upper[:, None])
+        return centre[0], radius[0]
+
+    def _matrices(self, low: Array, high: Array) -> tuple[Array, Array]:
+        low = np.maximum(low, self.lower[:, None])
+        high = np.minimum(high, self.upper[:, None])
+        centre, radius = _split(low, high)
+        centre, radius = self._place(centre) + self.fixed, self._place(radius)
+        return centre, radius + 2.0 * UNIT * (np.abs(centre) + np.abs(self.fixed))
+
+    def with_slopes(self, lower: Array, upper: Array) -> FieldRange:
+        """Enclose matrices and derivatives over boxes.
+
+        Parameters
+        ----------
+        lower, upper : ndarray, shape (v, N)
+            The boxes.
+
+        Returns
+        -------
+        FieldRange
+            Derivatives of structurally independent entries are zero.
+        """
+        problem, m = self.problem, len(self.rows)
+        used = sorted({k for k in problem.gradient.ravel().tolist() if k >= 0})
+        found = enclose(problem.program, lower, upper, [*range(m), *used], m)
+        centre, radius = self._matrices(found.lower[:m], found.upper[:m])
+        position = {k: m + row for row, k in enumerate(used)}
+        v, n = lower.shape
+        slope_lower, slope_upper = np.zeros((m, v, n)), np.zeros((m, v, n))
+        for e in range(m):
+            for j, k in enumerate(problem.gradient[e].tolist()):
+                if k >= 0:
+                    slope_lower[e, j] = found.lower[position[k]]
+                    slope_upper[e, j] = found.upper[position[k]]
+        finite = np.isfinite(slope_lower) & np.isfinite(slope_upper)
+        smooth = np.asarray(finite.all(axis=(0, 1)) & ~found.rough[:m].any(axis=0), dtype=np.bool_)
+        slope_lower, slope_upper = slope_lower * smooth, slope_upper * smooth
+        slope_centre, slope_radius = _split(
+            np.where(smooth, slope_lower, 0.0), np.where(smooth, slope_upper, 0.0)
+        )
+        return FieldRange(
+            centre,
+            radius,
+            np.swapaxes(self._place(slope_centre), 0, 1),
+            np.swapaxes(self._place(slope_radius), 0, 1),
+            smooth,
+        )
+
+
+def _split(low: Array, high: Array) -> tuple[Array, Array]:
+    """Middle and radius of intervals, rounded outwards; infinite radius for the whole line."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        centre = 0.5 * low + 0.5 * high
+        radius = np.maximum(high - centre, centre - low)
+    known = np.isfinite(centre) & np.isfinite(radius)
+    outward = np.where(radius > 0.0, np.nextafter(radius, np.inf), 0.0)
+    return np.where(known, centre, 0.0), np.where(known, outward, np.inf)

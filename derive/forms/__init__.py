@@ -1,0 +1,1 @@
+"""Varying-parameter forms of a plant: quasi-LPV and QPV."""

@@ -1,0 +1,1 @@
+"""Quadratic parameter-varying forms."""

@@ -1,0 +1,1 @@
+"""Quasi-LPV forms: A(rho), B(rho) with scheduling ranges and an exact identity."""

@@ -1,0 +1,216 @@
+"""From a plant to its quasi-LPV form."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import sympy as sp
+
+from obsynth.derive.algebra.zero_test import FormProof, prove_zero
+from obsynth.derive.errors import DerivationError, StructureError
+from obsynth.derive.forms.quasi_lpv.centre import Centre, deviations, read_centre
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, Ranging
+from obsynth.derive.forms.quasi_lpv.kinks import decide_signs
+from obsynth.derive.forms.quasi_lpv.layout import Layout
+from obsynth.derive.forms.quasi_lpv.options import Option
+from obsynth.derive.forms.quasi_lpv.ranking import choose
+from obsynth.derive.forms.quasi_lpv.scheduling import make_schedule
+from obsynth.derive.forms.quasi_lpv.terms import (
+    Term,
+    list_terms,
+    prefer_options,
+    row_names,
+    stacked_rows,
+)
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["assemble", "prove_form", "quasi_lpv"]
+
+
+def quasi_lpv(
+    model: Plant,
+    prefer: Sequence[Any] | Mapping[Any, Any] | None = None,
+    centre: Any = None,
+    *,
+    alternatives: int = 16,
+    penalty: float = 3.0,
+    rtol: float = 1e-6,
+    effort: str = "normal",
+) -> QuasiLPV:
+    """Write a plant as x+ = A(rho) x + B(rho) u + offset, exactly.
+
+    Every term of the dynamics and outputs is divided by a signal, or by a linear form of signals,
+    with which it vanishes: x1 x2 by x1 or x2, sqrt(h) by h, phi(x1 - x3) by x1 - x3 (two columns).
+    What does not vanish at the centre is written by secants in closed form, sqrt(x) - sqrt(c) =
+    (x - c) / (sqrt(x) + sqrt(c)), and its value there goes to the offset. Where there is a choice,
+    all choices are enumerated and the one with the least velocity inflation is taken, mean over
+    the box of sum_j width(A_ij) |x_j - c_j| / range(f_i), with a penalty for coefficients that need
+    unmeasured signals; choices whose coefficients have no bound over the box are left out.
+
+    Parameters
+    ----------
+    model : Plant
+        Continuous or discrete.
+    prefer : sequence of names, or mapping, optional
+        Signals to divide by, the most wanted first, or for single terms what to divide them by,
+        ``{"x1*x2": "x2"}``; see ``QuasiLPV.ranking`` for what there is.
+    centre : None, "origin", "equilibrium", Equilibrium or (x, u)
+        Where deviations are zero; with another centre than the origin the form is
+        A(rho) (x - x_c) + B(rho) (u - u_c) + offset.
+    alternatives : int
+        How many ways to write a row are bounded and ranked.
+    penalty : float
+        How many times more an entry counts that needs an unmeasured signal.
+    rtol : float
+        Wanted gap of the ranges of the scheduling variables.
+    effort : {"fast", "normal", "tight"}
+        Of the interval engine, for these ranges.
+
+    Returns
+    -------
+    QuasiLPV
+        Matrices, scheduling variables with guaranteed ranges, ranking and proof.
+
+    Raises
+    ------
+    DerivationError
+        An option that is not understood; parts that do not add up to the plant.
+    StructureError
+        A Runge-Kutta step, which has no such form.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import hinf_example
+    >>> form = quasi_lpv(hinf_example())
+    >>> form.offset.T
+    Matrix([[3/50, 0, 0]])
+    >>> form.A[2, 2]
+    13/200 - 33*sinc(x3)/100
+    >>> form.proof.holds
+    True
+    """
+    model.check()
+    if model.discretisation not in (None, "euler"):
+        raise StructureError(
+            f"a step of {model.discretisation} is no sum of terms that could be divided; use "
+            "discretise('euler', Ts), the continuous plant, or jacobian_bounds",
+            condition="quasi-LPV",
+        )
+    if alternatives < 1 or not penalty >= 0.0:
+        raise DerivationError(
+            f"alternatives= is at least 1 and penalty= not negative; given were {alternatives} and "
+            f"{penalty}",
+            alternatives=alternatives,
+            penalty=penalty,
+        )
+    point = read_centre(model, centre)
+    rows = stacked_rows(model)
+    if not point.is_origin:
+        rows = decide_signs(rows, model, point)
+    terms = prefer_options(model, list_terms(model, rows, point), prefer)
+    terms, chosen, rankings, lifts = choose(
+        model, rows, terms, point, alternatives, penalty, "fast"
+    )
+    layout = Layout.of(model)
+    proxy = assemble(model, layout, point, terms, chosen)
+    matrix = sp.ImmutableMatrix(proxy.xreplace({k.signal.symbol: k.meaning for k in lifts}))
+    proof = prove_form(model, matrix, point, rows)
+    places = {
+        (i, j): proxy[i, j]
+        for i in range(proxy.rows)
+        for j in range(proxy.cols)
+        if proxy[i, j] != 0
+    }
+    back = deviations(model, point)
+    names = row_names(model)
+    left = tuple((names[t.row], t.expression.xreplace(back), t.reason) for t in terms if t.reason)
+    schedule = make_schedule(places, model, rtol, effort, lifts)
+    return QuasiLPV(
+        model,
+        matrix,
+        layout,
+        point,
+        schedule,
+        rankings,
+        left,
+        proof,
+        Ranging(proxy, lifts, rtol, effort),
+    )
+
+
+def assemble(
+    model: Plant,
+    layout: Layout,
+    centre: Centre,
+    terms: Sequence[Term],
+    chosen: Sequence[Option],
+) -> sp.Matrix:
+    """Add the chosen options of all terms up.
+
+    Parameters
+    ----------
+    model : Plant
+        The plant.
+    layout : Layout
+        Columns of the result.
+    centre : Centre
+        Where deviations are zero.
+    terms, chosen : sequence of Term, sequence of Option
+        One option per term, in deviations.
+
+    Returns
+    -------
+    sympy.Matrix
+        The stacked matrix in the signals of the plant; lifted secants as their symbols.
+    """
+    rows, columns = layout.shape
+    total = sp.zeros(rows, columns)
+    for term, option in zip(terms, chosen, strict=True):
+        for share in option.shares:
+            total[term.row, share.position] += share.bounded
+        total[term.row, columns - 1] += option.rest
+    back = deviations(model, centre)
+    return sp.ImmutableMatrix(total.applyfunc(lambda e: e.xreplace(back)))
+
+
+def prove_form(
+    model: Plant, matrix: sp.Matrix, centre: Centre, rows: Sequence[sp.Expr]
+) -> FormProof:
+    """Show row by row that a stacked matrix is the plant.
+
+    Parameters
+    ----------
+    model : Plant
+        Signals and ranges.
+    matrix : sympy.Matrix
+        The blocks.
+    centre : Centre
+        Where deviations are zero.
+    rows : sequence of sympy.Expr
+        What the rows have to be.
+
+    Returns
+    -------
+    FormProof
+        One method per row.
+
+    Raises
+    ------
+    DerivationError
+        A row is not what the plant says; the row is named.
+    """
+    kinds = ("x", "u", "p", "rho", "d", "f", "w")
+    box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    back = deviations(model, centre)
+    signals = [s.symbol for kind in "xudfw" for s in getattr(model, kind)]
+    column = [*(back.get(s, s) for s in signals), sp.Integer(1)]
+    names = row_names(model)
+    methods = []
+    for i, row in enumerate(rows):
+        products = [matrix[i, j] * factor for j, factor in enumerate(column)]
+        method = prove_zero(row - sp.Add(*products), box)
+        if not method:
+            raise DerivationError(
+                f"the form of the row of {names[i]} is not the plant's {row}", row=names[i]
+            )
+        methods.append(method)
+    return FormProof(names, tuple(methods))

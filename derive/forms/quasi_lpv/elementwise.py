@@ -1,0 +1,232 @@
+"""Elementwise bounds A_lower <= A(rho) <= A_upper, constant or as functions of what is measured.
+
+An entry that is monotone in every unknown signal over the box takes its extremes where the unknown
+signals are at an end. Where a whole entry is not monotone, its terms are bounded one by one: by
+monotonicity, as a known factor times an unknown one, or by a constant range.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import sympy as sp
+
+from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.errors import UnboundedError
+from obsynth.derive.forms.quasi_lpv.known import Known
+from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.rigour.numbers import rational
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Signal
+
+__all__ = ["ElementBounds", "bound_elements"]
+
+Entry = tuple[int, int]
+Ends = tuple[sp.Expr, sp.Expr]
+_RTOL = 1e-2
+_EFFORT = "fast"
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBounds:
+    """Bounds of entries as functions of what is known.
+
+    Attributes
+    ----------
+    lower, upper : dict of (row, column) to sympy.Expr
+        In the arguments of the known signals only.
+    how : dict of (row, column) to str
+        ``"known"``, ``"monotone"``, ``"termwise"``, or ``"range"`` where a constant range of an
+        unknown factor was needed.
+    """
+
+    lower: dict[Entry, sp.Expr]
+    upper: dict[Entry, sp.Expr]
+    how: dict[Entry, str]
+
+
+def bound_elements(
+    entries: Mapping[Entry, sp.Expr],
+    model: Plant,
+    known: Sequence[Known],
+    more: Sequence[Signal] = (),
+) -> ElementBounds:
+    """Bound entries over the unknown signals, pointwise in the known ones.
+
+    Parameters
+    ----------
+    entries : mapping of (row, column) to sympy.Expr
+        Exact entries in the signals of the plant.
+    model : Plant
+        Ranges of the signals.
+    known : sequence of Known
+        What may stay in the bounds.
+    more : sequence of Signal
+        Further unknown variables, with ranges of their own.
+
+    Returns
+    -------
+    ElementBounds
+        With lower <= entry <= upper for every value of the unknown signals in their ranges that
+        agrees with the known ones.
+
+    Raises
+    ------
+    UnboundedError
+        An entry without a finite bound; entry and signal are named.
+
+    Examples
+    --------
+    >>> from obsynth.derive.forms.quasi_lpv.known import read_measured
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> plant = quadruple_tank()
+    >>> h1, h4 = plant.x[0].symbol, plant.x[3].symbol
+    >>> found = bound_elements({(0, 0): h1 / h4}, plant, read_measured(plant, ["h1"]))
+    >>> found.lower, found.upper, found.how
+    ({(0, 0): h1/100}, {(0, 0): h1/5}, {(0, 0): 'monotone'})
+    """
+    return _Bounder(model, known, more).bound(entries)
+
+
+class _Bounder:
+    def __init__(self, model: Plant, known: Sequence[Known], more: Sequence[Signal]) -> None:
+        self.model, self.more = model, more
+        kinds = ("x", "u", "p", "rho", "d", "f", "w")
+        signals = {s.symbol: s for kind in kinds for s in getattr(model, kind)}
+        signals |= {s.symbol: s for s in more}
+        self.exact = {k.signal: k.ends[0] for k in known if k.exact}
+        self.ends: dict[sp.Symbol, Ends | None] = {}
+        for symbol, signal in signals.items():
+            if symbol not in self.exact:
+                pair = (rational(signal.lower), rational(signal.upper)) if signal.bounded else None
+                self.ends[symbol] = pair
+        self.ends.update({k.signal: k.ends for k in known if not k.exact})
+
+    def bound(self, entries: Mapping[Entry, sp.Expr]) -> ElementBounds:
+        lower: dict[Entry, sp.Expr] = {}
+        upper: dict[Entry, sp.Expr] = {}
+        how: dict[Entry, str] = {}
+        whole = self._monotone(list(entries.values()))
+        hard: dict[Entry, list[sp.Expr]] = {}
+        for (place, entry), signs in zip(entries.items(), whole, strict=True):
+            if signs is None:
+                hard[place] = expand_terms(entry)
+                continue
+            lower[place], upper[place] = self._at_ends(entry, signs)
+            how[place] = "monotone" if signs else "known"
+        terms = list(dict.fromkeys(t for listed in hard.values() for t in listed))
+        by_term = dict(zip(terms, self._terms(terms), strict=True))
+        for place, listed in hard.items():
+            parts = [by_term[term] for term in listed]
+            lower[place] = sp.Add(*[low for low, _, _ in parts])
+            upper[place] = sp.Add(*[high for _, high, _ in parts])
+            how[place] = "range" if any(ranged for _, _, ranged in parts) else "termwise"
+        order = list(entries)
+        return ElementBounds(
+            {p: lower[p] for p in order}, {p: upper[p] for p in order}, {p: how[p] for p in order}
+        )
+
+    def _terms(self, terms: list[sp.Expr]) -> list[tuple[sp.Expr, sp.Expr, bool]]:
+        """Bounds of terms, and whether a constant range of an unknown factor was needed."""
+        split = [term.as_independent(*self.ends, as_Add=False) for term in terms]
+        signs = self._monotone(terms)
+        factor_signs = self._monotone([unknown for _, unknown in split])
+        ranged = [
+            unknown
+            for (_, unknown), term_sign, sign in zip(split, signs, factor_signs, strict=True)
+            if term_sign is None and sign is None
+        ]
+        ranges = dict(zip(ranged, self._ranges(ranged), strict=True))
+        result = []
+        for term, (factor, unknown), term_sign, sign in zip(
+            terms, split, signs, factor_signs, strict=True
+        ):
+            if term_sign is not None:
+                result.append((*self._at_ends(term, term_sign), False))
+                continue
+            low, high = ranges[unknown] if sign is None else self._at_ends(unknown, sign)
+            known = factor.xreplace(self.exact)
+            result.append((*_times(known, low, high), sign is None))
+        return result
+
+    def _at_ends(self, entry: sp.Expr, signs: Mapping[sp.Symbol, int]) -> Ends:
+        """Put the ends of the unknown signals in, as their signs demand."""
+        places = []
+        for side in (0, 1):
+            corner = dict(self.exact)
+            for symbol, sign in signs.items():
+                ends = self.ends[symbol]
+                if ends is None:
+                    raise UnboundedError(
+                        f"the entry {entry} depends on {symbol}, which has no range; declare it "
+                        "with range=",
+                        entries=(str(entry),),
+                        operation="a signal without a range",
+                        sub_box={},
+                    )
+                corner[symbol] = ends[side if sign > 0 else 1 - side]
+            places.append(entry.xreplace(corner))
+        return places[0], places[1]
+
+    def _monotone(self, expressions: list[sp.Expr]) -> list[dict[sp.Symbol, int] | None]:
+        """Signs of the slopes in the unknown signals; None where one is not of constant sign."""
+        varying = {
+            (0, k): e
+            for k, e in enumerate(expressions)
+            if any(e.has(symbol) for symbol in self.ends)
+        }
+        result: list[dict[sp.Symbol, int] | None] = [{} for _ in expressions]
+        if not varying:
+            return result
+        entries = matrix_entries(varying, self.model, self.more)
+        jacobian = ca.jacobian(entries.values, entries.variables)
+        rows, columns = jacobian.sparsity().get_triplet()
+        wanted = [
+            (n, r, c)
+            for n, (r, c) in enumerate(zip(rows, columns, strict=True))
+            if entries.symbols[c] in self.ends
+        ]
+        if not wanted:
+            return result
+        slopes = ca.vertcat(*[jacobian.nz[n] for n, _, _ in wanted])
+        found = bound_ranges(
+            slopes,
+            entries.variables,
+            entries.box,
+            entries.constants,
+            entries.constant_box,
+            rtol=_RTOL,
+            effort=_EFFORT,
+        )
+        for position, (_, r, c) in enumerate(wanted):
+            k = entries.places[r][1]
+            signs = result[k]
+            if signs is None:
+                continue
+            if found.lower[position] >= 0.0:
+                signs[entries.symbols[c]] = 1
+            elif found.upper[position] <= 0.0:
+                signs[entries.symbols[c]] = -1
+            else:
+                result[k] = None
+        return result
+
+    def _ranges(self, expressions: list[sp.Expr]) -> list[Ends]:
+        """Constant ranges over the whole box, as exact numbers."""
+        if not expressions:
+            return []
+        places = {(0, k): e for k, e in enumerate(expressions)}
+        entries = matrix_entries(places, self.model, self.more)
+        found = entries.ranges(1e-6, "normal")
+        return [
+            (rational(float(low)), rational(float(high)))
+            for low, high in zip(found.lower, found.upper, strict=True)
+        ]
+
+
+def _times(factor: sp.Expr, low: sp.Expr, high: sp.Expr) -> Ends:
+    """Bounds of a known factor times something between low and high."""
+    if factor.is_number:
+        return (factor * low, factor * high) if factor >= 0 else (factor * high, factor * low)
+    return sp.Min(factor * low, factor * high), sp.Max(factor * low, factor * high)

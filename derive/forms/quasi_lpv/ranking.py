@@ -1,0 +1,268 @@
+"""Choosing between the ways to write the terms: enumeration and ranking, row by row.
+
+The measure is the velocity inflation: how much a design that treats the entries as independent
+intervals overestimates the range of a row, mean over the box of sum_j width(A_ij) |x_j - c_j|
+divided by range(f_i). Entries that need an unmeasured signal count once more.
+"""
+
+import heapq
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy as sp
+
+from obsynth.derive.forms.quasi_lpv.centre import Centre, deviations
+from obsynth.derive.forms.quasi_lpv.display import short
+from obsynth.derive.forms.quasi_lpv.measured import known_signals
+from obsynth.derive.forms.quasi_lpv.options import Option, kept
+from obsynth.derive.forms.quasi_lpv.terms import Term, row_names
+from obsynth.derive.forms.quasi_lpv.widths import Lift, Widths
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["Alternative", "RowRanking", "choose"]
+
+Combination = tuple[int, ...]
+_TIE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """One way to write a row.
+
+    Attributes
+    ----------
+    choices : tuple of (str, str)
+        Terms with a choice and what they are divided by.
+    inflation : float
+        Velocity inflation of the row; inf where a range is missing.
+    unmeasured : tuple of str
+        Signals in the coefficients whose values are not known on line.
+    score : float
+        What alternatives are ordered by: the inflation, with a penalty for unmeasured signals.
+    """
+
+    choices: tuple[tuple[str, str], ...]
+    inflation: float
+    unmeasured: tuple[str, ...]
+    score: float
+
+    def __str__(self) -> str:
+        ways = "; ".join(f"{term} by {divisor}" for term, divisor in self.choices) or "no choice"
+        needs = f", needs {', '.join(self.unmeasured)}" if self.unmeasured else ""
+        return f"{ways}: inflation {self.inflation:.3g}{needs}"
+
+
+@dataclass(frozen=True, eq=False)
+class RowRanking:
+    """The ways to write a row, the chosen one first.
+
+    Attributes
+    ----------
+    row : str
+        Name of the state or output.
+    alternatives : tuple of Alternative
+        The chosen one, then the others in order of their scores; scores that differ by no more
+        than 2 % are equal, and the structurally simpler way is taken.
+    total : int
+        How many ways there are; more than listed where there are many.
+    """
+
+    row: str
+    alternatives: tuple[Alternative, ...]
+    total: int
+
+    def __str__(self) -> str:
+        lines = [f"{self.row}: {self.total} ways"]
+        lines += [f"  {k + 1}. {a}" for k, a in enumerate(self.alternatives)]
+        return "\n".join(lines)
+
+
+class _Chooser:
+    """The search: what it needs to know about the plant, computed once."""
+
+    def __init__(
+        self, model: Plant, centre: Centre, rows: Sequence[sp.Expr], penalty: float, effort: str
+    ) -> None:
+        self.widths = Widths(model, deviations(model, centre), effort)
+        self.penalty = penalty
+        self.names = row_names(model)
+        signals = [s for kind in "xudfw" for s in getattr(model, kind)]
+        noise = [s.symbol for kind in "dfw" for s in getattr(model, kind)]
+        values = [float(v) for v in (*centre.x, *centre.u)] + [0.0] * len(noise)
+        self.reach = [
+            _mean_distance(s.lower, s.upper, c) for s, c in zip(signals, values, strict=True)
+        ]
+        known = known_signals(model)
+        kinds = ("x", "d", "f", "w", "rho")
+        self.unknown = {s.symbol for k in kinds for s in getattr(model, k) if s.name not in known}
+        quiet = dict.fromkeys(noise, sp.Integer(0))
+        ranges = Widths(model, {}, effort)
+        still = [row.xreplace(quiet) for row in rows]
+        ranges.prepare(still)
+        sizes = [ranges[row] for row in still]
+        self.sizes = [size if np.isfinite(size) and size > 0.0 else 1.0 for size in sizes]
+
+    def admissible(self, terms: list[Term]) -> list[Term]:
+        """Drop options with a coefficient that has no bound over the box."""
+        shares = [share for t in terms for o in t.options for share in o.shares]
+        lifted = self.widths.lift(shares)
+        hidden = {lift.signal.symbol: lift.meaning for lift in self.widths.lifts}
+        self.unknown |= {s for s, e in hidden.items() if e.free_symbols & self.unknown}
+        result = []
+        for term in terms:
+            ways = [
+                replace(o, shares=tuple(lifted.get(s, s) for s in o.shares)) for o in term.options
+            ]
+            good = tuple(o for o in ways if self._singular(o) is None)
+            if good:
+                result.append(replace(term, options=good))
+                continue
+            worst = self._singular(ways[0])
+            reason = f"{worst} has no finite bound over the box"
+            result.append(replace(term, options=(kept(term.expression),), reason=reason))
+        return result
+
+    def _singular(self, option: Option) -> sp.Expr | None:
+        for share in option.shares:
+            if self.widths.singular(share.bounded):
+                return share.coefficient.xreplace(self.widths.back)
+        return None
+
+    def inflation(self, row: int, sums: Mapping[int, sp.Expr]) -> tuple[float, float]:
+        """Velocity inflation of a row, and the score with its penalty."""
+        plain = score = 0.0
+        for j, coefficient in sums.items():
+            part = self.widths[coefficient] * self.reach[j] / self.sizes[row]
+            plain += part
+            penalised = coefficient.free_symbols & self.unknown
+            score += part * (1.0 + (self.penalty if penalised else 0.0))
+        return plain, score
+
+    def estimate(self, row: int, option: Option) -> float:
+        """Upper bound of what an option adds to the score."""
+        return self.inflation(row, {s.position: s.bounded for s in option.shares})[1]
+
+    def rank(self, row: int, terms: list[Term], most: int) -> tuple[RowRanking, list[Option]]:
+        """Order the combinations of a row."""
+        costs = [[self.estimate(row, o) for o in t.options] for t in terms]
+        combinations = _best_sums(costs, most)
+        sums = [_sums(terms, combination) for combination in combinations]
+        self.widths.prepare([c for columns in sums for c in columns.values()])
+        ranked = []
+        for combination, columns in zip(combinations, sums, strict=True):
+            plain, score = self.inflation(row, columns)
+            options = [t.options[k] for t, k in zip(terms, combination, strict=True)]
+            used = {s for o in options for _, c in o.columns for s in c.free_symbols}
+            choices = tuple(
+                (sp.sstr(short(t.expression)), o.text)
+                for t, o in zip(terms, options, strict=True)
+                if len(t.options) > 1
+            )
+            needs = tuple(sorted(str(s) for s in used & self.unknown))
+            alternative = Alternative(choices, plain, needs, score)
+            ranked.append((score, sum(combination), combination, alternative))
+        ranked.sort(key=lambda item: item[:3])
+        # the widths are no better than their tolerance, so what is as good is settled by structure
+        near = [item for item in ranked if item[0] <= (1.0 + _TIE) * ranked[0][0]]
+        first = min(near, key=lambda item: item[1:3])
+        ranked.sort(key=lambda item: item is not first)
+        best = first[2]
+        chosen = [t.options[k] for t, k in zip(terms, best, strict=True)]
+        total = int(np.prod([len(t.options) for t in terms], dtype=object)) if terms else 1
+        return RowRanking(self.names[row], tuple(r[3] for r in ranked), total), chosen
+
+
+def choose(
+    model: Plant,
+    rows: Sequence[sp.Expr],
+    terms: list[Term],
+    centre: Centre,
+    alternatives: int,
+    penalty: float,
+    effort: str,
+) -> tuple[list[Term], list[Option], tuple[RowRanking, ...], tuple[Lift, ...]]:
+    """Choose one option for every term.
+
+    Parameters
+    ----------
+    model : Plant
+        Signals and ranges.
+    rows : sequence of sympy.Expr
+        Right-hand sides and outputs.
+    terms : list of Term
+        With their options.
+    centre : Centre
+        Where deviations are zero.
+    alternatives : int
+        How many combinations of a row are bounded and listed.
+    penalty : float
+        Weight of entries that need unmeasured signals.
+    effort : str
+        Of the interval engine.
+
+    Returns
+    -------
+    terms : list of Term
+        In the order of rows, inadmissible options dropped.
+    chosen : list of Option
+        One per term.
+    rankings : tuple of RowRanking
+        One per row.
+    lifts : tuple of Lift
+        Secants of the chosen options that are bounded through their derivatives.
+    """
+    chooser = _Chooser(model, centre, rows, penalty, effort)
+    admissible = chooser.admissible(terms)
+    ordered: list[Term] = []
+    chosen: list[Option] = []
+    rankings = []
+    for i in range(len(rows)):
+        own = [t for t in admissible if t.row == i]
+        ranking, best = chooser.rank(i, own, alternatives)
+        ordered += own
+        chosen += best
+        rankings.append(ranking)
+    used = {s.proxy for o in chosen for s in o.shares if s.proxy is not None}
+    lifts = tuple(lift for lift in chooser.widths.lifts if lift.signal.symbol in used)
+    return ordered, chosen, tuple(rankings), lifts
+
+
+def _mean_distance(lower: float, upper: float, centre: float) -> float:
+    """Mean of |x - c| for x uniform in [lower, upper]; 1 for an unbounded signal."""
+    if not (np.isfinite(lower) and np.isfinite(upper)):
+        return 1.0
+    if lower == upper or not lower < centre < upper:
+        return abs(0.5 * (lower + upper) - centre)
+    return ((centre - lower) ** 2 + (upper - centre) ** 2) / (2.0 * (upper - lower))
+
+
+def _sums(terms: list[Term], combination: Combination) -> dict[int, sp.Expr]:
+    total: dict[int, sp.Expr] = {}
+    for term, k in zip(terms, combination, strict=True):
+        for share in term.options[k].shares:
+            j = share.position
+            total[j] = total.get(j, sp.Integer(0)) + share.bounded
+    return total
+
+
+def _best_sums(costs: list[list[float]], most: int) -> list[Combination]:
+    """List the combinations with the smallest sums of costs, without making all of them."""
+    finite = [[min(c, 1e300) for c in row] for row in costs]
+    orders = [sorted(range(len(row)), key=row.__getitem__) for row in finite]
+    steps = [[row[k] for k in order] for row, order in zip(finite, orders, strict=True)]
+    start = (0,) * len(costs)
+    queue = [(sum(row[0] for row in steps), start)]
+    seen = {start}
+    found: list[Combination] = []
+    while queue and len(found) < most:
+        total, ranks = heapq.heappop(queue)
+        found.append(tuple(order[k] for order, k in zip(orders, ranks, strict=True)))
+        for t, k in enumerate(ranks):
+            if k + 1 == len(steps[t]):
+                continue
+            after = (*ranks[:t], k + 1, *ranks[t + 1 :])
+            if after not in seen:
+                seen.add(after)
+                heapq.heappush(queue, (total - steps[t][k] + steps[t][k + 1], after))
+    return found

@@ -1,0 +1,376 @@
+"""Scheduling variables: the functions through which the matrices of a form vary, affinely."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+
+from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.algebra.zero_test import prove_zero
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.forms.quasi_lpv.measured import known_signals
+from obsynth.derive.forms.quasi_lpv.widths import Lift
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.jacobian.dependence import AffineDependence, find_dependences
+from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["AffineSchedule", "SchedulingVariable", "make_schedule"]
+
+Entry = tuple[int, int]
+Affine = tuple[sp.Expr, dict[int, sp.Expr]]
+_SAMPLES = 96
+_PREFIXES = ("rho", "sigma", "zeta", "varrho")
+
+
+@dataclass(frozen=True, eq=False)
+class SchedulingVariable:
+    """A function of the signals on which matrices depend affinely, with its range.
+
+    Attributes
+    ----------
+    symbol : sympy.Symbol
+        What it is called; a signal that schedules by itself keeps its name.
+    expression : sympy.Expr
+        The function of the plant's signals.
+    lower, upper : float
+        Guaranteed range over the box, rounded outwards.
+    attained_lower, attained_upper : float
+        Values that are reached.
+    status : Status
+        How good the range is.
+    signals : tuple of str
+        Signals it depends on.
+    unmeasured : tuple of str
+        Those of them whose values are not known on line.
+    """
+
+    symbol: sp.Symbol
+    expression: sp.Expr
+    lower: float
+    upper: float
+    attained_lower: float
+    attained_upper: float
+    status: Status
+    signals: tuple[str, ...]
+    unmeasured: tuple[str, ...]
+
+    @property
+    def measured(self) -> bool:
+        """True when its value is known on line, up to the noise of the outputs."""
+        return not self.unmeasured
+
+    def __str__(self) -> str:
+        known = "" if self.measured else f", unmeasured: {', '.join(self.unmeasured)}"
+        own = "" if self.symbol == self.expression else f" = {sp.sstr(self.expression)}"
+        return f"{self.symbol}{own} in [{_tidy(self.lower)}, {_tidy(self.upper)}]{known}"
+
+
+def _tidy(value: float) -> str:
+    """Write a bound; one rounded away from zero by a subnormal number reads as zero."""
+    return "0" if abs(value) < 1e-300 else f"{value:.8g}"
+
+
+@dataclass(frozen=True, eq=False)
+class AffineSchedule:
+    """A matrix as constant + sum of variables times directions, exactly.
+
+    Attributes
+    ----------
+    variables : tuple of SchedulingVariable
+        The scheduling variables.
+    entries : dict of (row, column) to (constant, {variable: coefficient})
+        Every entry that is not zero, through positions in ``variables``.
+    methods : dict of (row, column) to str
+        How every varying entry was proved to be affine.
+    exact : bool
+        True when the variables depend on disjoint sets of signals, so that they take their values
+        independently of each other.
+    """
+
+    variables: tuple[SchedulingVariable, ...]
+    entries: dict[Entry, Affine]
+    methods: dict[Entry, str]
+    exact: bool
+
+    def matrix(self, shape: tuple[int, int]) -> sp.Matrix:
+        """Write the matrix in the symbols of the scheduling variables."""
+        result = sp.zeros(*shape)
+        for place, (constant, coefficients) in self.entries.items():
+            result[place] = constant + sum(
+                (c * self.variables[k].symbol for k, c in coefficients.items()), sp.Integer(0)
+            )
+        return result
+
+
+def make_schedule(
+    stacked: Mapping[Entry, sp.Expr],
+    model: Plant,
+    rtol: float,
+    effort: str,
+    lifts: Sequence[Lift] = (),
+) -> AffineSchedule:
+    """Find few scheduling variables on which all entries depend affinely.
+
+    Entries that share functions are treated together. Where they have as many independent entries
+    as functions, the functions are the variables; where they have fewer, the entries are.
+
+    Parameters
+    ----------
+    stacked : mapping of (row, column) to sympy.Expr
+        Exact entries that are not identically zero.
+    model : Plant
+        Signals, ranges, what is measured.
+    rtol : float
+        Wanted gap of the ranges.
+    effort : str
+        Of the interval engine.
+    lifts : sequence of Lift
+        Symbols in the entries that stand for secants, with ranges of their own.
+
+    Returns
+    -------
+    AffineSchedule
+        With ranges and proofs.
+
+    Raises
+    ------
+    DerivationError
+        An entry could not be proved to be affine in the variables; it is named.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> h1, h2 = (s.symbol for s in quadruple_tank().x[:2])
+    >>> entries = {(0, 0): 2 / h1 + 1, (1, 0): 3 / h1, (1, 1): h2}
+    >>> found = make_schedule(entries, quadruple_tank(), 1e-6, "normal")
+    >>> [str(v) for v in found.variables]
+    ['h2 in [60, 280]', 'rho1 = 1/h1 in [0.0035714286, 0.016666667]']
+    >>> found.entries[(0, 0)], found.exact
+    ((1, {1: 2}), True)
+    """
+    more = [lift.signal for lift in lifts]
+    varying = {place: e for place, e in stacked.items() if e.free_symbols}
+    fixed: dict[Entry, Affine] = {p: (e, {}) for p, e in stacked.items() if p not in varying}
+    entries = matrix_entries(varying, model, more)
+    signals = [s.symbol for s in model.signals]
+    scalars, affine = _scalars(entries, signals)
+    symbols = _names(model, scalars)
+    variables = _ranges(model, scalars, symbols, rtol, effort, lifts)
+    methods = _prove(entries, scalars, affine, model)
+    supports = [set(v.signals) for v in variables]
+    union: set[str] = set().union(*supports)
+    exact = not lifts and sum(map(len, supports)) == len(union)
+    order = sorted([*fixed, *affine])
+    return AffineSchedule(
+        variables,
+        {p: fixed[p] if p in fixed else affine[p] for p in order},
+        methods,
+        exact,
+    )
+
+
+def _scalars(
+    entries: MatrixEntries, signals: Sequence[sp.Symbol]
+) -> tuple[list[sp.Expr], dict[Entry, Affine]]:
+    """Scheduling functions, and every entry through them."""
+    known = set(entries.symbols)
+    parts = {place: _monomials(e, known) for place, e in entries.exact.items()}
+    basis, dependences = find_dependences(
+        entries.exact, entries.sample(_SAMPLES) if entries.exact else {}, entries.symbols
+    )
+    through = {d.entry: d for d in dependences}
+    scalars: list[sp.Expr] = []
+    position: dict[sp.Expr, int] = {}
+    by_entry: dict[Entry, int] = {}
+
+    def add(expression: sp.Expr) -> int:
+        if expression not in position:
+            position[expression] = len(scalars)
+            scalars.append(expression)
+        return position[expression]
+
+    direct: set[Entry] = set()
+    for group in _groups(parts):
+        monomials = list(dict.fromkeys(m for place in group for m in parts[place][1]))
+        independent = [place for place in group if place in basis]
+        if len(monomials) <= len(independent):
+            direct.update(group)
+            for monomial in monomials:
+                add(monomial)
+        else:
+            for place in independent:
+                by_entry[place] = add(entries.exact[place] - parts[place][0])
+    affine: dict[Entry, Affine] = {}
+    for place in entries.exact:
+        if place in direct:
+            constant, terms = parts[place]
+            affine[place] = (constant, {position[m]: c for m, c in terms.items()})
+        elif place in by_entry:
+            affine[place] = (parts[place][0], {by_entry[place]: sp.Integer(1)})
+    for place, dependence in through.items():
+        if place not in affine:
+            affine[place] = _compose(dependence, affine)
+    own = [s for s in entries.symbols if s in signals]
+    return _declared_first(scalars, own, affine)
+
+
+def _declared_first(
+    scalars: list[sp.Expr], own: Sequence[sp.Symbol], affine: dict[Entry, Affine]
+) -> tuple[list[sp.Expr], dict[Entry, Affine]]:
+    """Put signals that schedule by themselves first, in the order of the plant."""
+    plain = {s: k for k, s in enumerate(reversed(own))}
+
+    def key(k: int) -> tuple[int, int]:
+        return (0, -plain[scalars[k]]) if scalars[k] in plain else (1, k)
+
+    order = sorted(range(len(scalars)), key=key)
+    new = {old: k for k, old in enumerate(order)}
+    moved = {
+        place: (constant, {new[k]: c for k, c in sorted(terms.items(), key=lambda i: new[i[0]])})
+        for place, (constant, terms) in affine.items()
+    }
+    return [scalars[k] for k in order], moved
+
+
+def _monomials(entry: sp.Expr, known: set[sp.Symbol]) -> tuple[sp.Expr, dict[sp.Expr, sp.Expr]]:
+    """Constant part, and the coefficients of the products of varying factors."""
+    constant: sp.Expr = sp.Integer(0)
+    found: dict[sp.Expr, sp.Expr] = {}
+    for term in expand_terms(entry):
+        coefficient, monomial = term.as_independent(*known, as_Add=False)
+        if monomial == 1:
+            constant += coefficient
+        else:
+            found[monomial] = found.get(monomial, sp.Integer(0)) + coefficient
+    return constant, {m: c for m, c in found.items() if c != 0}
+
+
+def _groups(parts: Mapping[Entry, tuple[sp.Expr, dict[sp.Expr, sp.Expr]]]) -> list[list[Entry]]:
+    """Entries connected through common monomials."""
+    groups: list[tuple[list[Entry], set[sp.Expr]]] = []
+    for place, (_, monomials) in parts.items():
+        joined: tuple[list[Entry], set[sp.Expr]] = ([place], set(monomials))
+        rest = []
+        for group in groups:
+            if group[1] & joined[1]:
+                joined = (group[0] + joined[0], group[1] | joined[1])
+            else:
+                rest.append(group)
+        groups = [*rest, joined]
+    return [sorted(group) for group, _ in groups]
+
+
+def _compose(dependence: AffineDependence, affine: Mapping[Entry, Affine]) -> Affine:
+    constant: sp.Expr = dependence.constant
+    total: dict[int, sp.Expr] = {}
+    for other, coefficient in dependence.coefficients.items():
+        start, terms = affine[other]
+        constant += coefficient * start
+        for k, c in terms.items():
+            total[k] = total.get(k, sp.Integer(0)) + coefficient * c
+    return constant, {k: c for k, c in total.items() if c != 0}
+
+
+def _names(model: Plant, scalars: Sequence[sp.Expr]) -> list[sp.Symbol]:
+    taken = {s.name for s in model.signals}
+    signals = {s.symbol for s in model.signals}
+    count = sum(1 for s in scalars if s not in signals)
+    free = [
+        p for p in _PREFIXES if not any(f"{p}{k}" in taken or p in taken for k in range(count + 1))
+    ]
+    prefix = free[0] if free else "scheduling_"
+    names, k = [], 0
+    for scalar in scalars:
+        if scalar in signals:
+            names.append(scalar)
+            continue
+        k += 1
+        names.append(sp.Symbol(f"{prefix}{k}", real=True))
+    return names
+
+
+def _ranges(
+    model: Plant,
+    scalars: Sequence[sp.Expr],
+    symbols: Sequence[sp.Symbol],
+    rtol: float,
+    effort: str,
+    lifts: Sequence[Lift],
+) -> tuple[SchedulingVariable, ...]:
+    known = known_signals(model)
+    hidden = {lift.signal.symbol: lift.meaning for lift in lifts}
+    more = [lift.signal for lift in lifts]
+    entries = matrix_entries({(0, k): e for k, e in enumerate(scalars)}, model, more)
+    found = bound_ranges(
+        entries.values,
+        entries.variables,
+        entries.box,
+        entries.constants,
+        entries.constant_box,
+        rtol=rtol,
+        effort=effort,
+    )
+    meanings = [scalar.xreplace(hidden) for scalar in scalars]
+    through = matrix_entries({(0, k): e for k, e in enumerate(meanings)}, model)
+    attained = _attained(through) if hidden else {}
+    variables = []
+    for k, (place, symbol) in enumerate(zip(entries.places, symbols, strict=True)):
+        signals = through.support(place)
+        lifted = bool(scalars[k].free_symbols & hidden.keys())
+        reached = (float(found.attained_lower[k]), float(found.attained_upper[k]))
+        variables.append(
+            SchedulingVariable(
+                symbol,
+                meanings[k],
+                float(found.lower[k]),
+                float(found.upper[k]),
+                *(attained[place] if lifted else reached),
+                # the range is that of a derivative, so nothing says that it is attained
+                Status.BUDGET if lifted else found.status[k],
+                signals,
+                tuple(s for s in signals if s not in known),
+            )
+        )
+    return tuple(variables)
+
+
+def _attained(entries: MatrixEntries) -> dict[Entry, tuple[float, float]]:
+    """Values that are certainly passed, from enclosures at random points."""
+    problem = entries.problem()
+    rng = np.random.default_rng(0)
+    span = problem.upper - problem.lower
+    points = problem.lower[:, None] + span[:, None] * rng.random((len(span), _SAMPLES))
+    count = len(entries.places)
+    low, high = evaluate(problem.program, points, points, range(count))
+    return {
+        place: (float(np.min(high[k])), float(np.max(low[k])))
+        for k, place in enumerate(entries.places)
+    }
+
+
+def _prove(
+    entries: MatrixEntries,
+    scalars: Sequence[sp.Expr],
+    affine: Mapping[Entry, Affine],
+    model: Plant,
+) -> dict[Entry, str]:
+    """Show that every varying entry is the affine function that it is said to be."""
+    kinds = ("x", "u", "p", "rho", "d", "f", "w")
+    box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    methods = {}
+    for place, expression in entries.exact.items():
+        constant, terms = affine[place]
+        combined = sum((c * scalars[k] for k, c in terms.items()), constant)
+        method = prove_zero(expression - combined, box)
+        if not method:
+            raise DerivationError(
+                f"the entry {expression} is not the affine function {combined} of the scheduling "
+                "variables",
+                entry=place,
+                expression=expression,
+            )
+        methods[place] = method
+    return methods

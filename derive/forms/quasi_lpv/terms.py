@@ -1,0 +1,188 @@
+"""Rows of a plant as terms, each with the ways in which it can be written."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import sympy as sp
+
+from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.forms.quasi_lpv.centre import Centre
+from obsynth.derive.forms.quasi_lpv.options import Option, kept, options
+from obsynth.derive.rigour.numbers import substitute
+from obsynth.symbolic.equations import read_rows
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["Term", "list_terms", "prefer_options", "row_names", "stacked_rows"]
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """An additive term of a row, in deviations from the centre.
+
+    Attributes
+    ----------
+    row : int
+        Row among states, then outputs.
+    expression : sympy.Expr
+        The term; the symbols stand for deviations from the centre.
+    options : tuple of Option
+        How it can be written, the structurally preferred one first; never empty.
+    reason : str
+        Why nothing but the offset is left for it; empty otherwise.
+    """
+
+    row: int
+    expression: sp.Expr
+    options: tuple[Option, ...]
+    reason: str = ""
+
+
+def stacked_rows(model: Plant) -> list[sp.Expr]:
+    """Right-hand sides, then outputs, constants as numbers."""
+    return [substitute(row, model.constant_values) for row in (*model.rhs, *model.output)]
+
+
+def row_names(model: Plant) -> tuple[str, ...]:
+    """Names of the rows: states, then outputs."""
+    return (*model.names("x"), *model.output_names)
+
+
+def list_terms(model: Plant, rows: Sequence[sp.Expr], centre: Centre) -> list[Term]:
+    """Expand the rows about the centre and list the ways to write every term.
+
+    Parameters
+    ----------
+    model : Plant
+        Its signals.
+    rows : sequence of sympy.Expr
+        Right-hand sides, then outputs.
+    centre : Centre
+        What becomes zero.
+
+    Returns
+    -------
+    list of Term
+        Their sum is the rows at centre + deviation.
+    """
+    states = [s.symbol for s in model.x]
+    inputs = [s.symbol for s in model.u]
+    noise = [s.symbol for kind in "dfw" for s in getattr(model, kind)]
+    shift = {
+        symbol: symbol + value
+        for symbol, value in zip((*states, *inputs), (*centre.x, *centre.u), strict=True)
+        if value != 0
+    }
+    found = []
+    for i, row in enumerate(rows):
+        own = i if i < len(states) else -1
+        for term in expand_terms(row.xreplace(shift)):
+            if not term.has(*states, *inputs, *noise):
+                found.append(Term(i, term, (kept(term),)))
+                continue
+            ways = _own_columns(
+                options(term, own, states, [*inputs, *noise]), states, inputs, noise
+            )
+            reason = "" if ways else "no closed form at this centre"
+            found.append(Term(i, term, tuple(ways) or (kept(term),), reason))
+    return found
+
+
+def _own_columns(
+    ways: list[Option], states: list[sp.Symbol], inputs: list[sp.Symbol], noise: list[sp.Symbol]
+) -> list[Option]:
+    """Keep what observers do not know out of the coefficients where that is possible."""
+    clean = (
+        [w for w in ways if not any(s.coefficient.has(*noise) for s in w.shares)] if noise else ways
+    )
+    if clean:
+        return clean
+    first = len(states) + len(inputs)
+    return [w for w in ways if any(s.position >= first for s in w.shares)] or ways
+
+
+def prefer_options(model: Plant, terms: list[Term], prefer: Any) -> list[Term]:
+    """Restrict the options of the terms to what the user wants.
+
+    Parameters
+    ----------
+    model : Plant
+        Its symbols.
+    terms : list of Term
+        All terms.
+    prefer : None, sequence of names, or mapping
+        Signals to divide by, the most wanted first; or for single terms (without their constant
+        factor, ``{"x1*x2": "x2"}``) what to divide them by.
+
+    Returns
+    -------
+    list of Term
+        With fewer options.
+
+    Raises
+    ------
+    DerivationError
+        A signal, a term or an option that is not there; what is there is listed.
+    """
+    if prefer is None:
+        return terms
+    if isinstance(prefer, Mapping):
+        for key, value in prefer.items():
+            terms = _prefer_for_term(model, terms, key, str(value))
+        return terms
+    wanted = [prefer] if isinstance(prefer, str | sp.Symbol) else list(prefer)
+    signals = [s.name for kind in "xudfw" for s in getattr(model, kind)]
+    for name in map(str, wanted):
+        if name not in signals:
+            raise DerivationError(
+                f"prefer= names {name!r}, which is no state and no input; there are "
+                f"{', '.join(signals)}",
+                symbol=name,
+            )
+    order = [signals.index(str(name)) for name in wanted]
+    return [_with_preferred(term, order) for term in terms]
+
+
+def _with_preferred(term: Term, order: list[int]) -> Term:
+    for j in order:
+        chosen = tuple(o for o in term.options if o.shares and o.shares[0].position == j)
+        if chosen:
+            return replace(term, options=chosen)
+    return term
+
+
+def _prefer_for_term(model: Plant, terms: list[Term], key: Any, value: str) -> list[Term]:
+    symbols = {s.name: s.symbol for kind in "xudfw" for s in getattr(model, kind)}
+    symbols |= {s.name: s.symbol for kind in ("p", "rho") for s in getattr(model, kind)}
+    symbols |= {str(s): s for s in model.constant_values}
+    (read,) = read_rows([key], symbols, "prefer=")
+    wanted = _without_numbers(substitute(read, model.constant_values))
+    result, hit = [], False
+    for term in terms:
+        if _without_numbers(term.expression) != wanted:
+            result.append(term)
+            continue
+        hit = True
+        chosen = tuple(o for o in term.options if o.text.replace(" ", "") == value.replace(" ", ""))
+        if not chosen:
+            raise DerivationError(
+                f"the term {term.expression} cannot be divided by {value}; it can be divided by "
+                f"{'; '.join(o.text for o in term.options)}",
+                term=term.expression,
+                options=tuple(o.text for o in term.options),
+            )
+        result.append(replace(term, options=chosen))
+    if not hit:
+        listed = {str(_without_numbers(t.expression)) for t in terms if len(t.options) > 1}
+        raise DerivationError(
+            f"prefer= names the term {key}, which is in no row; terms with a choice are "
+            f"{', '.join(sorted(listed)) or 'none'} (in deviations from the centre)",
+            term=key,
+        )
+    return result
+
+
+def _without_numbers(term: sp.Expr) -> sp.Expr:
+    factors = [f for f in sp.Mul.make_args(term) if not f.is_number]
+    return sp.Mul(*factors)

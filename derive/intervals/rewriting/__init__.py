@@ -1,0 +1,1 @@
+"""Expressions rewritten before they are bounded: removable singularities, cancellations."""

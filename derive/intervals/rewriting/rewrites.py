@@ -1,0 +1,209 @@
+"""Rewrites of single operations: same value wherever the original is defined, narrower range.
+
+Every function here takes the graph and the operands of an operation of CasADi and returns the node
+that stands for it.
+"""
+
+from collections.abc import Callable
+
+from obsynth.derive.intervals.graph import Graph, Node
+from obsynth.derive.intervals.rewriting.cancelling import cancelled
+
+__all__ = ["REWRITES"]
+
+
+def _split_power(graph: Graph, index: int) -> tuple[int, int]:
+    node = graph.nodes[index]
+    return (node.args[0], node.number) if node.op == "power_int" else (index, 1)
+
+
+def _power(graph: Graph, base: int, n: int) -> int:
+    node = graph.nodes[base]
+    if node.op == "power_int":
+        base, n = node.args[0], n * node.number
+        node = graph.nodes[base]
+    if n % 2 == 0 and node.op in ("absolute", "negate"):
+        base = node.args[0]
+        node = graph.nodes[base]
+    if node.op == "sqrt":
+        inner = graph.append(Node("nonnegative", node.args))
+        return _power(graph, inner, n // 2) if n > 2 and n % 2 == 0 else _half(graph, inner, n)
+    return base if n == 1 else graph.append(Node("power_int", (base,), n))
+
+
+def _half(graph: Graph, inner: int, n: int) -> int:
+    """Return sqrt(a)**n for an a known to be nonnegative."""
+    whole = inner if n // 2 == 1 else graph.append(Node("power_int", (inner,), n // 2))
+    if n % 2 == 0:
+        return whole
+    root = graph.append(Node("sqrt", graph.nodes[inner].args))
+    return graph.plain("multiply", [whole, root])
+
+
+def _square(graph: Graph, args: list[int]) -> int:
+    return _power(graph, args[0], 2)
+
+
+def _multiply(graph: Graph, args: list[int]) -> int:
+    a, b = args
+    shorter = cancelled(graph, a, b, 1)
+    if shorter is not None:
+        return shorter
+    for first, second in ((a, b), (b, a)):
+        value = graph.exact(first)
+        if value == 1.0:
+            return second
+        if value == -1.0:
+            return _negate(graph, [second])
+        if value == 2.0:
+            return graph.append(Node("twice", (second,)))
+        inner = graph.nodes[second]
+        if graph.nodes[first].op == "sign":
+            if inner.op == "multiply" and first in inner.args:
+                other = inner.args[1] if inner.args[0] == first else inner.args[0]
+                return graph.plain("multiply", [other, _power(graph, first, 2)])
+            if graph.nodes[first].args[0] == second:
+                return graph.append(Node("absolute", (second,)))
+            argument = graph.nodes[first].args[0]
+            if inner.op == "multiply" and argument in inner.args:
+                other = inner.args[1] if inner.args[0] == argument else inner.args[0]
+                return graph.plain("multiply", [other, _absolute(graph, [argument])])
+        if inner.op == "multiply":
+            for k in (0, 1):
+                sign = graph.nodes[inner.args[k]]
+                if sign.op == "sign" and sign.args[0] == first:
+                    size = _absolute(graph, [first])
+                    return graph.plain("multiply", [inner.args[1 - k], size])
+    (base, n), (other, m) = _split_power(graph, a), _split_power(graph, b)
+    if base == other and base not in graph.constants:
+        return _power(graph, base, n + m)
+    return graph.plain("multiply", args)
+
+
+def _divide(graph: Graph, args: list[int]) -> int:
+    a, b = args
+    if graph.exact(b) == 1.0:
+        return a
+    shorter = cancelled(graph, a, b, -1)
+    if shorter is not None:
+        return shorter
+    top, bottom = graph.nodes[a], graph.nodes[b]
+    if top.op == "less_equal" and bottom.op == "add" and a in bottom.args:
+        other = bottom.args[1] if bottom.args[0] == a else bottom.args[0]
+        mirrored = graph.nodes[other]
+        if mirrored.op == "less_equal" and mirrored.args == top.args[::-1]:
+            return graph.append(Node("boundary_weight", top.args))
+    return graph.plain("divide", args)
+
+
+def _add(graph: Graph, args: list[int]) -> int:
+    a, b = args
+    for first, second in ((a, b), (b, a)):
+        if graph.exact(first) == 0.0:
+            return second
+        if graph.nodes[first].op == "negate":
+            return _subtract(graph, [second, graph.nodes[first].args[0]])
+        yes, no = graph.nodes[first], graph.nodes[second]
+        if yes.op == no.op == "if_else_zero":
+            opposite = graph.nodes[no.args[0]]
+            if opposite.op == "logical_not" and opposite.args[0] == yes.args[0]:
+                return graph.append(Node("select", (yes.args[0], yes.args[1], no.args[1])))
+        if yes.op == no.op == "multiply":
+            choice = _weighted(graph, yes, no)
+            if choice is not None:
+                return choice
+    if a == b:
+        return graph.append(Node("twice", (a,)))
+    return graph.plain("add", args)
+
+
+def _weighted(graph: Graph, yes: Node, no: Node) -> int | None:
+    """Join w a + (1 - w) b, with the weights of a min or max, to a choice between a and b."""
+    for i in (0, 1):
+        weight = graph.nodes[yes.args[i]]
+        if weight.op != "boundary_weight":
+            continue
+        for j in (0, 1):
+            other = graph.nodes[no.args[j]]
+            if other.op == "boundary_weight" and other.args == weight.args[::-1]:
+                return graph.append(Node("select", (yes.args[i], yes.args[1 - i], no.args[1 - j])))
+    return None
+
+
+def _subtract(graph: Graph, args: list[int]) -> int:
+    a, b = args
+    if graph.exact(b) == 0.0:
+        return a
+    if graph.exact(a) == 0.0:
+        return _negate(graph, [b])
+    if graph.nodes[b].op == "negate":
+        return _add(graph, [a, graph.nodes[b].args[0]])
+    return graph.plain("subtract", args)
+
+
+def _negate(graph: Graph, args: list[int]) -> int:
+    node = graph.nodes[args[0]]
+    if node.op == "negate":
+        return node.args[0]
+    if node.op == "subtract":
+        return _subtract(graph, [node.args[1], node.args[0]])
+    return graph.plain("negate", args)
+
+
+def _sqrt(graph: Graph, args: list[int]) -> int:
+    node = graph.nodes[args[0]]
+    if node.op == "power_int" and node.number % 2 == 0:
+        inner = graph.append(Node("absolute", node.args))
+        return _power(graph, inner, node.number // 2)
+    return graph.plain("sqrt", args)
+
+
+def _absolute(graph: Graph, args: list[int]) -> int:
+    node = graph.nodes[args[0]]
+    if node.op == "absolute" or (node.op == "power_int" and node.number % 2 == 0):
+        return args[0]
+    if node.op == "negate":
+        return _absolute(graph, [node.args[0]])
+    return graph.plain("absolute", args)
+
+
+def _power_const(graph: Graph, args: list[int]) -> int:
+    exponent = graph.exact(args[1])
+    if exponent is not None and exponent == int(exponent):
+        n = int(exponent)
+        if n == 0:
+            return graph.number(1.0, 1.0)
+        positive = _power(graph, args[0], abs(n))
+        return positive if n > 0 else _inverse(graph, [positive])
+    if exponent == 0.5:
+        return _sqrt(graph, [args[0]])
+    if exponent == -0.5:
+        return _inverse(graph, [_sqrt(graph, [args[0]])])
+    name = "power_const" if args[1] in graph.constants else "power"
+    return graph.plain(name, args)
+
+
+def _inverse(graph: Graph, args: list[int]) -> int:
+    return _divide(graph, [graph.number(1.0, 1.0), args[0]])
+
+
+def _not_equal(graph: Graph, args: list[int]) -> int:
+    return graph.append(Node("logical_not", (graph.plain("equal", args),)))
+
+
+REWRITES: dict[str, Callable[[Graph, list[int]], int]] = {
+    "square": _square,
+    "multiply": _multiply,
+    "divide": _divide,
+    "add": _add,
+    "subtract": _subtract,
+    "negate": _negate,
+    "sqrt": _sqrt,
+    "absolute": _absolute,
+    "power": _power_const,
+    "power_const": _power_const,
+    "inverse": _inverse,
+    "not_equal": _not_equal,
+    "twice": lambda graph, args: graph.append(Node("twice", (args[0],))),
+    "assign": lambda _graph, args: args[0],
+}

@@ -1,0 +1,357 @@
+"""Rows of boxes, each with the goal it serves, and what one evaluation says about them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.rigour.interval import Array, Mask, up
+
+__all__ = [
+    "Entries",
+    "EntryRanges",
+    "Problem",
+    "RowRanges",
+    "Rows",
+    "Source",
+    "enclose_rows",
+    "mean_value_terms",
+    "shrink",
+]
+
+Indices = NDArray[np.int64]
+
+# Cost of running a program, in microseconds: of the call, per operation, per operation and box. It
+# decides whether a sweep runs the shared program once or the parts of it one by one.
+_COST_CALL, _COST_NODE, _COST_BOX = 110.0, 2.0, 0.011
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """CasADi expressions behind a program.
+
+    Attributes
+    ----------
+    column : casadi.SX, shape (m, 1)
+        The expressions.
+    variables, extra : casadi.SX
+        Symbols of the box and of the constants.
+    constant_box : list of (float, float)
+        Enclosures of the constants.
+    """
+
+    column: ca.SX
+    variables: ca.SX
+    extra: ca.SX
+    constant_box: list[tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class EntryRanges:
+    """Ranges of several outputs per row.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (k, N)
+        Zero where a row has no such output.
+    rough : ndarray of bool, shape (N,)
+        Where the first output may jump or be undefined in the box.
+    """
+
+    lower: Array
+    upper: Array
+    rough: Mask
+
+
+class Entries:
+    """Several outputs of a program for every one of many entries.
+
+    Parameters
+    ----------
+    program : Program
+        The outputs.
+    outputs : ndarray of int, shape (m, k)
+        Their positions, one row per entry; -1 for none.
+
+    Examples
+    --------
+    >>> x = ca.SX.sym("x")
+    >>> program = Program.from_casadi(ca.Function("f", [x], [x * x, x - 1, 2 * x]))
+    >>> entries = Entries(program, np.array([[0, 2], [1, -1]]))
+    >>> which, low, high = np.array([0, 1]), np.array([[1.0, 4.0]]), np.array([[2.0, 5.0]])
+    >>> entries.enclose(which, low, high, judged=True).upper.tolist()
+    [[4.0, 4.0], [4.0, 0.0]]
+    """
+
+    def __init__(self, program: Program, outputs: Indices) -> None:
+        self._program, self._outputs = program, outputs
+        self._needs = [sorted({k for k in row if k >= 0}) for row in outputs.tolist()]
+        self._alone: dict[int, int] = {}
+        self._chosen: dict[tuple[int, ...], tuple[list[int], Indices]] = {}
+
+    def enclose(self, entry: Indices, lower: Array, upper: Array, judged: bool) -> EntryRanges:
+        """Enclose, for every box, the outputs that belong to its entry.
+
+        Parameters
+        ----------
+        entry : ndarray of int, shape (N,)
+            Which entry a box belongs to.
+        lower, upper : ndarray, shape (v, N)
+            The boxes.
+        judged : bool
+            Whether it matters that the first output is rough.
+
+        Returns
+        -------
+        EntryRanges
+        """
+        counts = np.bincount(entry, minlength=len(self._needs))
+        some = np.flatnonzero(counts).tolist()
+        if self._together(some, counts):
+            return self._enclose(tuple(some), entry, lower, upper, judged)
+        k, n = self._outputs.shape[1], len(entry)
+        result = EntryRanges(np.empty((k, n)), np.empty((k, n)), np.empty(n, dtype=bool))
+        for e in some:
+            index = np.flatnonzero(entry == e)
+            part = self._enclose((e,), entry[index], lower[:, index], upper[:, index], judged)
+            result.lower[:, index], result.upper[:, index] = part.lower, part.upper
+            result.rough[index] = part.rough
+        return result
+
+    def _together(self, some: list[int], counts: Indices) -> bool:
+        """Whether the shared program costs less than the parts of it one by one."""
+        rows = int(counts.sum())
+        # nothing is gained by parts before the boxes weigh as much as the calls
+        if len(some) == 1 or rows * _COST_BOX < _COST_NODE:
+            return True
+        for e in some:
+            if e not in self._alone:
+                self._alone[e] = len(self._program.live(self._needs[e]))
+        one_by_one = sum(_cost(self._alone[e], int(counts[e])) for e in some)
+        return _cost(len(self._program.live(self._choice(tuple(some))[0])), rows) <= one_by_one
+
+    def _choice(self, some: tuple[int, ...]) -> tuple[list[int], Indices]:
+        """List the outputs of some entries, first the first ones, and where they stand."""
+        if some not in self._chosen:
+            first = list(dict.fromkeys(self._outputs[list(some), 0].tolist()))
+            others = {k for e in some for k in self._needs[e]}
+            chosen = first + sorted(others.difference(first)) if -1 not in first else sorted(others)
+            row = np.zeros(len(self._program.outputs) + 1, dtype=np.int64)
+            row[chosen] = np.arange(len(chosen))
+            self._chosen[some] = chosen, row
+        return self._chosen[some]
+
+    def _enclose(
+        self, some: tuple[int, ...], entry: Indices, lower: Array, upper: Array, judged: bool
+    ) -> EntryRanges:
+        chosen, row = self._choice(some)
+        found = enclose(self._program, lower, upper, chosen, len(some) if judged else 0)
+        wanted = self._outputs[entry].T
+        place, present = (row[wanted], np.arange(len(entry))), wanted >= 0
+        return EntryRanges(
+            np.where(present, found.lower[place], 0.0),
+            np.where(present, found.upper[place], 0.0),
+            found.rough[place[0][0], place[1]],
+        )
+
+
+def _cost(nodes: int, rows: int) -> float:
+    return _COST_CALL + nodes * (_COST_NODE + _COST_BOX * rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Expressions with their gradients over one box.
+
+    Attributes
+    ----------
+    program : Program
+        Outputs: first the expressions, then the structurally nonzero partial derivatives.
+    gradient : ndarray of int, shape (m, v)
+        Position of a partial derivative among the outputs; -1 where it is zero.
+    relevant : ndarray of bool, shape (m, v)
+        Whether an expression depends on a variable.
+    affine : ndarray of bool, shape (m, v)
+        Whether an expression is affine in a variable with the others held.
+    lower, upper : ndarray, shape (v,)
+        The box.
+    source : Source or None
+        Where it comes from, for those who need more derivatives or other variables.
+    """
+
+    program: Program
+    gradient: Indices
+    relevant: Mask
+    affine: Mask
+    lower: Array
+    upper: Array
+    source: Source | None = None
+
+    @cached_property
+    def values(self) -> Entries:
+        """The expressions alone."""
+        return Entries(self.program, np.arange(len(self.gradient))[:, None])
+
+    @cached_property
+    def with_slopes(self) -> Entries:
+        """The expressions, each followed by its partial derivatives."""
+        values = np.arange(len(self.gradient))[:, None]
+        return Entries(self.program, np.concatenate([values, self.gradient], axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A batch of boxes.
+
+    Attributes
+    ----------
+    goal : ndarray of int, shape (N,)
+        2 e for the smallest value of the expression e, 2 e + 1 for the largest.
+    lower, upper : ndarray, shape (v, N)
+        The boxes.
+    bound : ndarray, shape (N,)
+        Upper bound of the goal's expression over the box, so far.
+    """
+
+    goal: Indices
+    lower: Array
+    upper: Array
+    bound: Array
+
+    def take(self, which: Mask | Indices) -> "Rows":
+        """Return some of the rows."""
+        return Rows(self.goal[which], self.lower[:, which], self.upper[:, which], self.bound[which])
+
+    def join(self, other: "Rows") -> "Rows":
+        """Return these rows and others."""
+        return Rows(
+            np.concatenate([self.goal, other.goal]),
+            np.concatenate([self.lower, other.lower], axis=1),
+            np.concatenate([self.upper, other.upper], axis=1),
+            np.concatenate([self.bound, other.bound]),
+        )
+
+    def put(self, which: Indices, other: "Rows") -> "Rows":
+        """Return these rows with some of them replaced."""
+        lower, upper, bound = self.lower.copy(), self.upper.copy(), self.bound.copy()
+        lower[:, which], upper[:, which], bound[which] = other.lower, other.upper, other.bound
+        return Rows(self.goal, lower, upper, bound)
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.goal)
+
+
+@dataclass(frozen=True, eq=False)
+class RowRanges:
+    """Value and gradient of every row's goal: of the expression or of its negative.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (N,)
+        Natural enclosure of the value.
+    slope_lower, slope_upper : ndarray, shape (v, N)
+        Enclosure of the gradient; the whole line where the expression may jump or be undefined
+        in the box, zero where no gradient was asked for.
+    rough : ndarray of bool, shape (N,)
+        Where the expression may jump or be undefined in the box.
+    """
+
+    lower: Array
+    upper: Array
+    slope_lower: Array
+    slope_upper: Array
+    rough: Mask
+
+    def take(self, which: Indices) -> "RowRanges":
+        """Return some of the rows."""
+        return RowRanges(
+            self.lower[which],
+            self.upper[which],
+            self.slope_lower[:, which],
+            self.slope_upper[:, which],
+            self.rough[which],
+        )
+
+
+def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
+    """Enclose value and, where asked, gradient for every row.
+
+    Parameters
+    ----------
+    problem : Problem
+        The expressions.
+    rows : Rows
+        Boxes and goals.
+    slopes : bool
+        Whether the gradient is needed.
+
+    Returns
+    -------
+    RowRanges
+        In the sign of the goals, so that every row asks for a largest value.
+    """
+    entry = rows.goal // 2
+    entries = problem.with_slopes if slopes else problem.values
+    found = entries.enclose(entry, rows.lower, rows.upper, judged=True)
+    low = rows.goal % 2 == 0
+    lower, upper = (
+        np.where(low, -found.upper, found.lower),
+        np.where(low, -found.lower, found.upper),
+    )
+    slope_lower, slope_upper = lower[1:], upper[1:]
+    if not slopes:
+        slope_lower, slope_upper = np.zeros_like(rows.lower), np.zeros_like(rows.lower)
+    elif found.rough.any():
+        touched = problem.relevant[entry].T & found.rough
+        slope_lower[touched], slope_upper[touched] = -np.inf, np.inf
+    return RowRanges(lower[0], upper[0], slope_lower, slope_upper, found.rough)
+
+
+def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, Array]:
+    """Reduce boxes to the facet where a monotone goal has its largest value.
+
+    Parameters
+    ----------
+    rows : Rows
+        Boxes.
+    slope_lower, slope_upper : ndarray, shape (v, N)
+        Enclosure of the gradient over them.
+
+    Returns
+    -------
+    (ndarray, ndarray), shape (v, N)
+        Lower and upper ends: the upper facet in variables in which the goal rises, the lower one
+        where it falls or does not change.
+    """
+    falls = slope_upper <= 0.0
+    rises = (slope_lower >= 0.0) & ~falls
+    return np.where(rises, rows.upper, rows.lower), np.where(falls, rows.lower, rows.upper)
+
+
+def mean_value_terms(
+    lower: Array, upper: Array, centre: Array, slope_lower: Array, slope_upper: Array
+) -> Array:
+    """Bound |gradient| times distance from the centre, variable by variable.
+
+    Parameters
+    ----------
+    lower, upper, centre : ndarray, shape (v, N)
+        Boxes and a point in each.
+    slope_lower, slope_upper : ndarray, shape (v, N)
+        Enclosure of the gradient over the boxes.
+
+    Returns
+    -------
+    ndarray, shape (v, N)
+        Rounded up; zero for variables without width, infinite where the gradient is unknown.
+    """
+    radius = np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
+    size = np.maximum(np.abs(slope_lower), np.abs(slope_upper))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(radius > 0.0, up(size * radius), 0.0)

@@ -1,0 +1,332 @@
+"""Second derivatives over batches of boxes, and what they say about a largest value.
+
+Where an expression is twice differentiable all over a box, an enclosure H of its second derivatives
+gives three things that values and gradients do not: a gradient enclosure that is better by one
+order (the mean-value form of every partial derivative), a bound of second order,
+f(x) <= f(c) + f'(c) (x - c) + sup (x - c)' H (x - c) / 2, and, where H is negative definite, the
+knowledge that the goal is concave, so that its tangent at any point bounds it.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.search.batch import Entries, Source
+from obsynth.derive.rigour.interval import Array, Mask, down, up
+
+__all__ = [
+    "Curvatures",
+    "Hessians",
+    "is_concave",
+    "sharpened_slopes",
+    "tangent_rise",
+    "taylor_spread",
+]
+
+Indices = NDArray[np.int64]
+
+# Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
+# quotients with a removable singularity it knows nothing at the singularity.
+_NOT_SMOOTH = frozenset(
+    {
+        "absolute",
+        "boundary_weight",
+        "ceiling",
+        "conjunction",
+        "copysign",
+        "disjunction",
+        "equal",
+        "floor",
+        "if_else_zero",
+        "less",
+        "less_equal",
+        "logical_not",
+        "maximum",
+        "meet",
+        "minimum",
+        "remainder",
+        "select",
+        "sign",
+    }
+)
+_ULP = 2.3e-16
+_TINY = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class Hessians:
+    """Enclosures of second derivatives, in the sign of the goals.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (N, v, v)
+        Symmetric; zero where nothing is known.
+    usable : ndarray of bool, shape (N,)
+        Rows whose goal is twice differentiable all over the box, with finite bounds.
+    """
+
+    lower: Array
+    upper: Array
+    usable: Mask
+
+    @property
+    def size(self) -> Array:
+        """Largest magnitudes, shape (N, v, v)."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
+    def take(self, which: Indices) -> "Hessians":
+        """Return some of the rows."""
+        return Hessians(self.lower[which], self.upper[which], self.usable[which])
+
+
+class Curvatures:
+    """Programs of the second derivatives of expressions, made when they are first asked for.
+
+    Parameters
+    ----------
+    source : Source
+        The expressions.
+    program : Program
+        Interval program of the expressions, which tells what they are made of.
+
+    Examples
+    --------
+    >>> x = ca.SX.sym("x", 2)
+    >>> f = ca.vertcat(x[0] ** 2 * x[1], ca.fabs(x[0]))
+    >>> none = ca.SX(0, 1)
+    >>> program = Program.from_casadi(ca.Function("f", [x, none], [f]), {1: []})
+    >>> made = Curvatures(Source(f, x, none, []), program)
+    >>> low = np.array([[1.0], [2.0]])
+    >>> made.enclose(np.array([1]), low, low).upper[0].tolist()
+    [[4.0, 2.0], [2.0, 0.0]]
+    >>> made.enclose(np.array([3]), low, low).usable.tolist()
+    [False]
+    """
+
+    def __init__(self, source: Source, program: Program) -> None:
+        self._source, self._program = source, program
+        self._smooth: dict[int, bool] = {}
+        self._made: list[Entries] = []
+        self._where: dict[int, int] = {}
+
+    def _is_smooth(self, expression: int) -> bool:
+        if expression not in self._smooth:
+            program = self._program
+            used = {
+                program.nodes[k].op
+                for k in program.live([expression])
+                if k not in program.constants
+            }
+            self._smooth[expression] = not used & _NOT_SMOOTH
+        return self._smooth[expression]
+
+    def _make(self, expressions: list[int]) -> None:
+        """Make one program of the second derivatives of several expressions."""
+        source = self._source
+        m, v = source.column.numel(), source.variables.numel()
+        outputs = np.full((m, v, v), -1, dtype=np.int64)
+        entries = [ca.SX(0, 1)]
+        count = 0
+        for e in expressions:
+            hessian = ca.triu(ca.hessian(source.column[e], source.variables)[0])
+            rows, columns = hessian.sparsity().get_triplet()
+            if rows:
+                entries.append(ca.SX(hessian.nz[:]))
+            for i, j in zip(rows, columns, strict=True):
+                outputs[e, i, j] = outputs[e, j, i] = count
+                count += 1
+            self._where[e] = len(self._made)
+        inputs = [source.variables, source.extra]
+        function = ca.Function("curvature", inputs, [ca.vertcat(*entries)])
+        program = Program.from_casadi(function, {1: source.constant_box})
+        self._made.append(Entries(program, outputs.reshape(m, v * v)))
+
+    def enclose(self, goal: Indices, lower: Array, upper: Array) -> Hessians:
+        """Enclose the second derivatives of every row's goal over its box.
+
+        Parameters
+        ----------
+        goal : ndarray of int, shape (N,)
+            2 e for minus the expression e, 2 e + 1 for the expression.
+        lower, upper : ndarray, shape (v, N)
+            The boxes.
+
+        Returns
+        -------
+        Hessians
+            Not usable for expressions with kinks, jumps or choices.
+        """
+        v, n = lower.shape
+        low, high = np.zeros((n, v, v)), np.zeros((n, v, v))
+        entry = goal // 2
+        smooth = [e for e in np.unique(entry).tolist() if self._is_smooth(e)]
+        new = [e for e in smooth if e not in self._where]
+        if new:
+            self._make(new)
+        usable = np.isin(entry, smooth)
+        for number in sorted({self._where[e] for e in smooth}):
+            here = [e for e in smooth if self._where[e] == number]
+            index = np.flatnonzero(np.isin(entry, here))
+            boxes = lower[:, index], upper[:, index]
+            found = self._made[number].enclose(entry[index], *boxes, judged=False)
+            low[index] = found.lower.T.reshape(-1, v, v)
+            high[index] = found.upper.T.reshape(-1, v, v)
+        usable &= (np.isfinite(low) & np.isfinite(high)).all(axis=(1, 2))
+        low[~usable] = high[~usable] = 0.0
+        minus = (goal % 2 == 0)[:, None, None]
+        return Hessians(np.where(minus, -high, low), np.where(minus, -low, high), usable)
+
+
+def _radius(lower: Array, upper: Array, centre: Array) -> Array:
+    return np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
+
+
+def sharpened_slopes(
+    lower: Array,
+    upper: Array,
+    centre: Array,
+    at_centre: tuple[Array, Array],
+    slopes: tuple[Array, Array],
+    hessians: Hessians,
+) -> tuple[Array, Array]:
+    """Intersect gradients with the mean-value form that starts from the centre.
+
+    Parameters
+    ----------
+    lower, upper, centre : ndarray, shape (v, N)
+        Boxes and a point in each.
+    at_centre, slopes : (ndarray, ndarray), shape (v, N)
+        Enclosures of the gradient at the centre and over the box.
+    hessians : Hessians
+        Over the box.
+
+    Returns
+    -------
+    (ndarray, ndarray), shape (v, N)
+        Enclosure of the gradient over the box.
+    """
+    reach = np.einsum("nij,jn->in", hessians.size, _radius(lower, upper, centre))
+    reach = up(reach * (1.0 + (len(lower) + 4) * _ULP))
+    reach[:, ~hessians.usable] = np.inf
+    with np.errstate(invalid="ignore"):
+        low, high = down(at_centre[0] - reach), up(at_centre[1] + reach)
+    return np.fmax(slopes[0], low), np.fmin(slopes[1], high)
+
+
+def taylor_spread(
+    lower: Array,
+    upper: Array,
+    centre: Array,
+    at_centre: tuple[Array, Array],
+    hessians: Hessians,
+) -> Array:
+    """Bound the rise above the value at the centre by a quadratic, separately in every variable.
+
+    Parameters
+    ----------
+    lower, upper, centre : ndarray, shape (v, N)
+        Boxes and a point in each.
+    at_centre : (ndarray, ndarray), shape (v, N)
+        Enclosure of the gradient at the centre.
+    hessians : Hessians
+        Over the box or a larger one.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Infinite where the second derivatives are not usable.
+    """
+    radius = _radius(lower, upper, centre)
+    steep = np.maximum(np.abs(at_centre[0]), np.abs(at_centre[1]))
+    bend = np.einsum("nii->in", hessians.upper)
+    size = hessians.size
+    with np.errstate(all="ignore"):
+        # where the parabola bends down before the end of the box, its top; else its end, of which
+        # the negative part takes away at most half
+        top = (bend < 0.0) & (steep < -bend * radius)
+        along = np.where(
+            top, steep * steep / (-2.0 * bend), steep * radius + 0.5 * bend * radius * radius
+        )
+    along = np.where(radius > 0.0, np.maximum(along, 0.0), 0.0)
+    np.einsum("nii->ni", size)[...] = 0.0
+    across = 0.5 * np.einsum("nij,in,jn->n", size, radius, radius)
+    total = (along.sum(axis=0) + across) * (1.0 + (len(lower) ** 2 + 64) * _ULP) + _TINY
+    return np.where(hessians.usable, total, np.inf)
+
+
+def is_concave(hessians: Hessians, free: Mask) -> Mask:
+    """Prove goals strictly concave in their free variables, by elimination in intervals.
+
+    Parameters
+    ----------
+    hessians : Hessians
+        Over the boxes.
+    free : ndarray of bool, shape (v, N)
+        Variables in which a box has width.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        True where every symmetric matrix between the bounds is negative definite on the free
+        variables: all pivots of its negative are positive.
+    """
+    count = int(free.sum(axis=0).max(initial=0))
+    order = np.argsort(~free.T, axis=1, kind="stable")[:, :count]
+    inside = np.take_along_axis(free.T, order, axis=1)
+    pick = np.arange(len(order))[:, None, None], order[:, :, None], order[:, None, :]
+    low, high = -hessians.upper[pick], -hessians.lower[pick]
+    outside = ~(inside[:, :, None] & inside[:, None, :])
+    one = np.broadcast_to(np.eye(count), low.shape)
+    low, high = np.where(outside, one, low), np.where(outside, one, high)
+    proved = hessians.usable.copy()
+    with np.errstate(all="ignore"):
+        for k in range(count):
+            proved &= low[:, k, k] > 0.0
+            if not proved.any():
+                break
+            pivot = np.where(proved, low[:, k, k], 1.0), np.where(proved, high[:, k, k], 1.0)
+            for i in range(k + 1, count):
+                factor = _divide((low[:, i, k], high[:, i, k]), pivot)
+                for j in range(i, count):
+                    product = _multiply(factor, (low[:, j, k], high[:, j, k]))
+                    low[:, j, i] = down(low[:, j, i] - product[1])
+                    high[:, j, i] = up(high[:, j, i] - product[0])
+    return proved
+
+
+def _multiply(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+    products = np.stack([a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]])
+    return down(products.min(axis=0)), up(products.max(axis=0))
+
+
+def _divide(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Quotient by a positive interval."""
+    quotients = np.stack([a[0] / b[0], a[0] / b[1], a[1] / b[0], a[1] / b[1]])
+    return down(quotients.min(axis=0)), up(quotients.max(axis=0))
+
+
+def tangent_rise(
+    lower: Array, upper: Array, centre: Array, at_centre: tuple[Array, Array]
+) -> Array:
+    """Bound the rise of tangents above their point of contact, over boxes.
+
+    Parameters
+    ----------
+    lower, upper, centre : ndarray, shape (v, N)
+        Boxes and a point in each.
+    at_centre : (ndarray, ndarray), shape (v, N)
+        Enclosure of the gradient there.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Rounded up; what a concave function rises at most.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        forwards = np.where(upper > centre, up(at_centre[1] * up(upper - centre)), 0.0)
+        backwards = np.where(lower < centre, up(at_centre[0] * down(lower - centre)), 0.0)
+    along = np.maximum(np.maximum(forwards, backwards), 0.0)
+    return np.asarray(up(along.sum(axis=0) * (1.0 + (len(lower) + 2) * _ULP)))

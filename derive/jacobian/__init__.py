@@ -1,0 +1,1 @@
+"""Jacobians over a box: entries, bounds, dependences, affine families."""

@@ -1,0 +1,306 @@
+"""Entries of a plant's Jacobian, in CasADi for the interval engine and in SymPy for proofs."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive.algebra.common_factors import cancel_common_factors
+from obsynth.derive.algebra.products_to_sums import products_to_sums
+from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.rewriting.quotients import Quotients
+from obsynth.derive.intervals.rewriting.removable import remove_singularities
+from obsynth.derive.rigour.numbers import enclose_number, rational, substitute
+from obsynth.derive.split import Split
+from obsynth.symbolic.convert import nearest_double, to_sx
+from obsynth.symbolic.parity import ParityError, check_parity, sample_box
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["JacobianEntries", "jacobian_entries", "sample_entries"]
+
+Array = NDArray[np.float64]
+Entry = tuple[int, int]
+_SAMPLES = 96
+# Expanding a longer entry costs more than the zeros it may show.
+_LONG = 500
+_KINDS = ("x", "u", "p", "rho", "d", "f", "w")
+# Two forms of a row are compared on boxes of this share of the ranges.
+_SHARE, _BOXES = 0.25, 24
+_GAIN = 0.9
+_POINTS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianEntries:
+    """Entries of the Jacobian that are not structurally zero.
+
+    Attributes
+    ----------
+    places : list of (int, int)
+        Row and column of every entry.
+    values : casadi.SX, shape (m, 1)
+        The entries, with constants as symbols.
+    variables : casadi.SX, shape (v, 1)
+        Variables of the box: all states, and the other signals that occur.
+    names, symbols : tuple of str, list of sympy.Symbol
+        Their names and SymPy symbols.
+    box : ndarray, shape (v, 2)
+        Their ranges.
+    constants : casadi.SX
+        Symbols that stand for numbers.
+    constant_box : list of (float, float)
+        Their enclosures.
+    symbolic : dict of (int, int) to sympy.Expr
+        The entries, exact.
+    quotients : Quotients or None
+        What further symbols in the values stand for.
+    """
+
+    places: list[Entry]
+    values: ca.SX
+    variables: ca.SX
+    names: tuple[str, ...]
+    symbols: list[sp.Symbol]
+    box: Array
+    constants: ca.SX
+    constant_box: list[tuple[float, float]]
+    symbolic: dict[Entry, sp.Expr]
+    quotients: Quotients | None
+
+
+def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntries:
+    """Collect the entries of a Jacobian that are not structurally zero.
+
+    Parameters
+    ----------
+    model : Plant
+        The plant.
+    part : Split or None
+        Its split, for the Jacobian of g in place of that of the right-hand side.
+    wrt : {"states", "inputs"}
+        What to differentiate by.
+
+    Returns
+    -------
+    JacobianEntries
+        Rows with products of sines and cosines are taken in the form with the narrower ranges.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import planar_arm_bias
+    >>> found = jacobian_entries(planar_arm_bias(2), None, "states")
+    >>> found.symbolic[(3, 1)]
+    -dq1**2*cos(q2)
+    """
+    kind = {"states": "x", "inputs": "u"}[wrt]
+    sx = model.sx(constants="symbol")
+    columns = getattr(sx, kind)
+    constants = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
+    rows, rhs = _preferred_rows(model, constants)
+    if part is not None:
+        noise = ca.vertcat(sx.d, sx.f, sx.w)
+        rhs = ca.substitute(rhs, noise, ca.SX.zeros(noise.numel()))
+    jacobian, quotients = _differentiated(model, rhs, columns, constants)
+    linear = None if part is None else (part.A if kind == "x" else part.B)
+    wrt_symbols = [s.symbol for s in getattr(model, kind)]
+    symbolic = sp.Matrix(rows).jacobian(wrt_symbols) if wrt_symbols else sp.zeros(len(rows), 0)
+    quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
+    places, values, shifts, shift_symbols = [], [], [], []
+    expressions: dict[Entry, sp.Expr] = {}
+    for i in range(jacobian.shape[0]):
+        for j in range(jacobian.shape[1]):
+            present = jacobian.sparsity().has_nz(i, j)
+            offset = 0.0 if linear is None else float(linear[i, j])
+            if not present and offset == 0.0:
+                continue
+            value = jacobian[i, j] if present else ca.SX(0)
+            exact = substitute(symbolic[i, j], model.constant_values)
+            if offset != 0.0:
+                symbol = ca.SX.sym(f"a{i + 1}{j + 1}")
+                shifts.append((offset, offset))
+                shift_symbols.append(symbol)
+                value, exact = value - symbol, exact - rational(offset)
+            if part is not None:
+                exact = exact.subs(quiet)
+            if exact.count_ops() < _LONG:
+                exact = sp.expand(exact)
+            if exact == 0:
+                continue
+            places.append((i, j))
+            values.append(value)
+            expressions[(i, j)] = exact
+    column = ca.vertcat(*values) if values else ca.SX(0, 1)
+    inner = [] if quotients is None else [q.argument for q in quotients.members]
+    needed = {str(s) for s in ca.symvar(ca.vertcat(column, *inner))}
+    names: list[str] = []
+    symbols: list[sp.Symbol] = []
+    parts: list[ca.SX] = []
+    boxes: list[tuple[float, float]] = []
+    for k in _KINDS:
+        for signal, element in zip(getattr(model, k), ca.vertsplit(getattr(sx, k)), strict=True):
+            if k == "x" or signal.name in needed:
+                names.append(signal.name)
+                symbols.append(signal.symbol)
+                parts.append(element)
+                boxes.append((signal.lower, signal.upper))
+    return JacobianEntries(
+        places,
+        column,
+        ca.vertcat(*parts),
+        tuple(names),
+        symbols,
+        np.array(boxes, dtype=float).reshape(-1, 2),
+        ca.vertcat(sx.c, *shift_symbols),
+        [*constants, *shifts],
+        expressions,
+        quotients,
+    )
+
+
+def _all_variables(model: Plant) -> tuple[ca.SX, Array]:
+    sx = model.sx(constants="symbol")
+    variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
+    return variables, np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
+
+
+def _differentiated(
+    model: Plant, rhs: ca.SX, columns: ca.SX, constants: list[tuple[float, float]]
+) -> tuple[ca.SX, Quotients | None]:
+    """Jacobian, through quotients with removable singularities where there are some."""
+    variables, box = _all_variables(model)
+    extra = model.sx(constants="symbol").c
+    found = remove_singularities(ca.densify(rhs), variables, extra, box, constants)
+    if found is None:
+        return ca.jacobian(rhs, columns), None
+    return found[1].jacobian(found[0], columns), found[1]
+
+
+def _preferred_rows(
+    model: Plant, constants: list[tuple[float, float]]
+) -> tuple[list[sp.Expr], ca.SX]:
+    """Right-hand side row by row, as it is or in a form with narrower ranges."""
+    sx = model.sx(constants="symbol")
+    rows, rhs = list(model.rhs), ca.vertsplit(sx.rhs)
+    columns = ca.vertcat(sx.x, sx.u)
+    signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
+    variables, box = _all_variables(model)
+    elements = ca.vertsplit(ca.vertcat(variables, sx.c))
+    symbols = dict(zip((s.symbol for s in signals), elements, strict=True))
+
+    def may_vanish(part: sp.Expr) -> bool:
+        (value,) = to_sx([part], symbols, ["a denominator"])
+        function = ca.Function("part", [variables, sx.c], [value])
+        lower, upper = evaluate(Program.from_casadi(function, {1: constants}), *_ends(box))
+        return bool(lower[0, 0] <= 0.0 <= upper[0, 0])
+
+    for i, typed in enumerate(rows):
+        row = typed
+        shorter = cancel_common_factors(substitute(typed, {}), may_vanish)
+        if shorter is not None:
+            (written,) = to_sx([shorter], symbols, [f"dynamics row {i + 1}"])
+            if _agree(typed.xreplace(model.constant_values), written, symbols, model):
+                rows[i], rhs[i], row = shorter, written, shorter
+        other = products_to_sums(substitute(row, {}))
+        if other is None:
+            continue
+        (written,) = to_sx([other], symbols, [f"dynamics row {i + 1}"])
+        if not _agree(row.xreplace(model.constant_values), written, symbols, model):
+            continue
+        forms = [ca.jacobian(form, columns) for form in (rhs[i], written)]
+        widths = _mean_widths(forms, variables, sx.c, box, constants)
+        if _is_narrower(widths[1], widths[0]):
+            rows[i], rhs[i] = other, written
+    return rows, ca.vertcat(*rhs)
+
+
+def _ends(box: Array) -> tuple[Array, Array]:
+    return box[:, :1], box[:, 1:]
+
+
+def _agree(row: sp.Expr, written: ca.SX, symbols: dict[sp.Symbol, ca.SX], model: Plant) -> bool:
+    """Compare a row as the user wrote it with its other form, at random points."""
+    variables, box = _all_variables(model)
+    values = [(symbols[s], nearest_double(v)) for s, v in model.constant_values.items()]
+    numbers = [ca.DM(value) for _, value in values]
+    plain = ca.substitute([written], [symbol for symbol, _ in values], numbers)[0]
+    function = ca.Function("form", [variables], [plain])
+    names = [s.symbol for k in _KINDS for s in getattr(model, k)]
+    try:
+        points = sample_box(box, _POINTS)
+        check_parity([row], names, lambda p: np.array(function(p)), points, ["a row"])
+    except ParityError:
+        return False
+    return True
+
+
+def _mean_widths(
+    forms: list[ca.SX],
+    variables: ca.SX,
+    extra: ca.SX,
+    box: Array,
+    constants: list[tuple[float, float]],
+) -> list[Array]:
+    """Widths of natural enclosures over some small boxes, shape (entries, boxes) for each form."""
+    function = ca.Function("forms", [variables, extra], [ca.densify(form.T) for form in forms])
+    program = Program.from_casadi(function, {1: constants})
+    rng = np.random.default_rng(0)
+    size = np.where(np.isfinite(box[:, 1] - box[:, 0]), _SHARE * (box[:, 1] - box[:, 0]), np.inf)
+    start = np.where(np.isfinite(size), box[:, 0], 0.0)[:, None]
+    step = np.where(np.isfinite(size), size, 0.0)[:, None]
+    low = start + rng.random((len(box), _BOXES)) * (1.0 / _SHARE - 1.0) * step
+    high = np.where(np.isfinite(size)[:, None], low + step, box[:, 1:])
+    low = np.where(np.isfinite(size)[:, None], low, box[:, :1])
+    lower, upper = evaluate(program, low, high)
+    with np.errstate(invalid="ignore"):
+        return list(np.split(upper - lower, 2))
+
+
+def _is_narrower(one: Array, other: Array) -> bool:
+    """Whether widths are smaller than others, on the geometric mean of what can be compared."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        known = np.isfinite(one) & np.isfinite(other) & (np.maximum(one, other) > 0.0)
+        floor = 1e-3 * np.maximum(one, other)
+        ratio = np.log(np.maximum(one, floor) / np.maximum(other, floor))
+    gained = bool((np.isfinite(one) & ~np.isfinite(other)).any())
+    lost = bool((np.isfinite(other) & ~np.isfinite(one)).any())
+    if gained != lost:
+        return gained
+    return bool(known.any() and float(ratio[known].mean()) < np.log(_GAIN))
+
+
+def sample_entries(entries: JacobianEntries) -> dict[Entry, Array]:
+    """Evaluate all entries at fixed random points of the box.
+
+    Parameters
+    ----------
+    entries : JacobianEntries
+        The entries.
+
+    Returns
+    -------
+    dict of (int, int) to ndarray, shape (N,)
+        Values at the points where all entries are defined.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import planar_arm_bias
+    >>> found = sample_entries(jacobian_entries(planar_arm_bias(2), None, "states"))
+    >>> bool(np.all(np.abs(found[(3, 1)]) <= 0.25))
+    True
+    """
+    rng = np.random.default_rng(0)
+    lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)
+    upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)
+    points = lower + rng.random((_SAMPLES, len(lower))) * (upper - lower)
+    middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
+    values = entries.values
+    if entries.quotients is not None:
+        values = entries.quotients.closed(values)
+    function = ca.Function("sample", [entries.variables, entries.constants], [values])
+    result = np.array(function(points.T, np.tile(middle[:, None], (1, _SAMPLES))))
+    # points outside the domain of some entry say nothing about dependences
+    usable = np.isfinite(result).all(axis=0)
+    return dict(zip(entries.places, result[:, usable], strict=True))

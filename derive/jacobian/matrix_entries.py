@@ -1,0 +1,295 @@
+"""Entries of a matrix function, from exact SymPy to what the interval engine takes.
+
+Every number in an expression becomes a constant of its own with a proven enclosure, so that CasADi
+has nothing to fold and no rounding escapes: in x (sqrt(2) - 1.414...) the difference is formed
+exactly before it is rounded once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.errors import UnboundedError
+from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
+from obsynth.derive.intervals.search.batch import Problem
+from obsynth.derive.rigour.numbers import enclose_number, substitute
+from obsynth.derive.split import Split
+from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Signal
+
+__all__ = ["MatrixEntries", "exact_jacobian", "matrix_entries"]
+
+Array = NDArray[np.float64]
+Entry = tuple[int, int]
+_KINDS = ("x", "u", "p", "rho", "d", "f", "w")
+_EXACT_BITS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixEntries:
+    """Entries that are not identically zero, as functions of the signals they depend on.
+
+    Attributes
+    ----------
+    exact : dict of (row, column) to sympy.Expr
+        Exact expressions, in the order of everything else here.
+    values : casadi.SX, shape (m, 1)
+        The same, with numbers as symbols in ``constants``.
+    variables : casadi.SX, shape (v, 1)
+        Signals that occur; the first state where none does.
+    names, symbols : tuple
+        Their names and SymPy symbols.
+    box : ndarray, shape (v, 2)
+        Their ranges.
+    constants : casadi.SX
+        Symbols that stand for numbers.
+    constant_box : list of (float, float)
+        Their enclosures.
+    model : Plant
+        Whose signals they are.
+    """
+
+    exact: dict[Entry, sp.Expr]
+    values: ca.SX
+    variables: ca.SX
+    names: tuple[str, ...]
+    symbols: tuple[sp.Symbol, ...]
+    box: Array
+    constants: ca.SX
+    constant_box: list[tuple[float, float]]
+    model: Plant
+
+    @property
+    def places(self) -> list[Entry]:
+        """Row and column of every entry."""
+        return list(self.exact)
+
+    def take(self, which: Sequence[int]) -> "MatrixEntries":
+        """Return some of the entries, with the signals that they need."""
+        places = self.places
+        exact = {places[k]: self.exact[places[k]] for k in which}
+        present = {s for expression in exact.values() for s in expression.free_symbols}
+        kept = [k for k, s in enumerate(self.symbols) if s in present] or [0]
+        return MatrixEntries(
+            exact,
+            _column([self.values[int(k)] for k in which]),
+            _column([self.variables[k] for k in kept]),
+            tuple(self.names[k] for k in kept),
+            tuple(self.symbols[k] for k in kept),
+            self.box[kept],
+            self.constants,
+            self.constant_box,
+            self.model,
+        )
+
+    def problem(self) -> Problem:
+        """Return the entries with their gradients as an interval program."""
+        return make_problem(
+            self.values, self.variables, self.box, self.constants, self.constant_box
+        )
+
+    def ranges(self, rtol: float, effort: str, what: str = "entry") -> Ranges:
+        """Bound every entry over the box.
+
+        Parameters
+        ----------
+        rtol : float
+            Wanted gap.
+        effort : {"fast", "normal", "tight"}
+            How many boxes may be spent.
+        what : str
+            What an entry is called in messages; row and column follow in brackets.
+
+        Returns
+        -------
+        Ranges
+            All finite.
+
+        Raises
+        ------
+        UnboundedError
+            An entry without a finite bound.
+        """
+        found = bound_ranges(
+            self.values,
+            self.variables,
+            self.box,
+            self.constants,
+            self.constant_box,
+            rtol=rtol,
+            effort=effort,
+        )
+        if found.failures:
+            failure = found.failures[0]
+            i, j = self.places[failure.index]
+            expression = self.exact[(i, j)]
+            sub_box = {
+                name: (float(failure.lower[k]), float(failure.upper[k]))
+                for k, (name, s) in enumerate(zip(self.names, self.symbols, strict=True))
+                if expression.has(s)
+            }
+            where = ", ".join(f"{n} in [{lo:.6g}, {hi:.6g}]" for n, (lo, hi) in sub_box.items())
+            raise UnboundedError(
+                f"no finite bound over the box for {what}[{i + 1},{j + 1}] = {expression} "
+                f"({failure.operation} at {where}). Keep the range of {', '.join(sub_box)} away "
+                "from there",
+                entries=(f"{what}[{i + 1},{j + 1}]",),
+                operation=failure.operation,
+                sub_box=sub_box,
+            )
+        return found
+
+    def support(self, place: Entry) -> tuple[str, ...]:
+        """Names of the signals on which an entry depends."""
+        expression = self.exact[place]
+        return tuple(n for n, s in zip(self.names, self.symbols, strict=True) if expression.has(s))
+
+    def named(self, point: Array) -> dict[str, float]:
+        """Return the values at a point by name, without signals on which nothing depends."""
+        present = {s for expression in self.exact.values() for s in expression.free_symbols}
+        return {
+            name: float(value)
+            for name, symbol, value in zip(self.names, self.symbols, point, strict=True)
+            if symbol in present
+        }
+
+    def sample(self, count: int) -> dict[Entry, Array]:
+        """Evaluate the entries at fixed random points and corners, those in their domain."""
+        rng = np.random.default_rng(0)
+        lower = np.where(np.isfinite(self.box[:, 0]), self.box[:, 0], -1.0)
+        upper = np.where(np.isfinite(self.box[:, 1]), self.box[:, 1], lower + 2.0)
+        share = rng.random((count, len(lower)))
+        share[: count // 3] = np.round(share[: count // 3])
+        points = lower + share * (upper - lower)
+        middle = np.array([0.5 * lo + 0.5 * hi for lo, hi in self.constant_box])
+        function = ca.Function("sample", [self.variables, self.constants], [self.values])
+        result = np.array(function(points.T, np.tile(middle[:, None], (1, count))))
+        usable = np.isfinite(result).all(axis=0)
+        return dict(zip(self.places, result[:, usable], strict=True))
+
+
+def exact_jacobian(split_or_model: Split | Plant) -> sp.Matrix:
+    """Differentiate g of a split, or the right-hand side of a plant, by the states.
+
+    Parameters
+    ----------
+    split_or_model : Split or Plant
+        Where the function comes from.
+
+    Returns
+    -------
+    sympy.Matrix, shape (n, n)
+        Exact, constants as numbers. Where the function has a kink or is written with a sign whose
+        jump cancels, the derivative is the one beside it: right almost everywhere, which is what
+        bounds of a continuous function need.
+    """
+    if isinstance(split_or_model, Split):
+        rows, model = split_or_model.g, split_or_model.model
+    else:
+        model = split_or_model
+        rows = model.rhs.applyfunc(lambda e: substitute(e, model.constant_values))
+    jacobian = sp.Matrix(rows).jacobian([s.symbol for s in model.x])
+    return jacobian.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+
+
+def matrix_entries(
+    entries: Mapping[Entry, sp.Expr], model: Plant, more: Sequence[Signal] = ()
+) -> MatrixEntries:
+    """Prepare exact expressions of a plant's signals for the interval engine.
+
+    Parameters
+    ----------
+    entries : mapping of (row, column) to sympy.Expr
+        Exact expressions; those that are identically zero are left out.
+    model : Plant
+        The signals and their ranges.
+    more : sequence of Signal
+        Further variables that occur, with ranges of their own.
+
+    Returns
+    -------
+    MatrixEntries
+        In the order of rows and columns.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> plant = quadruple_tank()
+    >>> found = matrix_entries({(0, 0): sp.sqrt(2) * plant.x[0].symbol}, plant)
+    >>> found.names, len(found.constant_box)
+    (('h1',), 1)
+    """
+    exact = {
+        place: expression
+        for place in sorted(entries)
+        if (expression := _expanded(substitute(entries[place], model.constant_values))) != 0
+    }
+    present = {s for expression in exact.values() for s in expression.free_symbols}
+    available = [*(s for kind in _KINDS for s in getattr(model, kind)), *more]
+    # the interval engine wants a box, for constants as well
+    signals = [s for s in available if s.symbol in present] or [model.x[0]]
+    numbers: dict[sp.Expr, sp.Dummy] = {}
+    rows = [_hoist(expression, numbers) for expression in exact.values()]
+    columns = {s.symbol: ca.SX.sym(s.name) for s in signals}
+    held = {dummy: ca.SX.sym(f"number{k}") for k, dummy in enumerate(numbers.values())}
+    labels = [f"entry ({i + 1}, {j + 1})" for i, j in exact]
+    values = to_sx(rows, columns | held, labels)
+    return MatrixEntries(
+        exact,
+        _column(values),
+        _column(list(columns.values())),
+        tuple(s.name for s in signals),
+        tuple(columns),
+        np.array([(s.lower, s.upper) for s in signals], dtype=float).reshape(-1, 2),
+        _column(list(held.values())),
+        [enclose_number(number) for number in numbers],
+        model,
+    )
+
+
+def _expanded(expression: sp.Expr) -> sp.Expr:
+    # denominators stay whole: written out, 1/(1 + (a - b)^2) has no bound over a box
+    return sp.Add(*expand_terms(expression))
+
+
+def _column(items: Sequence[Any]) -> ca.SX:
+    return ca.densify(ca.vertcat(*items)) if items else ca.SX(0, 1)
+
+
+def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
+    """Replace numbers that are no short binary fractions by symbols."""
+    if isinstance(expression, sp.Expr) and expression.is_number:
+        if expression.is_Rational and _is_short(expression):
+            return expression
+        return numbers.setdefault(expression, sp.Dummy(f"n{len(numbers)}", real=True))
+    if not expression.args:
+        return expression
+    if expression.is_Pow:
+        # the exponent stays: whether it is an integer decides about the domain
+        return sp.Pow(_hoist(expression.base, numbers), _exponent(expression.exp, numbers))
+    if expression.is_Add or expression.is_Mul:
+        numeric = [a for a in expression.args if a.is_number]
+        if len(numeric) > 1:
+            rest = [a for a in expression.args if not a.is_number]
+            parts = [
+                _hoist(expression.func(*numeric), numbers),
+                *(_hoist(a, numbers) for a in rest),
+            ]
+            return expression.func(*parts)
+    return expression.func(*(_hoist(a, numbers) for a in expression.args))
+
+
+def _exponent(exponent: sp.Expr, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
+    return exponent if exponent.is_Rational else _hoist(exponent, numbers)
+
+
+def _is_short(number: sp.Rational) -> bool:
+    power_of_two = int(number.q) & (int(number.q) - 1) == 0
+    return power_of_two and abs(int(number.p)) < 2**_EXACT_BITS and int(number.q) <= 2**60

@@ -1,0 +1,186 @@
+"""Signs of the slopes of a plant's equations over a box, proved.
+
+Flows like sign(g) sqrt(|g|) have no derivative at g = 0 but are monotone all the same: every
+product sign(g) |g|^a with a > 0 counts as one increasing function of g, so that a slope is a sum
+of pieces with a sign each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive import StructureError
+from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.rigour.numbers import rational, substitute
+from obsynth.symbolic import Plant, Role, Signal
+
+__all__ = ["Monotone", "with_ranges"]
+
+FloatArray = NDArray[np.float64]
+Signs = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One increasing function sign(g) |g|^a in an equation, with the symbol that stands for it."""
+
+    signal: Signal
+    inner: sp.Expr
+
+
+class Monotone:
+    """Signs of slopes of the equations of a plant over its declared ranges.
+
+    Parameters
+    ----------
+    plant : Plant
+        See `with_ranges` for another box.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> box = [(0.0, 1.0)] * 3
+    >>> plant = with_ranges(three_tanks(), box)
+    >>> Monotone(plant).signs(2, plant.x).tolist()
+    [1, 1, -1]
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        values = plant.constant_values
+        self.rows: list[sp.Expr] = []
+        self.pieces: list[Piece] = []
+        for row in plant.rhs:
+            self.rows.append(self._replace(sp.expand(substitute(row, values))))
+
+    def signs(self, row: int, signals: Sequence[Signal]) -> Signs:
+        """Return -1, 0 or 1 for the slope of an equation in each signal.
+
+        Raises
+        ------
+        StructureError
+            A slope that has no constant sign over the box; equation and signal are named.
+        """
+        found = np.zeros(len(signals), dtype=np.int64)
+        for j, signal in enumerate(signals):
+            parts = self._parts(self.rows[row], signal.symbol)
+            signs = {sign for sign in map(self._sign, parts) if sign != 0}
+            if len(signs) > 1 or None in signs:
+                state = self.plant.names("x")[row]
+                raise StructureError(
+                    f"the equation of {state} is not monotone in {signal.name} over the region; "
+                    "narrow the region or the ranges",
+                    symbol=signal.name,
+                    row=state,
+                    condition="monotone equations",
+                )
+            found[j] = sum(sign for sign in signs if sign is not None)
+        return found
+
+    def _parts(self, row: sp.Expr, symbol: sp.Symbol) -> list[list[sp.Expr]]:
+        """Return the slope as a sum of products, each listed by its factors."""
+        parts = [[sp.diff(row, symbol)]]
+        parts += [
+            [sp.diff(row, piece.signal.symbol), sp.diff(piece.inner, symbol)]
+            for piece in self.pieces
+            if row.has(piece.signal.symbol)
+        ]
+        return parts
+
+    def _sign(self, factors: list[sp.Expr]) -> int | None:
+        sign: int | None = 1
+        for factor in factors:
+            low, high = self._range(sp.expand(factor))
+            one = 0 if low == high == 0.0 else 1 if low >= 0.0 else -1 if high <= 0.0 else None
+            if one == 0:
+                return 0
+            sign = None if one is None or sign is None else sign * one
+        return sign
+
+    def _range(self, expression: sp.Expr) -> tuple[float, float]:
+        if expression.is_number:
+            value = float(sp.sign(expression))
+            return value, value
+        entries = matrix_entries(
+            {(0, 0): expression}, self.plant, [piece.signal for piece in self.pieces]
+        )
+        found = bound_ranges(
+            entries.values,
+            entries.variables,
+            entries.box,
+            entries.constants,
+            entries.constant_box,
+            rtol=1e-2,
+            effort="fast",
+        )
+        return float(found.lower[0]), float(found.upper[0])
+
+    def _replace(self, row: sp.Expr) -> sp.Expr:
+        def signed(node: sp.Basic) -> bool:
+            return isinstance(node, sp.Mul) and _signed_power(node) is not None
+
+        def shortened(node: sp.Basic) -> sp.Expr:
+            found = _signed_power(node)
+            if found is None:
+                return node
+            inner, exponent, rest = found
+            return rest * self._symbol(inner, exponent)
+
+        return row.replace(signed, shortened)
+
+    def _symbol(self, inner: sp.Expr, exponent: sp.Expr) -> sp.Symbol:
+        low, high = self._range(inner)
+        ends = [np.sign(end) * abs(end) ** float(exponent) for end in (low, high)]
+        # one part in 10^9 is far above the rounding of a power
+        wide = 1e-9 * (abs(ends[0]) + abs(ends[1])) + 1e-300
+        symbol = sp.Dummy(f"flow{len(self.pieces) + 1}", real=True)
+        signal = Signal(
+            symbol.name, symbol, Role.SCHEDULING, ends[0] - wide, ends[1] + wide, measured=False
+        )
+        self.pieces.append(Piece(signal, inner))
+        return symbol
+
+
+def with_ranges(plant: Plant, box: Sequence[Sequence[float]] | FloatArray) -> Plant:
+    """Return a copy of a plant whose states have other ranges."""
+    data = plant.to_dict()
+    ranges = dict(zip(plant.names("x"), np.asarray(box, dtype=float).tolist(), strict=True))
+    signals = []
+    for entry in data["signals"]:
+        if entry["name"] in ranges:
+            low, high = ranges[entry["name"]]
+            nominal = entry.get("nominal")
+            if nominal is not None and not low <= nominal <= high:
+                nominal = None
+            entry = {**entry, "lower": low, "upper": high, "nominal": nominal}
+        signals.append(entry)
+    return Plant.from_dict({**data, "signals": signals})
+
+
+def _signed_power(node: sp.Mul) -> tuple[sp.Expr, sp.Expr, sp.Expr] | None:
+    """Return (g, a, the other factors) of a product with sign(g) |g|^a, a > 0."""
+    for factor in node.args:
+        if not isinstance(factor, sp.sign):
+            continue
+        inner = factor.args[0]
+        for power in node.args:
+            base, exponent = power.as_base_exp()
+            if isinstance(base, sp.Abs) and exponent.is_number and exponent > 0:
+                same = sp.expand(base.args[0] - inner) == 0
+                opposite = sp.expand(base.args[0] + inner) == 0
+                if same or opposite:
+                    rest = sp.Mul(*[f for f in node.args if f is not factor and f is not power])
+                    return inner, exponent, rest
+    return None
+
+
+def exact_slope(row: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
+    """Return the derivative of an equation with every double as the rational that it is."""
+    slope = sp.diff(row, symbol)
+    return slope.xreplace({number: rational(float(number)) for number in slope.atoms(sp.Float)})

@@ -1,0 +1,1 @@
+"""Rigorous numbers: intervals, enclosures, exact matrices, rounding, definiteness."""

@@ -1,0 +1,1 @@
+"""What structure allows: ranks, zeros, detectability, isolability, excitation."""

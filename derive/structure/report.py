@@ -1,0 +1,245 @@
+"""One readable report on the structure of a plant, before any design."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from html import escape
+from typing import TypeVar
+
+import numpy as np
+
+from obsynth.derive.equilibrium import Equilibrium
+from obsynth.derive.faults import invariant_zeros, separable_faults
+from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
+from obsynth.derive.split import Split, split
+from obsynth.derive.structure.conditions import detectability, unknown_input_condition
+from obsynth.derive.structure.summary import family_lines, fault_lines
+from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.plant import Plant
+
+__all__ = ["Check", "StructureReport", "analyse"]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of a report.
+
+    Attributes
+    ----------
+    title : str
+        What was looked at.
+    passed : bool or None
+        Outcome; None for a line that only informs, or that could not be reached.
+    text : str
+        What was found, with names and numbers.
+    """
+
+    title: str
+    passed: bool | None
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class StructureReport:
+    """What the structure of a plant allows, line by line.
+
+    Attributes
+    ----------
+    plant : str
+        Name of the plant.
+    checks : tuple of Check
+        In the order in which a design needs them.
+    split : Split or None
+        The split, where there is one.
+    bounds : JacobianBounds or None
+        The Jacobian bounds, where there are.
+    """
+
+    plant: str
+    checks: tuple[Check, ...]
+    split: Split | None
+    bounds: JacobianBounds | None
+
+    @property
+    def passed(self) -> bool:
+        """True when no check failed."""
+        return all(check.passed is not False for check in self.checks)
+
+    def __getitem__(self, title: str) -> Check:
+        for check in self.checks:
+            if check.title == title:
+                return check
+        raise KeyError(title)
+
+    def __str__(self) -> str:
+        marks = {True: "ok  ", False: "FAIL", None: "    "}
+        width = max(len(check.title) for check in self.checks)
+        lines = [f"Structure of {self.plant}"]
+        for check in self.checks:
+            first, *more = check.text.split("\n")
+            lines.append(f"{marks[check.passed]} {check.title:<{width}}  {first}")
+            lines += [f"{'':<{width + 7}}{line}" for line in more]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        marks = {True: "&#10003;", False: "&#10007;", None: ""}
+        rows = "".join(
+            f"<tr><td>{marks[c.passed]}</td><th style='text-align:left'>{escape(c.title)}</th>"
+            f"<td style='text-align:left'>{escape(c.text).replace(chr(10), '<br>')}</td></tr>"
+            for c in self.checks
+        )
+        return f"<table><caption>Structure of {escape(self.plant)}</caption>{rows}</table>"
+
+
+def _signals(model: Plant) -> str:
+    kinds = (
+        ("x", "states"),
+        ("u", "inputs"),
+        ("d", "unknown inputs"),
+        ("f", "faults"),
+        ("w", "disturbances"),
+        ("p", "uncertain parameters"),
+        ("rho", "scheduling variables"),
+    )
+    parts = [f"{word} {', '.join(model.names(k))}" for k, word in kinds if model.names(k)]
+    parts.append(f"outputs {', '.join(model.output_names)}")
+    time = "continuous time" if model.Ts is None else f"discrete time, Ts = {model.Ts:g} s"
+    return "; ".join(parts) + f"; {time}"
+
+
+class _Notes:
+    """Collects lines; a refusal of a step becomes a failed line."""
+
+    def __init__(self) -> None:
+        self.checks: list[Check] = []
+
+    def step(self, title: str, action: Callable[[], tuple[T, str]]) -> T | None:
+        try:
+            value, text = action()
+        except ObsynthError as error:
+            self.checks.append(Check(title, False, str(error)))
+            return None
+        self.checks.append(Check(title, True, text))
+        return value
+
+    def inform(self, title: str, text: str) -> None:
+        self.checks.append(Check(title, None, text))
+
+
+def analyse(model_or_split: Plant | Split) -> StructureReport:
+    """Report on the structure of a plant; what fails is a line of the report, not an error.
+
+    Parameters
+    ----------
+    model_or_split : Plant or Split
+        A plant is split with ``linear="frozen"`` at its nominal equilibrium.
+
+    Returns
+    -------
+    StructureReport
+        Signals, equilibrium, split, which single faults show and can be told apart, what has to
+        move for that, decoupling of unknown inputs, Jacobian family, detectability at its vertices
+        and inside, invariant zeros and separability of the faults.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> report = analyse(quadruple_tank().discretise("euler", Ts=1.0))
+    >>> report.passed, report["vertices"].text.split(":")[0]
+    (True, '16 (exact) in place of 64')
+    """
+    notes = _Notes()
+    part: Split | None
+    if isinstance(model_or_split, Split):
+        part, model = model_or_split, model_or_split.model
+        notes.inform("signals", _signals(model))
+    else:
+        model = model_or_split
+        if notes.step("plant", lambda: (model.check(), "complete and consistent")) is None:
+            return StructureReport(model.name, tuple(notes.checks), None, None)
+        notes.inform("signals", _signals(model))
+        part = notes.step("split", lambda: _split(model))
+    notes.checks += [Check(*line) for line in fault_lines(model)]
+    if part is None:
+        return StructureReport(model.name, tuple(notes.checks), None, None)
+    found = part
+    _point(notes, found.at, model)
+    decoupling = notes.step("unknown inputs", lambda: _decouple(found))
+    bounds = notes.step("Jacobian bounds", lambda: _bounds(found))
+    if bounds is None:
+        return StructureReport(model.name, tuple(notes.checks), found, None)
+    family = bounds
+    kind = "exact" if family.family.exact else "outer"
+    reasons = "\n".join(str(d) for d in family.dependences if d.coefficients)
+    text = f"{family.family.vertex_count} ({kind}) in place of {family.naive_vertex_count}"
+    notes.inform("vertices", text + (f":\n{reasons}" if reasons else ""))
+    if decoupling is not None:
+        notes.step("detectability", lambda: _detect(found, family))
+        notes.checks += [Check(*line) for line in family_lines(found, family)]
+    if model.names("f"):
+        _separate(notes, found, family)
+    return StructureReport(model.name, tuple(notes.checks), found, family)
+
+
+def _split(model: Plant) -> tuple[Split, str]:
+    part = split(model)
+    return part, f"linear={part.linear!r}; {part.proof}"
+
+
+def _point(notes: _Notes, at: Equilibrium, model: Plant) -> None:
+    values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(model.names("x"), at.x, strict=True))
+    inputs = ", ".join(f"{n} = {v:.6g}" for n, v in zip(model.names("u"), at.u, strict=True))
+    notes.inform("point of operation", f"{values} for {inputs}; residual {at.residual:.1e}")
+
+
+def _decouple(part: Split) -> tuple[bool, str]:
+    found = unknown_input_condition(part)
+    if found.rank == 0:
+        return True, "none"
+    names = ", ".join(part.model.names("d"))
+    lost = [
+        name for i, name in enumerate(part.model.names("x")) if np.abs(found.T[i]).max() <= 1e-12
+    ]
+    text = f"{names} decoupled: rank(D) = rank(C D) = {found.rank}"
+    if lost:
+        text += f"; {', '.join(lost)} is then taken from the measurement alone"
+    return True, text
+
+
+def _bounds(part: Split) -> tuple[JacobianBounds, str]:
+    bounds = jacobian_bounds(part)
+    worst = max(
+        (str(s).split(":")[0] for s in bounds.status.ravel()),
+        key=["exact", "converged", "budget"].index,
+    )
+    varying = int(bounds.varying.sum())
+    words = "1 entry of dg/dx varies" if varying == 1 else f"{varying} entries of dg/dx vary"
+    return bounds, f"{words}; worst status {worst}"
+
+
+def _detect(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:
+    found = detectability(part, bounds)
+    who = "state and faults are" if part.model.names("f") else "the state is"
+    text = f"{who} detectable at all {found.vertices} vertices (margin {found.margin:.2g})"
+    if found.hidden_modes:
+        slowest = found.hidden_modes[-1]
+        text += f"; a hidden mode decays with {slowest.real:.6g}"
+    return True, text
+
+
+def _separate(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:
+    apart, rank, signals = separable_faults(part, bounds.family.midpoint)
+    names = part.model.names("f")
+    zeros = invariant_zeros(part, bounds.family.midpoint)
+    if signals <= len(part.C):
+        listed = ", ".join(f"{z.real:.6g}" if z.imag == 0 else f"{z:.6g}" for z in zeros)
+        notes.inform("invariant zeros", listed or "none, from faults and unknown inputs to outputs")
+    if len(apart) == len(names):
+        text = f"{', '.join(names)} can be told apart (rank {rank} of {signals})"
+        notes.checks.append(Check("faults", True, text))
+        return
+    mixed = ", ".join(n for n in names if n not in apart)
+    others = " and from unknown inputs" if part.model.names("d") else ""
+    text = f"{mixed} cannot be told apart from other faults{others} (rank {rank} of {signals})"
+    notes.checks.append(Check("faults", False, text))

@@ -1,0 +1,177 @@
+"""Proofs of the ellipsoidal bounds, for the gains and matrices as they are stored."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.bounded_error.error_system import (
+    Arithmetic,
+    ModelData,
+    build_error_system,
+    kept_coordinates,
+    lift,
+)
+from obsynth.designs.bounded_error.lmis import fixed_gain_block
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.lmi import (
+    Enclosure,
+    is_positive_definite,
+    prove_positive_definite,
+    symmetric_block,
+)
+
+__all__ = ["inverse_diagonal_bounds", "prove_ellipsoid", "recursion_block", "reduced_gain"]
+
+FloatArray = NDArray[np.float64]
+RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
+EXACT = "exact rational LDL' on the worst vertex"
+
+
+def reduced_gain(design: UioDesign, error: str) -> FloatArray:
+    """Kbar in the coordinates of the error system, shape (p, m)."""
+    if error == "plain":
+        return design.gain
+    return np.vstack([design.K[kept_coordinates(design.T)], design.F])
+
+
+def recursion_block(
+    data: ModelData,
+    gain: FloatArray,
+    bound: EllipsoidBound,
+    number: int,
+    arithmetic: Arithmetic,
+) -> Any:
+    """Form the matrix whose definiteness makes ellipsoid `number` invariant."""
+    system = build_error_system(data, bound.error, arithmetic)
+    X, Z = system.closed_loop(lift(gain, arithmetic))
+    gamma = lift(np.array([[bound.gamma[number]]]), arithmetic)
+    one = lift(np.ones((1, 1)), arithmetic)
+    noise = gamma * lift(np.diag(bound.weights[number]), arithmetic)
+    P = lift(bound.P[number], arithmetic)
+    return fixed_gain_block(X, Z, P, one - gamma, noise)
+
+
+def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
+    """Prove every matrix inequality behind an `EllipsoidBound`.
+
+    Returns
+    -------
+    tuple of Claim
+        ``lmi`` (the invariance at every vertex), ``weights``, ``half_widths``
+        and, for the shifted error, ``dropped_gain``.
+    """
+    bound = design.bound
+    if not isinstance(bound, EllipsoidBound):
+        raise TypeError("the design has no ellipsoidal bound")
+    claims = [_prove_weights(bound), _prove_lmi(design, bound), _prove_half_widths(bound)]
+    if bound.error == "shifted":
+        kept = kept_coordinates(design.T)
+        dropped = [i for i in range(len(design.A)) if i not in kept]
+        largest = float(np.abs(design.K[dropped]).max(initial=0.0))
+        claims.append(
+            Claim(
+                "dropped_gain",
+                "K is zero in the coordinates that the unknown input takes away",
+                largest == 0.0,
+                -largest,
+                "comparison of the stored gains with zero",
+            )
+        )
+    return tuple(claims)
+
+
+def _prove_weights(bound: EllipsoidBound) -> Claim:
+    sums = [sum(map(Fraction, row.tolist()), Fraction(0)) for row in bound.weights]
+    room = float(min(1 - total for total in sums))
+    inside = bool(
+        room >= 0
+        and np.all(bound.weights >= 0)
+        and np.all(bound.gamma > 0)
+        and np.all(bound.gamma < 1)
+    )
+    return Claim(
+        "weights",
+        "every admissible v lies in the ellipsoid v'Q_v v <= 1, and 0 < gamma < 1",
+        inside,
+        room,
+        "exact sum of the weights over the boxes",
+    )
+
+
+def _prove_lmi(design: UioDesign, bound: EllipsoidBound) -> Claim:
+    gain = reduced_gain(design, bound.error)
+    holds, exact, margin = True, True, np.inf
+    count = len(design.data.vertices)
+    for number in range(len(bound.P)):
+        block = recursion_block(design.data, gain, bound, number, "enclosure")
+        result = prove_positive_definite(block)
+        holds = holds and result.all_proved
+        margin = min(margin, float(result.relative.min()))
+        worst = int(result.worst()[0])
+        exact = exact and is_positive_definite(
+            recursion_block(design.data.vertex(worst), gain, bound, number, "exact")
+        )
+    return Claim(
+        "lmi",
+        f"V+ <= (1 - gamma) V + gamma v'Q_v v at all {count} vertices of the Jacobian set "
+        f"({len(bound.P)} ellipsoid{'s' if len(bound.P) > 1 else ''})",
+        bool(holds and exact),
+        margin,
+        f"{RUMP}; {EXACT}",
+    )
+
+
+def _corner(P: FloatArray, component: int, upper: Any) -> Enclosure:
+    unit = np.zeros((1, len(P)))
+    unit[0, component] = 1.0
+    block: Enclosure = symmetric_block(
+        [[Enclosure.of(np.array([[upper]]))], [Enclosure.of(unit.T), Enclosure.of(P)]]
+    )
+    return block
+
+
+def _prove_half_widths(bound: EllipsoidBound) -> Claim:
+    holds, margin = True, np.inf
+    for i, upper in enumerate(bound.inverse_diagonal):
+        result = prove_positive_definite(_corner(bound.P[bound.shape_of(i)], i, upper))
+        holds = holds and result.all_proved
+        margin = min(margin, float(result.relative.min()))
+    return Claim(
+        "half_widths",
+        "(P^-1)_ii stays below the stored value for every component",
+        bool(holds),
+        margin,
+        RUMP,
+    )
+
+
+def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
+    """Doubles just above ``(P^-1)_ii``, proved, component i from its own ellipsoid.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (s, p, p)
+        One matrix for all components, or one per component.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> bounds = inverse_diagonal_bounds(np.array([[[2.0, 0.0], [0.0, 4.0]]]))
+    >>> bool(np.all(bounds > [0.5, 0.25]) and np.all(bounds < [0.5000001, 0.2500001]))
+    True
+    """
+    p = shapes.shape[-1]
+    values = np.empty(p)
+    for i in range(p):
+        P = shapes[0 if len(shapes) == 1 else i]
+        near = float(np.linalg.inv(P)[i, i])
+        for slack in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
+            values[i] = near * (1.0 + slack)
+            if prove_positive_definite(_corner(P, i, values[i]), sharp=False).all_proved:
+                break
+    return values

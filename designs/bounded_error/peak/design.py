@@ -1,0 +1,219 @@
+"""Peak bounds for the observer: design, proof, run-time recursion and start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.bounded_error.error_system import (
+    ErrorKind,
+    build_error_system,
+    kept_coordinates,
+)
+from obsynth.designs.bounded_error.model import Prepared
+from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
+from obsynth.designs.bounded_error.peak.gain import peak_gain
+from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
+from obsynth.designs.bounded_error.peak.transient import Transient, transient
+from obsynth.designs.bounded_error.record import PeakData, UioDesign
+from obsynth.designs.bounded_error.runtime import StartBox, noise_offset, reset_box
+from obsynth.designs.bounded_error.step import RuntimeBound
+from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+
+if TYPE_CHECKING:
+    from obsynth.designs.bounded_error.method import BoundedErrorUIO
+
+__all__ = ["bound_peak", "design_peak", "peak_runtime", "peak_start", "prove_peak_claims"]
+
+FloatArray = NDArray[np.float64]
+# Of the largest feasible gamma: where the ellipsoidal design gives a good first gain.
+START_SHARE = 2.0 / 3.0
+FAULT_WEIGHT = 0.01
+STEP_UP = 1.0 + 2.0**-50
+
+
+def _system(design: UioDesign) -> PeakSystem:
+    family = design.family
+    return peak_system(
+        A=design.A,
+        B_f=design.B_f,
+        C=design.C,
+        D=design.D,
+        W1=design.W1,
+        W2=design.W2,
+        E=design.E,
+        K=design.K,
+        F=design.F,
+        constant=family.constant,
+        directions=family.directions,
+        ranges=family.ranges,
+        radius=family.radius,
+    )
+
+
+def _unknown_input_bound(design: UioDesign) -> FloatArray:
+    box = np.abs(design.plant.box("d")).max(axis=1, initial=0.0)
+    return np.where(np.isfinite(box), box, 0.0)
+
+
+def bound_peak(design: UioDesign) -> UioDesign:
+    """Attach proved peak bounds to a design with gains.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If the gains are unstable or the small-gain condition fails.
+    """
+    peak = peak_bound(
+        _system(design),
+        design.w_radius,
+        design.rate,
+        rounding=design.rounding,
+        dbar=_unknown_input_bound(design),
+    )
+    start = transient(peak, _widest_start(design))
+    return replace(design, bound=PeakData(peak.b, start.decay))
+
+
+def _widest_start(design: UioDesign) -> FloatArray:
+    """Bounds of ``|zeta_0|`` for a state anywhere in its box, and one step of every fault."""
+    width = np.diff(design.plant.box("x"))[:, 0]
+    return np.concatenate([np.abs(design.T) @ width, design.rate])
+
+
+def design_peak(prepared: Prepared, method: BoundedErrorUIO) -> UioDesign:
+    """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves.
+
+    Raises
+    ------
+    InfeasibleDesign
+        If no stabilising gain is found or the small-gain condition fails.
+    """
+    design = prepared.design
+    n, n_f = design.A.shape[0], design.rate.size
+    weights = np.ones(n + n_f) if method.weights is None else np.array(method.weights)
+    diagonal = not np.any(design.T - np.diag(np.diag(design.T)))
+    error: ErrorKind = "shifted" if diagonal else "plain"
+    system = build_error_system(design.data, error)
+    kept = kept_coordinates(design.T) if diagonal else list(range(n))
+    gamma = method.gamma
+    if gamma is None:
+        gamma = START_SHARE * largest_gamma(system, rtol=0.05)
+    if gamma <= 0:
+        raise InfeasibleDesign(
+            "no gain makes the error contract at all vertices with one P",
+            ["what helps: a smaller box of the states, or another measurement"],
+            largest_gamma=0.0,
+        )
+    start_weights = np.concatenate([np.ones(len(kept)), np.full(n_f, FAULT_WEIGHT)])
+    first = synthesise(system, gamma, None, "trace_inverse", start_weights)
+    K = np.zeros_like(design.K)
+    K[kept] = first.gain[: len(kept)]
+    F = first.gain[len(kept) :]
+    given = replace(design, K=K, F=F, options={**asdict(method), "start_error": error})
+    found = peak_gain(
+        _system(given),
+        design.w_radius,
+        design.rate,
+        weights=weights,
+        rounding=design.rounding,
+        dbar=_unknown_input_bound(design),
+    )
+    return bound_peak(replace(given, K=found.K, F=found.F))
+
+
+def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
+    """Prove the stored peak bounds from the stored data."""
+    bound = _peak_data(design)
+    statement = "n + G b <= b: the stored b bounds every error at every k"
+    try:
+        proof = prove_peak(
+            _system(design),
+            design.w_radius,
+            design.rate,
+            bound.b,
+            rounding=design.rounding,
+            dbar=_unknown_input_bound(design),
+        )
+    except (CertificateError, InfeasibleDesign) as error:
+        return (Claim("peak", statement, False, -np.inf, str(error)),)
+    slack = float((proof.slack / bound.b).min())
+    return (
+        Claim(
+            "peak",
+            statement,
+            True,
+            slack,
+            f"sums of {proof.steps} powers with an enclosed remainder of {proof.remainder:.1e}, "
+            "all numbers rounded up",
+        ),
+        Claim(
+            "small_gain",
+            "the spectral radius of G is below 1",
+            True,
+            1.0 - proof.small_gain,
+            "max (G v)_i / v_i for a positive v, rounded up",
+        ),
+    )
+
+
+def _peak_data(design: UioDesign) -> PeakData:
+    if not isinstance(design.bound, PeakData):
+        raise TypeError("the design has no peak bound")
+    return design.bound
+
+
+def _stored_bound(design: UioDesign) -> PeakBound:
+    return peak_bound(
+        _system(design),
+        design.w_radius,
+        design.rate,
+        rounding=design.rounding,
+        dbar=_unknown_input_bound(design),
+    )
+
+
+def _first(design: UioDesign, peak: PeakBound, box: StartBox) -> FloatArray:
+    """Transient at k = 0: covers the first error, and c lambda^k from k = 1 on."""
+    bound = _peak_data(design)
+    n = design.A.shape[0]
+    size = n + design.rate.size
+    zeta = np.maximum(np.abs(box.zeta[0]), np.abs(box.zeta[1]))
+    e_f = np.maximum(np.abs(box.e_f[0]), np.abs(box.e_f[1]))
+    tail: Transient = transient(peak, np.concatenate([zeta, e_f]), decay=bound.decay)
+    now = np.concatenate([zeta + noise_offset(design), e_f]) - bound.b[:size]
+    return np.maximum(tail.c[:size], now) * STEP_UP
+
+
+def peak_start(design: UioDesign) -> Callable[[StartBox], FloatArray]:
+    """Return the first transient for a box of first errors."""
+    peak = _stored_bound(design)
+
+    def first(box: StartBox) -> FloatArray:
+        return _first(design, peak, box)
+
+    return first
+
+
+def peak_runtime(design: UioDesign) -> RuntimeBound:
+    """Recursion t+ = lambda t of the transient, half width b + t."""
+    bound = _peak_data(design)
+    size = design.A.shape[0] + design.rate.size
+    reset = np.full(size, np.inf)
+    box = reset_box(design)
+    if box is not None:
+        reset = _first(design, _stored_bound(design), box)
+    return RuntimeBound(
+        decay=np.full(size, bound.decay * STEP_UP),
+        offset=np.zeros(size),
+        scale=np.ones(size),
+        add=(bound.b[:size] + design.rounding) * STEP_UP,
+        root=False,
+        reset=reset,
+    )

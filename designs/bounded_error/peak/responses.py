@@ -1,0 +1,209 @@
+"""Guaranteed sums of absolute impulse responses, truncation and rounding included.
+
+Let A be known up to an entrywise radius, and X_0 = I, X_{k+1} = fl(A X_k),
+X_k = 0 for k >= N. With the local errors D_k = X_{k+1} - A X_k one has
+A^k = X_k - sum_{j<k} A^{k-1-j} D_j, hence with R >= sum_k |D_k|
+
+    sum_k |A^k| <= S + (sum_k |A^k|) R,      S = sum_k |X_k| ,
+
+for the partial sums first, which therefore stay bounded by S (I - R)^-1 as soon
+as the norm of R is below one: the sums converge, and A is Schur. Every single
+power satisfies |A^k - X_k| <= S (I - R)^-1 R.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import matrix_balance
+
+from obsynth.derive.rigour.enclosure import Enclosure, gamma_bound
+from obsynth.derive.rigour.rounding import add_up, product_up, raised
+from obsynth.designs.core.errors import InfeasibleDesign
+
+__all__ = ["PowerSum", "Response", "power_sum", "response"]
+
+FloatArray = NDArray[np.float64]
+
+# A quarter of a gigabyte of powers.
+MAX_NUMBERS = 2**25
+CHECK_EVERY = 64
+SMALL = 2.0**-60
+
+
+@dataclass(frozen=True, eq=False)
+class PowerSum:
+    """Powers of an enclosed Schur matrix with bounds of their sum and of their errors.
+
+    Attributes
+    ----------
+    powers : ndarray, shape (steps, N, N)
+        X_k, the computed powers; zero is meant beyond the last.
+    total : ndarray, shape (N, N)
+        S, at least the sum of all ``|X_k|``.
+    bound : ndarray, shape (N, N)
+        At least ``sum_k |A^k|`` for every A of the enclosure.
+    error : ndarray, shape (N, N)
+        At least ``|A^k - X_k|`` for every k >= 0 and every such A.
+    contraction : float
+        At least the largest row sum of R; below one, which proves that the
+        matrix is Schur.
+    """
+
+    powers: FloatArray
+    total: FloatArray
+    bound: FloatArray
+    error: FloatArray
+    contraction: float
+
+    @property
+    def steps(self) -> int:
+        """Number of powers before truncation."""
+        return int(self.powers.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Absolute impulse responses ``|Q A^k B|`` of every output to every input.
+
+    Attributes
+    ----------
+    terms : ndarray, shape (steps, n_o, n_i)
+        Computed ``|Q X_k B|``.
+    spread : ndarray, shape (n_o, n_i)
+        ``|Q A^k B| <= terms[k] + spread`` for every k >= 0, with zero for the
+        terms beyond the last.
+    total : ndarray, shape (n_o, n_i)
+        At least ``sum_k |Q A^k B|``.
+    """
+
+    terms: FloatArray
+    spread: FloatArray
+    total: FloatArray
+
+
+def power_sum(A: Enclosure) -> PowerSum:
+    """Bound the sum of the absolute powers of a matrix, or refuse.
+
+    Parameters
+    ----------
+    A : Enclosure, shape (N, N)
+
+    Returns
+    -------
+    PowerSum
+
+    Raises
+    ------
+    InfeasibleDesign
+        If the matrix is not Schur (``spectral_radius`` is an attribute), or so
+        slow that the sum does not fit into memory.
+
+    Examples
+    --------
+    >>> half = power_sum(Enclosure.of([[0.5]]))
+    >>> bool(2.0 <= half.bound[0, 0] < 2.0 + 1e-12)
+    True
+    """
+    size = A.mid.shape[0]
+    spectral_radius = float(np.max(np.abs(np.linalg.eigvals(A.mid)), initial=0.0))
+    if not spectral_radius < 1.0:
+        raise InfeasibleDesign(
+            f"peak bounds: the error system is not stable, spectral radius {spectral_radius:.6g}",
+            ["use other gains, for example those of a design by LMIs"],
+            spectral_radius=spectral_radius,
+        )
+    # powers of two, so exact: mixed units must not spoil the norm of the remainder
+    _, (scale, _) = matrix_balance(A.mid, permute=False, separate=True)
+    ratio = scale[:, None] / scale
+    mid, rad = A.mid / ratio, A.rad / ratio
+    most = max(MAX_NUMBERS // size**2, 2)
+    powers = _powers(mid, most)
+    sizes = np.abs(powers)
+    steps = len(powers)
+    total = raised(sizes.sum(axis=0), steps)
+    local = raised(gamma_bound(size + 1) * np.abs(mid) + rad, 4)
+    residual = add_up(product_up(local, total), product_up(raised(np.abs(mid) + rad, 1), sizes[-1]))
+    contraction = float(raised(np.max(residual.sum(axis=1), keepdims=True), size)[0])
+    if not contraction < 0.5:
+        raise InfeasibleDesign(
+            "peak bounds: the impulse responses of the error system decay too slowly to be summed",
+            [
+                f"spectral radius {spectral_radius:.9g}, {steps} steps leave a remainder of "
+                f"{contraction:.3g}, which has to be below one half",
+                "use gains with a faster decay",
+            ],
+            spectral_radius=spectral_radius,
+            steps=steps,
+            remainder=contraction,
+        )
+    # (I - R)^-1 <= I + R + R^2 + R^3 + c^4 / (1 - c), the last in every entry
+    square = product_up(residual, residual)
+    rest = raised(np.full((size, size), contraction**4 / (1.0 - contraction)), 5)
+    inverse = add_up(np.eye(size), residual, square, product_up(square, residual), rest)
+    bound = product_up(total, inverse)
+    return PowerSum(
+        powers=powers * ratio,
+        total=total * ratio,
+        bound=bound * ratio,
+        error=product_up(bound, residual) * ratio,
+        contraction=contraction,
+    )
+
+
+def _powers(matrix: FloatArray, most: int) -> FloatArray:
+    """Return X_0, X_1, ... until they are negligible; one step at a time, so that errors stay."""
+    size = matrix.shape[0]
+    powers = np.empty((CHECK_EVERY, size, size))
+    powers[0] = np.eye(size)
+    steps = 1
+    while steps < most:
+        if steps + CHECK_EVERY > len(powers):
+            powers = np.concatenate([powers, np.empty_like(powers)])
+        for k in range(steps, steps + CHECK_EVERY):
+            np.matmul(matrix, powers[k - 1], out=powers[k])
+        steps += CHECK_EVERY
+        if np.max(np.abs(powers[steps - 1])) < SMALL:
+            break
+    return powers[:steps]
+
+
+def response(powers: PowerSum, outputs: FloatArray, B: Enclosure) -> Response:
+    """Bound the responses of some outputs to some inputs.
+
+    Parameters
+    ----------
+    powers : PowerSum
+    outputs : ndarray, shape (n_o, N)
+        Q, exact.
+    B : Enclosure, shape (N, n_i)
+
+    Returns
+    -------
+    Response
+
+    Notes
+    -----
+    ``|Q A^k B| <= |Q X_k B| + |Q| |A^k - X_k| |B|``; the rounding of the two
+    products and the radius of B are bounded in the same way.
+
+    Examples
+    --------
+    >>> half = power_sum(Enclosure.of([[0.5]]))
+    >>> response(half, np.eye(1), Enclosure.of([[3.0]])).total.round(9).tolist()
+    [[6.0]]
+    """
+    size = B.mid.shape[0]
+    steps = powers.steps
+    terms = np.abs((outputs @ powers.powers) @ B.mid)
+    weight = raised(gamma_bound(2 * size + 2) * np.abs(B.mid) + B.rad, 4)
+    inner = add_up(
+        product_up(powers.total, weight),
+        product_up(powers.error, raised(np.abs(B.mid) + B.rad, 1)),
+    )
+    spread = product_up(np.abs(outputs), inner)
+    return Response(
+        terms=terms, spread=spread, total=add_up(raised(terms.sum(axis=0), steps), spread)
+    )

@@ -1,0 +1,1 @@
+"""What every method shares: the observer, its certificate, its file, its step."""

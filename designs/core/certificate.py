@@ -1,0 +1,159 @@
+"""Certificates: what is claimed of a design, with margins and proofs that can be repeated."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from obsynth.designs.core.errors import CertificateError
+
+__all__ = ["LEVELS", "Certificate", "Claim", "Guarantee", "Level"]
+
+Level = Literal["full", "lmi"]
+LEVELS: tuple[Level, ...] = ("full", "lmi")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statement about a design and how it was proved.
+
+    Attributes
+    ----------
+    name : str
+        Short name, stable between versions (``"lmi"``, ``"decoupling"``, ...).
+    statement : str
+        The statement in words and the field's letters.
+    holds : bool
+        Whether the proof went through.
+    margin : float
+        How far the statement is from failing, in the units that ``proof`` names.
+    proof : str
+        By which means it was proved.
+    """
+
+    name: str
+    statement: str
+    holds: bool
+    margin: float
+    proof: str
+
+    def __str__(self) -> str:
+        word = "proved" if self.holds else "NOT PROVED"
+        return f"{self.statement}: {word} (margin {self.margin:.3g}; {self.proof})"
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What an observer promises, and under which assumptions.
+
+    Attributes
+    ----------
+    claims : tuple of str
+    assumptions : tuple of str
+        Assumptions that the step monitors are marked ``[monitored]``.
+    """
+
+    claims: tuple[str, ...]
+    assumptions: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = ["Guaranteed:", *(f"  - {text}" for text in self.claims)]
+        lines += ["provided that:", *(f"  - {text}" for text in self.assumptions)]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """All claims of a design, bound to the record that they were proved for.
+
+    Attributes
+    ----------
+    claims : tuple of Claim
+    record : mapping
+        The stored design: everything the proofs use, as JSON-able data.
+    """
+
+    claims: tuple[Claim, ...]
+    record: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def valid(self) -> bool:
+        """Whether every claim was proved."""
+        return all(claim.holds for claim in self.claims)
+
+    @property
+    def margin(self) -> float:
+        """The smallest margin of all claims."""
+        return min((claim.margin for claim in self.claims), default=float("nan"))
+
+    def __getitem__(self, name: str) -> Claim:
+        for claim in self.claims:
+            if claim.name == name:
+                return claim
+        raise KeyError(f"no claim {name!r}; there are {[c.name for c in self.claims]}")
+
+    def __iter__(self) -> Iterator[Claim]:
+        return iter(self.claims)
+
+    def check(self, level: Level = "full") -> Certificate:
+        """Prove every claim again from the stored record, without a solver.
+
+        Parameters
+        ----------
+        level : {"full", "lmi"}
+            ``"full"`` also derives the split and the Jacobian bounds from the
+            stored equations again and shows that the stored vertices cover
+            them; ``"lmi"`` starts from the stored vertices.
+
+        Returns
+        -------
+        Certificate
+            The claims of this check.
+
+        Raises
+        ------
+        CertificateError
+            If a claim cannot be proved; ``error.claims`` holds all of them.
+        """
+        from obsynth.designs.core.registry import method_module
+
+        if level not in LEVELS:
+            raise CertificateError(f"level is {level!r}; it has to be one of {', '.join(LEVELS)}")
+        module = importlib.import_module(method_module(self.record))
+        claims: tuple[Claim, ...] = module.prove(self.record, level)
+        return Certificate(claims, self.record).require()
+
+    def require(self) -> Certificate:
+        """Return the certificate itself if every claim holds.
+
+        Raises
+        ------
+        CertificateError
+            Naming the claims that could not be proved.
+        """
+        failed = [claim for claim in self.claims if not claim.holds]
+        if failed:
+            raise CertificateError(
+                "the design is not certified:\n" + "\n".join(f"  - {claim}" for claim in failed),
+                claims=self.claims,
+                failed=tuple(failed),
+            )
+        return self
+
+    def __str__(self) -> str:
+        return "\n".join(str(claim) for claim in self.claims)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        left = "style='text-align:left'"
+        rows = "".join(
+            f"<tr><td>{'&#10003;' if c.holds else '&#10007;'}</td>"
+            f"<td {left}>{escape(c.statement)}</td>"
+            f"<td>{c.margin:.3g}</td><td {left}>{escape(c.proof)}</td></tr>"
+            for c in self.claims
+        )
+        head = f"<tr><th></th><th {left}>claim</th><th>margin</th><th {left}>proof</th></tr>"
+        return f"<table>{head}{rows}</table>"

@@ -1,0 +1,180 @@
+"""`Observer`: one certified run-time function and all that is known about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.core.certificate import Certificate, Guarantee
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from obsynth.symbolic import Plant
+
+__all__ = ["ALARM_OUTPUT", "STATUS", "STEP_OUTPUTS", "Observer"]
+
+STATUS: Mapping[str, int] = {
+    "not_initialised": 1,
+    "non_finite_input": 2,
+    "outside_domain": 4,
+    "inconsistent_measurement": 8,
+    "fault_not_valid": 16,
+}
+"""Bits of the status that a step returns."""
+
+STEP_OUTPUTS = (
+    "memory",
+    "xhat",
+    "fhat",
+    "x_lower",
+    "x_upper",
+    "f_lower",
+    "f_upper",
+    "status",
+)
+"""Names of the outputs of `Observer.step`, in their order."""
+
+ALARM_OUTPUT = "alarm"
+"""Name of the output that a fault detector's step has behind them."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observer:
+    """A certified observer; `step` is the one truth at run time.
+
+    Attributes
+    ----------
+    method : str
+        The name under which the method is stored, ``"bounded_error_uio"``.
+    model : Plant
+        The discrete plant that the guarantee speaks of.
+    step : casadi.Function
+        ``(memory, u, y) -> (memory, xhat, fhat, x_lower, x_upper, f_lower,
+        f_upper, status)``. Called at instant k with u_k and y_k it returns what
+        is known about x_k and f_{k - fault_delay}, and the memory for k + 1.
+    memory_layout : mapping of str to slice
+        Which entries of the memory hold what.
+    gains : mapping of str to ndarray
+    performance : mapping of str to float
+    half_widths : ndarray of shape (n + n_f,) or None
+        Guaranteed steady half widths, states then faults.
+    certificate : Certificate
+    guarantee : Guarantee
+    fault_delay : int
+        0 or 1: how many samples the fault estimate lags behind.
+    ode : casadi.Function or None
+        Right-hand side of continuous-time methods.
+    step_covered : bool
+        Continuous-time methods: whether the guarantee covers the step too, called
+        every `model.Ts` seconds on the continuous plant.
+    """
+
+    method: str
+    model: Plant
+    step: ca.Function
+    memory_layout: Mapping[str, slice]
+    gains: Mapping[str, FloatArray]
+    performance: Mapping[str, float]
+    half_widths: FloatArray | None
+    certificate: Certificate
+    guarantee: Guarantee
+    start: Callable[..., FloatArray] = field(repr=False)
+    fault_delay: int = 0
+    ode: ca.Function | None = None
+    step_covered: bool = False
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """The stored design: everything that the certificate and the step are made from."""
+        return self.certificate.record
+
+    @property
+    def outputs(self) -> Mapping[str, tuple[str, ...]]:
+        """Labels of every output of the step, by the names of the plant's signals."""
+        x, f = self.model.names("x"), self.model.names("f")
+        bounds = {
+            "x_lower": tuple(f"{name}_lower" for name in x),
+            "x_upper": tuple(f"{name}_upper" for name in x),
+            "f_lower": tuple(f"{name}_lower" for name in f),
+            "f_upper": tuple(f"{name}_upper" for name in f),
+        }
+        hats = {
+            "xhat": tuple(f"{name}_hat" for name in x),
+            "fhat": tuple(f"{name}_hat" for name in f),
+        }
+        return {**hats, **bounds, "status": ("status",)}
+
+    def memory0(
+        self,
+        guess: Any,
+        x_range: Any = None,
+        f_range: Any = None,
+        y0: Any = None,
+        **options: Any,
+    ) -> FloatArray:
+        """Return the memory for the first call of `step`.
+
+        Parameters
+        ----------
+        guess : array_like of shape (n,)
+            Where the state is thought to be.
+        x_range : array_like of shape (n, 2), optional
+            Box that holds the first state; the declared ranges by default.
+        f_range : array_like of shape (n_f, 2), optional
+            Box that holds the first faults; zero (no fault at the start) by default.
+        y0 : array_like of shape (m,), optional
+            The first measurement, for methods that start from it.
+        **options
+            What else the method offers, see its documentation.
+
+        Returns
+        -------
+        ndarray of shape (n_memory,)
+        """
+        return self.start(guess, x_range=x_range, f_range=f_range, y0=y0, **options)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Store the design as JSON; the file is replaced only when complete.
+
+        See Also
+        --------
+        obsynth.load
+        """
+        from obsynth.designs.core.registry import save
+
+        save(self, path)
+
+    def __str__(self) -> str:
+        names = (*self.model.names("x"), *self.model.names("f"))
+        lines = [f"{self.method} for {self.model.name}"]
+        if self.half_widths is not None:
+            pairs = zip(names, self.half_widths, strict=True)
+            lines.append("  " + ", ".join(f"{name} +-{width:.4g}" for name, width in pairs))
+        lines += [f"  {key} = {value:.6g}" for key, value in self.performance.items()]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        names = (*self.model.names("x"), *self.model.names("f"))
+        rows, left = "", "style='text-align:left'"
+        if self.half_widths is not None:
+            rows = "".join(
+                f"<tr><td {left}>{escape(name)}</td><td>&plusmn;{width:.4g}</td></tr>"
+                for name, width in zip(names, self.half_widths, strict=True)
+            )
+        facts = "".join(
+            f"<tr><td {left}>{escape(key)}</td><td>{value:.6g}</td></tr>"
+            for key, value in self.performance.items()
+        )
+        words = f"{escape(self.method)} for {escape(self.model.name)}"
+        title = f"<caption style='text-align:left;white-space:nowrap'>{words}</caption>"
+        return f"<table>{title}{rows}{facts}</table>{self.certificate._repr_html_()}"

@@ -1,0 +1,1 @@
+"""Alarms from guaranteed fault bounds."""

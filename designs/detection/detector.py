@@ -1,0 +1,390 @@
+"""`FaultDetector`: alarms from guaranteed fault bounds."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.core.certificate import Certificate, Guarantee
+from obsynth.designs.core.errors import DetectorError
+from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS
+from obsynth.designs.detection.comparison import Detection, RunLike, compare
+
+if TYPE_CHECKING:
+    from obsynth.designs.core.observer import Observer
+    from obsynth.symbolic import Plant
+
+__all__ = ["SKIPPED", "FaultDetector"]
+
+FloatArray = NDArray[np.float64]
+
+SKIPPED = ("not_initialised", "non_finite_input", "fault_not_valid")
+"""Bits of the status at which a sample never counts, neither for an alarm nor against it."""
+
+_COUNT = "alarm_count"
+
+
+@dataclass(frozen=True, eq=False)
+class FaultDetector:
+    """Raises one alarm per fault when zero has left the fault's guaranteed interval.
+
+    Parameters
+    ----------
+    observer : Observer
+        Of any method that bounds the faults.
+    persistence : int or sequence of int
+        Consecutive valid samples at which zero has to be outside before the alarm is raised:
+        one number, or one for each fault. 1 raises it at once.
+    also_skip : tuple of str
+        Further bits of the status, by their names in ``STATUS``, at which a sample does not
+        count, for example ``("outside_domain",)``. Samples that are not initialised, saw a
+        number that is not finite or have no valid fault interval never count.
+
+    Raises
+    ------
+    DetectorError
+        The observer gives no bounds of its faults, or the plant has no faults; the message
+        names the reason.
+
+    Notes
+    -----
+    A fault that lies in [f_lower, f_upper] and an interval without zero together prove that
+    the fault is not zero; where the method encloses a mean of the fault, that it was not zero
+    throughout. As long as the observer's assumptions hold there is therefore no false
+    alarm, for any persistence; persistence guards against single samples at which an assumption
+    is broken. A sample that does not count leaves counter and alarm as they are. The
+    alarm at instant k speaks of instant k - `fault_delay`.
+
+    **Smallest detectable fault.** Let w_i be the steady half width of fault i. An interval of
+    length at most 2 w_i that holds f_i excludes zero whenever abs(f_i) > 2 w_i, wherever in the
+    interval f_i lies. So the alarm is promised if abs(f_i) > 2 w_i at `persistence` consecutive
+    valid samples at which the interval is not longer than 2 w_i; before the transient is over
+    the half width of that instant stands for w_i. A smaller fault may be detected, but may also
+    remain inside an interval that holds zero for ever. Where a method does not predict its
+    steady widths nothing is promised.
+
+    The detector can be simulated and turned into C like an observer: its step has the
+    observer's outputs and, behind them, ``alarm`` (n_f,), each 0 or 1.
+
+    Examples
+    --------
+    >>> import obsynth as ob                                        # doctest: +SKIP
+    >>> detector = ob.FaultDetector(observer, persistence=3)        # doctest: +SKIP
+    >>> run = ob.simulate(model, detector, scenario)                # doctest: +SKIP
+    >>> print(detector.detect(run))                                 # doctest: +SKIP
+    f1 from k = 1001 to 3099 (peak 5): alarm at k = 1015, 14 s after its onset, at 0.75
+    no false alarm
+    """
+
+    observer: Observer
+    persistence: int | Sequence[int] = 1
+    also_skip: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        model, method = self.observer.model, self.observer.method
+        names = model.names("f")
+        if not names:
+            raise DetectorError(
+                f"{model.name!r} declares no fault, so there is nothing to detect: declare faults "
+                "by actuator_faults, sensor_faults or process_faults.",
+                model=model.name,
+            )
+        if not _bounded_faults(self.observer.step, len(names)).any():
+            raise DetectorError(
+                f"{method} estimates {', '.join(names)} without bounds (its fault intervals are "
+                "infinite), so that zero never leaves them: a detector needs a method that bounds "
+                "its faults.",
+                method=method,
+                faults=names,
+            )
+        object.__setattr__(self, "persistence", self._counts(names))
+        unknown = [name for name in self.also_skip if name not in STATUS]
+        if unknown:
+            raise DetectorError(
+                f"also_skip names {', '.join(map(repr, unknown))}; the bits of the status are "
+                f"{', '.join(STATUS)}.",
+                also_skip=self.also_skip,
+            )
+
+    def _counts(self, names: tuple[str, ...]) -> tuple[int, ...]:
+        given: Any = self.persistence
+        values = tuple(given) if np.ndim(given) else (given,) * len(names)
+        if len(values) != len(names):
+            raise DetectorError(
+                f"persistence has {len(values)} numbers for the {len(names)} faults "
+                f"{', '.join(names)}.",
+                persistence=given,
+            )
+        try:
+            whole = tuple(operator.index(value) for value in values)
+        except TypeError:
+            whole = (0,)
+        if any(isinstance(value, bool) for value in values) or min(whole) < 1:
+            raise DetectorError(
+                f"persistence={given!r} is not a whole number of samples from 1 on.",
+                persistence=given,
+            )
+        return whole
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Samples that the alarm of each fault takes."""
+        return self._counts(self.model.names("f"))
+
+    @property
+    def _skipped(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys((*SKIPPED, *self.also_skip)))
+
+    @property
+    def model(self) -> Plant:
+        """The observer's discrete plant."""
+        return self.observer.model
+
+    @property
+    def method(self) -> str:
+        """Name of the observer's method, with the detector's."""
+        return f"{self.observer.method} with fault_detector"
+
+    @property
+    def fault_delay(self) -> int:
+        """By how many samples bounds and alarms lag behind."""
+        return self.observer.fault_delay
+
+    @property
+    def half_widths(self) -> FloatArray | None:
+        """The observer's steady half widths."""
+        return self.observer.half_widths
+
+    @property
+    def ode(self) -> ca.Function | None:
+        """The observer's right-hand side; its memory has no counters, as alarms do not flow."""
+        return self.observer.ode
+
+    @property
+    def step_covered(self) -> bool:
+        """Whether the observer's guarantee covers its step, for continuous-time methods."""
+        return self.observer.step_covered
+
+    @property
+    def gains(self) -> Mapping[str, FloatArray]:
+        """The observer's gains."""
+        return self.observer.gains
+
+    @property
+    def performance(self) -> Mapping[str, float]:
+        """The observer's performance."""
+        return self.observer.performance
+
+    @property
+    def certificate(self) -> Certificate:
+        """The observer's certificate; an alarm rests on nothing else."""
+        return self.observer.certificate
+
+    @property
+    def smallest_detectable(self) -> FloatArray | None:
+        """Magnitude (n_f,) from which on an alarm is promised in the steady state: 2 w.
+
+        Infinite for a fault without bounds; None where the method does not predict its steady
+        widths. See the notes of the class for the conditions.
+        """
+        if self.half_widths is None:
+            return None
+        widths = np.asarray(self.half_widths, dtype=np.float64)[len(self.model.x) :]
+        return 2.0 * widths
+
+    @cached_property
+    def decide(self) -> ca.Function:
+        """The decision alone: (count, f_lower, f_upper, status) -> (count, alarm)."""
+        n_f = len(self.model.f)
+        count, lower, upper = (ca.SX.sym(name, n_f) for name in ("count", "f_lower", "f_upper"))
+        status = ca.SX.sym("status")
+        valid = ca.SX(1)
+        for name in self._skipped:
+            valid = ca.logic_and(valid, ca.fmod(ca.floor(status / STATUS[name]), 2) < 1)
+        following, alarm = [], []
+        for i, needed in enumerate(self.counts):
+            outside = ca.logic_or(lower[i] > 0, upper[i] < 0)
+            counted = ca.if_else(outside, ca.fmin(count[i] + 1, needed), 0)
+            following.append(ca.if_else(valid, counted, count[i]))
+            alarm.append(following[-1] >= needed)
+        return ca.Function(
+            "decide",
+            [count, lower, upper, status],
+            [ca.vertcat(*following), ca.vertcat(*alarm)],
+            ["count", "f_lower", "f_upper", "status"],
+            ["count_next", ALARM_OUTPUT],
+        )
+
+    @cached_property
+    def step(self) -> ca.Function:
+        """Observer and decision as one step, with the further output ``alarm``.
+
+        (memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
+        status, alarm); the memory is the observer's with the counters behind it.
+        """
+        step = self.observer.step
+        n_memory, n_f = int(step.numel_in(0)), len(self.model.f)
+        names = list(step.name_in())
+        ports = [ca.MX.sym("memory", n_memory + n_f)]
+        ports += [ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate(names) if i]
+        outputs = list(step.call([ports[0][:n_memory], *ports[1:]]))
+        at = STEP_OUTPUTS.index
+        decision: Any = self.decide
+        count, alarm = decision(
+            ports[0][n_memory:],
+            outputs[at("f_lower")],
+            outputs[at("f_upper")],
+            outputs[at("status")],
+        )
+        outputs[0] = ca.vertcat(outputs[0], count)
+        results = [ca.densify(output) for output in (*outputs, alarm)]
+        labels = [*STEP_OUTPUTS, ALARM_OUTPUT]
+        options = {"allow_duplicate_io_names": True}
+        composed = ca.Function("step", ports, results, names, labels, options)
+        try:
+            return composed.expand("step", options)
+        except RuntimeError:
+            return composed
+
+    @property
+    def memory_layout(self) -> dict[str, slice]:
+        """The observer's layout, and the counters as ``alarm_count``."""
+        n_memory = int(self.observer.step.numel_in(0))
+        return {
+            **self.observer.memory_layout,
+            _COUNT: slice(n_memory, n_memory + len(self.model.f)),
+        }
+
+    @property
+    def outputs(self) -> Mapping[str, tuple[str, ...]]:
+        """Labels of every output of the step, by the names of the plant's signals."""
+        alarms = tuple(f"{name}_alarm" for name in self.model.names("f"))
+        return {**self.observer.outputs, ALARM_OUTPUT: alarms}
+
+    @property
+    def guarantee(self) -> Guarantee:
+        """The observer's guarantee, and what it makes of an alarm."""
+        own = self.observer.guarantee
+        names, smallest = self.model.names("f"), self.smallest_detectable
+        claims = [
+            f"an alarm of {name} proves that what its interval encloses was not zero at {count} "
+            "samples, the latest ones that count: the fault was there"
+            for name, count in zip(names, self.counts, strict=True)
+        ]
+        for i, (name, count) in enumerate(zip(names, self.counts, strict=True)):
+            if smallest is not None and np.isfinite(smallest[i]):
+                claims.append(
+                    f"in the steady state abs({name}) > {smallest[i]:.6g} at {count} consecutive "
+                    "samples that count raises its alarm"
+                )
+        return Guarantee((*own.claims, *claims), tuple(own.assumptions))
+
+    def memory0(
+        self, guess: Any, x_range: Any = None, f_range: Any = None, y0: Any = None, **options: Any
+    ) -> FloatArray:
+        """Return the memory for the first call of `step`; see `Observer.memory0`."""
+        memory = self.observer.memory0(guess, x_range=x_range, f_range=f_range, y0=y0, **options)
+        return np.concatenate([memory, np.zeros(len(self.model.f))])
+
+    def alarms(
+        self, f_lower: FloatArray, f_upper: FloatArray, status: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Decide for recorded bounds, from counters at zero.
+
+        Parameters
+        ----------
+        f_lower, f_upper : (N + 1, n_f)
+        status : (N + 1,)
+
+        Returns
+        -------
+        (N + 1, n_f) bool
+        """
+        decide: Any = self.decide.mapaccum(len(status))
+        columns = (f_lower.T, f_upper.T, np.asarray(status, dtype=float)[None, :])
+        _, alarm = decide(np.zeros(len(self.model.f)), *columns)
+        return np.asarray(np.array(alarm).T > 0.5)
+
+    def valid(self, status: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which samples count, from their status."""
+        mask = sum(STATUS[name] for name in self._skipped)
+        return np.asarray((np.asarray(status, dtype=np.int64) & mask) == 0)
+
+    def detect(self, run: RunLike, threshold: float = 0.0) -> Detection:
+        """Compare the alarms of a run with the faults that were there.
+
+        Parameters
+        ----------
+        run : Run
+            Of this detector or of its observer, with either engine: the decision is made
+            again from the recorded bounds.
+        threshold : float
+            Magnitude up to which a fault counts as not there.
+
+        Returns
+        -------
+        Detection
+            Events with their delays, false alarms, alarms that outlast a fault.
+
+        Raises
+        ------
+        DetectorError
+            The run is of another plant.
+        """
+        names = self.model.names("f")
+        if tuple(run.names["f"]) != names or run.fault_delay != self.fault_delay:
+            raise DetectorError(
+                f"the run has the faults {', '.join(run.names['f']) or 'none'} with a delay of "
+                f"{run.fault_delay}, the detector {', '.join(names)} with {self.fault_delay}: "
+                "give a run of its observer.",
+                faults=tuple(run.names["f"]),
+            )
+        # Without predicted widths the interval may be that of a mean, which a fault enters slowly.
+        width = None
+        if self.half_widths is not None:
+            width = np.asarray(run.f_upper - run.f_lower, dtype=np.float64)
+        return compare(
+            self.alarms(run.f_lower, run.f_upper, run.status),
+            run.f,
+            run.t,
+            names,
+            self.fault_delay,
+            threshold=threshold,
+            width=width,
+            valid=self.valid(run.status),
+            persistence=self.counts,
+        )
+
+    def __str__(self) -> str:
+        lines = [f"fault detector over {self.observer.method} for {self.model.name}"]
+        smallest = self.smallest_detectable
+        for i, (signal, count) in enumerate(zip(self.model.f, self.counts, strict=True)):
+            unit = f" {signal.unit}" if signal.unit else ""
+            size = "not predicted" if smallest is None else f"above {smallest[i]:.4g}{unit}"
+            lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}")
+        return "\n".join(lines)
+
+
+def _bounded_faults(step: ca.Function, n_f: int) -> NDArray[np.bool_]:
+    """Return which faults have an interval that is not infinite by construction."""
+    ports = [ca.SX.sym(name, step.numel_in(i)) for i, name in enumerate(step.name_in())]
+    try:
+        outputs = step.call(ports) if step.is_a("SXFunction") else step.expand().call(ports)
+    except RuntimeError:
+        # A step that has no scalar form cannot be looked into; its bounds are then taken as such.
+        return np.ones(n_f, dtype=bool)
+    lower, upper = (outputs[STEP_OUTPUTS.index(key)] for key in ("f_lower", "f_upper"))
+    return np.array(
+        [not (_infinite(lower[i]) or _infinite(upper[i])) for i in range(n_f)], dtype=bool
+    )
+
+
+def _infinite(value: ca.SX) -> bool:
+    return bool(value.is_constant()) and bool(np.isinf(float(value)))

@@ -1,0 +1,1 @@
+"""Bank of filters for monotone balances."""

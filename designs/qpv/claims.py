@@ -1,0 +1,301 @@
+"""Proofs of a stored design: every pair of vertices, every half-space, every corner."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.lmi import (
+    Enclosure,
+    ExactMatrix,
+    FamilyProof,
+    prove_family,
+    prove_positive_definite,
+    symmetric_block,
+)
+from obsynth.designs.qpv.data import VertexData
+from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
+from obsynth.designs.qpv.lmis import (
+    close,
+    decay_block,
+    h2_block,
+    hinf_block,
+    inside_block,
+    noise_block,
+    start_block,
+)
+from obsynth.designs.qpv.polya import PolyaTerm
+from obsynth.designs.qpv.record import QPVDesign
+
+__all__ = ["inverse_bounds", "prove_design", "prove_dynamics", "region_factor"]
+
+FloatArray = NDArray[np.float64]
+RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
+EXACT = "the worst ones also by exact rational LDL'"
+
+
+def prove_design(design: QPVDesign) -> tuple[Claim, ...]:
+    """Prove everything that the guarantee rests on, from the stored numbers."""
+    sets, P = design.sets, design.P
+    claims = [_region(design), _error_set(P, sets), _start(P, sets)]
+    claims += prove_dynamics(design)
+    claims += [_bounds(design), _reset(design)]
+    if design.noise is not None:
+        claims.append(_noise_box(design))
+    return tuple(claims)
+
+
+def _claim(name: str, statement: str, proof: FamilyProof, how: str) -> Claim:
+    exactly = f"; {EXACT}" if proof.exact else ""
+    listed = "" if proof.all_proved else f"; not at {', '.join(map(str, proof.failed))}"
+    return Claim(name, statement, proof.all_proved, proof.margin, f"{how}{exactly}{listed}")
+
+
+def _region(design: QPVDesign) -> Claim:
+    normals = design.state.normals
+    Q = Enclosure.of(design.region.Q)
+    values = np.ones((1, 1)) - normals @ Q @ normals.T
+    proof = prove_family("region", len(normals.mid), lambda k: values.member(k), exact_count=1)
+    return _claim(
+        "region",
+        f"the region X lies in the polytope of the state ({_both(len(normals.mid))} half-spaces)",
+        proof,
+        "enclosed quadratic forms a_k'Q a_k < 1",
+    )
+
+
+def _both(count: int) -> str:
+    return f"{2 * count}, in pairs,"
+
+
+def _error_set(P: FloatArray, sets: ErrorSets) -> Claim:
+    normals, shape = sets.normals, Enclosure.of(P)
+    count = len(normals.mid)
+    proof = prove_family(
+        "error set",
+        count,
+        lambda k: inside_block(shape, normals.member(k)),
+        lambda k: inside_block(ExactMatrix.of(P), ExactMatrix.of(normals.mid[k])),
+    )
+    return _claim(
+        "error_set",
+        f"E = {{e'P e <= 1}} lies in the polytope of the error, (20) ({_both(count)} half-spaces)"
+        if sets.error.kind != "hull"
+        else f"E = {{e'P e <= 1}} lies in the polytope of the error, (20) ({count} half-spaces)",
+        proof,
+        RUMP,
+    )
+
+
+def _start(P: FloatArray, sets: ErrorSets) -> Claim:
+    corners, shape = Enclosure.of(sets.start[:, None, :]), Enclosure.of(P)
+    proof = prove_family(
+        "start",
+        len(sets.start),
+        lambda k: start_block(shape, corners.member(k)),
+        lambda k: start_block(ExactMatrix.of(P), ExactMatrix.of(sets.start[[k]])),
+    )
+    return _claim(
+        "start",
+        f"the polytope of e(0) lies in E, (19) ({_both(len(sets.start))} corners)",
+        proof,
+        RUMP,
+    )
+
+
+def prove_dynamics(design: QPVDesign) -> list[Claim]:
+    """Prove the inequalities of the error dynamics for all terms and all pairs of vertices."""
+    data, terms = design.data, design.data.terms(design.polya)
+    blocks: dict[str, tuple[str, Any]] = {
+        "decay": (
+            f"V' + {design.alpha:g} V < 0 in E without disturbances, (22)",
+            lambda P, closed: decay_block(P, closed, design.alpha),
+        )
+    }
+    noise = design.noise
+    if noise is not None:
+        weights = np.diag(noise.weights)
+        blocks["quadratic_boundedness"] = (
+            f"V' < {noise.rate:g} (1 - V) in E for bounded disturbances",
+            lambda P, closed: noise_block(P, closed, noise.rate, type(P).of(weights)),
+        )
+    elif design.norm == "h2" and data.sizes[2]:
+        blocks["h2"] = ("V' < w'w in E, (41)", lambda _, closed: h2_block(closed))
+    if design.norm == "hinf":
+        blocks["l2_gain"] = (
+            f"V' + z'z < {design.gamma:.6g} w'w in E, (23)",
+            lambda P, closed: hinf_block(closed, type(P).of(design.gamma)),
+        )
+    families = [psi_family(block, design.sets, data.N_radius) for block in _distinct_blocks(data.N)]
+    if len(families) == 1:
+        families *= len(data.N)
+    claims = []
+    for name, (statement, formula) in blocks.items():
+        proofs = [_prove_term(design, term, families, formula) for term in terms]
+        worst = min(proofs, key=lambda p: (p.all_proved, p.margin))
+        pairs = len(families[0].mid) if families[0].mid.ndim == 3 else 1
+        kind = "vertices of the scheduling" if terms[0].total == 1 else "Polya terms"
+        claims.append(
+            _claim(
+                name, f"{statement}: {pairs} pairs of vertices, {len(terms)} {kind}", worst, RUMP
+            )
+        )
+    return claims
+
+
+def _distinct_blocks(N: FloatArray) -> FloatArray:
+    return N[:1] if (N[0] == N).all() else N
+
+
+def _prove_term(
+    design: QPVDesign, term: PolyaTerm, families: list[Enclosure], formula: Any
+) -> FamilyProof:
+    data = design.data
+    P = Enclosure.of(design.P)
+    gains = [P @ Enclosure.of(gain) for gain in design.L]
+    enclosed = _lifted(data)
+    count = len(families[0].mid)
+
+    def at(k: Any) -> Enclosure:
+        psi = [family.member(k) for family in families]
+        block: Enclosure = formula(P, close(P, gains, term, psi=psi, **enclosed))
+        return block
+
+    exact_P = ExactMatrix.of(design.P)
+    exact_gains = [exact_P @ ExactMatrix.of(gain) for gain in design.L]
+    exact_data = _exact(data)
+
+    def exactly(k: int) -> ExactMatrix:
+        psi = [ExactMatrix.of(family.mid[k]) for family in families]
+        closed = close(exact_P, exact_gains, term, psi=psi, **exact_data)
+        block: ExactMatrix = formula(exact_P, closed)
+        return block
+
+    return prove_family("pairs", count, at, exactly, exact_count=2)
+
+
+def _lifted(data: VertexData) -> dict[str, list[Enclosure]]:
+    lifted = {
+        name: [
+            Enclosure.of(block, getattr(data, f"{name}_radius")) for block in getattr(data, name)
+        ]
+        for name in ("A", "C", "G", "H")
+    }
+    lifted["Cz"] = [Enclosure.of(block) for block in data.Cz]
+    return lifted
+
+
+def _exact(data: VertexData) -> dict[str, list[ExactMatrix]]:
+    return {
+        name: [ExactMatrix.of(block) for block in getattr(data, name)]
+        for name in ("A", "C", "G", "H", "Cz")
+    }
+
+
+def _corner(P: FloatArray, row: FloatArray, upper: float) -> Enclosure:
+    block: Enclosure = symmetric_block(
+        [[Enclosure.of(np.array([[upper]]))], [Enclosure.of(row[:, None]), Enclosure.of(P)]]
+    )
+    return block
+
+
+def inverse_bounds(P: FloatArray, rows: FloatArray) -> FloatArray:
+    """Doubles just above r P^-1 r' for given rows r, proved.
+
+    Parameters
+    ----------
+    P : ndarray of shape (n, n)
+    rows : ndarray of shape (k, n)
+
+    Examples
+    --------
+    >>> bound = inverse_bounds(np.diag([2.0, 4.0]), np.array([[1.0, 2.0]]))
+    >>> bool(1.5 <= bound[0] < 1.5000001)
+    True
+    """
+    values = np.empty(len(rows))
+    for i, row in enumerate(rows):
+        near = float(row @ np.linalg.solve(P, row))
+        for slack in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
+            values[i] = near * (1.0 + slack) + (1e-300 if near == 0 else 0.0)
+            if prove_positive_definite(_corner(P, row, values[i]), sharp=False).all_proved:
+                break
+    return values
+
+
+def _bounds(design: QPVDesign) -> Claim:
+    P, n = design.P, len(design.P)
+    rows = np.concatenate([np.eye(n), design.Cz.reshape(-1, n)])
+    upper = np.concatenate([design.inverse_diagonal, design.rows.ravel()])
+    margin, holds = np.inf, True
+    for row, value in zip(rows, upper, strict=True):
+        result = prove_positive_definite(_corner(P, row, float(value)))
+        holds = holds and result.all_proved
+        margin = min(margin, float(result.relative.min()))
+    return Claim(
+        "bounds",
+        "(P^-1)_ii and the diagonal of Cz P^-1 Cz' stay below the stored values, (40)",
+        bool(holds),
+        margin,
+        RUMP,
+    )
+
+
+def region_factor(P: FloatArray, Q: FloatArray) -> float:
+    """Return t with Q^-1 t^2 > P, so that x'P x <= t^2 where x'Q^-1 x <= 1; infinite unproved."""
+    root = np.linalg.cholesky(Q)
+    near = float(np.sqrt(np.linalg.eigvalsh(root.T @ P @ root)[-1]))
+    for slack in (1e-12, 1e-10, 1e-8, 1e-6):
+        if _factor_proof(P, Q, near * (1.0 + slack)).all_proved:
+            return near * (1.0 + slack)
+    return 1e300
+
+
+def _factor_proof(P: FloatArray, Q: FloatArray, factor: float) -> Any:
+    shape, region = Enclosure.of(P), Enclosure.of(Q)
+    return prove_positive_definite(
+        region * Enclosure.of(factor) * Enclosure.of(factor) - region @ shape @ region
+    )
+
+
+def _reset(design: QPVDesign) -> Claim:
+    if design.reset >= 1e300:
+        return Claim("reset", "nothing is claimed of the size of X", True, np.inf, "none needed")
+    result = _factor_proof(design.P, design.region.Q, design.reset)
+    return Claim(
+        "reset",
+        f"x'P x <= {design.reset:.6g}^2 for every x in X - c",
+        result.all_proved,
+        float(result.relative.min()),
+        RUMP,
+    )
+
+
+def _noise_box(design: QPVDesign) -> Claim:
+    noise, plant = design.noise, design.plant
+    box = plant.box("w")
+    total, room = Fraction(0), np.inf
+    if noise is not None:
+        for weight, radius in zip(noise.weights.tolist(), noise.radius.tolist(), strict=True):
+            total += Fraction(weight) * Fraction(radius) ** 2
+        n, n_w = len(plant.x), len(plant.w)
+        rates = [plant.f[k - n].rate or 0.0 for k in noise.faults]
+        centre, radius_w = design.w_centre, noise.radius[:n_w]
+        declared = np.concatenate([box[:, 1] - centre, centre - box[:, 0]])
+        given = np.concatenate([radius_w, radius_w])
+        room = float(np.min(given - declared, initial=np.inf))
+        room = min(room, float(np.min(noise.radius[n_w:] - np.array(rates), initial=np.inf)))
+        named = {k - n for k in noise.faults}
+        if any(s.rate for j, s in enumerate(plant.f) if j not in named):
+            room = -np.inf
+    return Claim(
+        "noise",
+        "the declared disturbances and rates satisfy v'W v <= 1",
+        bool(total <= 1 and room >= 0),
+        float(1 - total),
+        "exact sum of the weights over the box",
+    )

@@ -1,0 +1,188 @@
+"""Proofs of what the guarantee of the set adaptive observer rests on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.designs.core.certificate import Claim, Level
+from obsynth.designs.lmi import ExactMatrix
+from obsynth.designs.set_adaptive.bounds import BLOCKS
+from obsynth.designs.set_adaptive.model import Structure, read_structure
+from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
+
+__all__ = ["decay_conditions", "metzler_conditions", "prove_design"]
+
+_EXACT = "exact rational arithmetic on the stored numbers"
+
+
+def metzler_conditions(A_lower: Any, L: Any, C: Any) -> Any:
+    """Return A_lower - L C, whose entries off the diagonal must not be negative."""
+    return A_lower - L @ C
+
+
+def decay_conditions(A_upper: Any, L: Any, C: Any, p: Any, alpha: float) -> Any:
+    """Return -alpha p' - p'(A_upper - L C), whose entries must not be negative; p is a row."""
+    return (-alpha) * p - p @ (A_upper - L @ C)
+
+
+def prove_design(
+    design: SetDesign, level: Level, derived: Structure | None = None
+) -> tuple[Claim, ...]:
+    """Prove everything from the stored design.
+
+    Parameters
+    ----------
+    design : SetDesign
+    level : {"full", "lmi"}
+        Whether the form, the elementwise bounds and the speeds are derived again.
+    derived : Structure, optional
+        What was just derived, proved too without deriving it again.
+    """
+    claims = [_signs(design), _boxes(design), _metzler(design)]
+    claims += [
+        _decay(design, "decay", design.A_upper, design.alpha, "the continuous form"),
+        _decay(design, "decay_step", design.A_upper_step, design.alpha_step, "the frozen bounds"),
+        _uniformisation(design),
+        _law(design),
+    ]
+    if level == "full" or derived is not None:
+        if derived is None:
+            derived = read_structure(design.plant, bool(design.options["noise"]))
+        claims += [_model(design, derived), _bounds(design, derived), _speed(design, derived)]
+    return tuple(claims)
+
+
+def _signs(design: SetDesign) -> Claim:
+    low = float(design.plant.box("x")[:, 0].min())
+    smallest = float(min(design.C.min(initial=np.inf), design.G.min(initial=np.inf)))
+    return Claim(
+        "signs",
+        "x >= 0 over the declared ranges, C >= 0 and G >= 0 (Assumption 1)",
+        bool(low >= 0.0 and smallest >= 0.0),
+        min(low, smallest),
+        "comparison",
+    )
+
+
+def _boxes(design: SetDesign) -> Claim:
+    box = design.plant.box("w")
+    if not design.options["noise"]:
+        box = np.zeros_like(box)
+    room = np.concatenate(
+        [
+            box[:, 0] - (design.w_centre - design.w_radius),
+            (design.w_centre + design.w_radius) - box[:, 1],
+        ]
+    )
+    margin = float(room.min(initial=np.inf))
+    what = "hold the declared disturbances" if design.options["noise"] else "are zero, as assumed"
+    return Claim("boxes", f"the stored boxes {what}", margin >= 0.0, margin, "comparison")
+
+
+def _metzler(design: SetDesign) -> Claim:
+    exact = metzler_conditions(*map(ExactMatrix.of, (design.A_lower_box, design.L, design.C)))
+    entries = exact.to_fractions()
+    outside = [entries[i][j] for i in range(len(entries)) for j in range(len(entries)) if i != j]
+    margin = min(outside, default=0)
+    return Claim(
+        "metzler",
+        "A_m - L C is a Metzler matrix for all ends of the outputs in their ranges",
+        margin >= 0,
+        float(margin),
+        _EXACT,
+    )
+
+
+def _decay(design: SetDesign, name: str, A_upper: Any, alpha: float, what: str) -> Claim:
+    A, L, C, p = map(ExactMatrix.of, (A_upper, design.L, design.C, design.p[None]))
+    exact = decay_conditions(A, L, C, p, alpha)
+    margin = min(exact.to_fractions()[0])
+    return Claim(
+        name,
+        f"p'(A_M - L C) <= -{alpha:.7g} p' with p > 0: {what} decays",
+        bool(margin >= 0 and alpha > 0.0 and design.p.min() > 0.0),
+        float(margin),
+        _EXACT,
+    )
+
+
+def _uniformisation(design: SetDesign) -> Claim:
+    diagonal = np.diag(np.array(metzler_conditions(design.A_lower_box, design.L, design.C)))
+    room = float((design.mu + diagonal).min())
+    product = design.Ts * design.mu
+    return Claim(
+        "transition",
+        f"I + (A_o - L C) / mu is nonnegative for mu = {design.mu:.6g}, so every term of the "
+        f"exponential over Ts = {design.Ts:g} is",
+        bool(room > 1e-13 * design.mu and 0.0 < product <= LARGEST_PRODUCT),
+        room,
+        "comparison",
+    )
+
+
+def _law(design: SetDesign) -> Claim:
+    margin = float(design.Gamma.min(initial=np.inf))
+    if design.law == "printed":
+        statement = "the printed law: its order is not guaranteed, so no fault bound is reported"
+    else:
+        statement = "with N >= 0 and Gamma > 0 a step of theta is a mean of two bounds"
+    return Claim("law", statement, margin > 0.0, margin, "comparison")
+
+
+def _model(design: SetDesign, derived: Structure) -> Claim:
+    names = ("C", "G", "W1", "W2")
+    same = all(np.array_equal(getattr(design, name), getattr(derived, name)) for name in names)
+    return Claim(
+        "model",
+        "A(rho) x + B u + offset + G theta + W1 w equals the stored dynamics, C x + W2 w the "
+        "outputs",
+        bool(same and derived.form.proof.holds),
+        0.0,
+        str(derived.form.proof),
+    )
+
+
+def _bounds(design: SetDesign, derived: Structure) -> Claim:
+    mine, fresh = design.bounds, derived.bounds
+    same = [s.name for s in mine.states] == [s.name for s in fresh.states]
+    for side in ("lower", "upper"):
+        for block in BLOCKS:
+            same = same and getattr(mine, side)[block] == getattr(fresh, side)[block]
+    low, high = fresh.extremes(derived.reach(0.0))
+    high_step = fresh.extremes(derived.reach(design.Ts))[1]
+    low_box = fresh.extremes(np.inf)[0]
+    room = min(
+        float((high_now - high_fresh).min())
+        for high_now, high_fresh in (
+            (low, design.A_lower),
+            (low_box, design.A_lower_box),
+            (design.A_upper, high),
+            (design.A_upper_step, high_step),
+        )
+    )
+    return Claim(
+        "bounds",
+        "A_m <= A(rho) <= A_M elementwise between the ends of the outputs, and their extremes "
+        "over the ranges are the stored ones",
+        bool(same and room >= 0.0),
+        room,
+        "monotonicity of entries and terms, interval branch and bound with outward rounding",
+    )
+
+
+def _speed(design: SetDesign, derived: Structure) -> Claim:
+    room = min(
+        float((derived.rate[:, 0] - design.rate[:, 0]).min(initial=np.inf)),
+        float((design.rate[:, 1] - derived.rate[:, 1]).min(initial=np.inf)),
+    )
+    same = np.array_equal(design.input_rate, derived.input_rate)
+    return Claim(
+        "speed",
+        "between two samples the outputs move no faster than the stored rates",
+        bool(room >= 0.0 and same),
+        room,
+        "interval branch and bound with outward rounding",
+    )

@@ -1,0 +1,312 @@
+"""What the method reads of a plant: x' = A(rho) x + B u + phi + G theta + W1 w, y = C x + v."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.rigour.numbers import round_number, substitute
+from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
+from obsynth.symbolic import Plant
+
+__all__ = ["Structure", "output_of_fault", "read_structure"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The plant in the form (3) of the paper, with bounds.
+
+    Attributes
+    ----------
+    form : QuasiLPV
+        With the proof that it is the plant.
+    bounds : EndBounds
+    C, G, W1, W2 : ndarray
+        Shapes (m, n), (n, q), (n, n_w), (m, n_w).
+    w_centre, w_radius : ndarray of shape (n_w,)
+        Box of the disturbances, zero where the noise is left out.
+    rate : ndarray of shape (m, 2)
+        Range of the derivative of C x over the declared ranges, inputs left out where they
+        enter with a constant factor.
+    input_rate : ndarray of shape (m, n_u)
+        These factors.
+    """
+
+    form: QuasiLPV
+    bounds: EndBounds
+    C: FloatArray
+    G: FloatArray
+    W1: FloatArray
+    W2: FloatArray
+    w_centre: FloatArray
+    w_radius: FloatArray
+    rate: FloatArray
+    input_rate: FloatArray
+
+    @property
+    def noise(self) -> FloatArray:
+        """Bound of the measurement noise, shape (m,)."""
+        bound: FloatArray = np.abs(self.W2) @ self.w_radius
+        return bound
+
+    def reach(self, Ts: float) -> FloatArray:
+        """Half width of what is known of every measured state over a step of Ts."""
+        plant = self.form.model
+        box = plant.box("u")
+        with np.errstate(invalid="ignore"):
+            push = np.where(self.input_rate == 0.0, 0.0, self.input_rate * box.T[:, None])
+        speed = np.abs(self.rate).max(axis=1) + np.abs(push).max(axis=0, initial=0.0).sum(axis=1)
+        rows = [
+            int(np.argmax(self.C[:, plant.names("x").index(s.name)] != 0.0))
+            for s in self.bounds.states
+        ]
+        scale = np.array([self.C[k].sum() for k in rows])
+        wide: FloatArray = (self.noise + Ts * speed)[rows] / scale
+        return wide
+
+
+def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
+    """Read a continuous plant, or refuse it by name.
+
+    Parameters
+    ----------
+    plant : Plant or Split
+        Continuous, with nonnegative states.
+    noise : bool
+        Whether the declared disturbances are included in the bounds.
+
+    Raises
+    ------
+    StructureError
+        Naming the signal that does not fit and what to do.
+    UnboundedError
+        If an entry of A, or the speed of an output, has no bound over the declared ranges.
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> structure = read_structure(three_tanks())
+    >>> structure.noise.round(6).tolist(), structure.G[0].round(4).tolist()
+    ([0.0045, 0.0045], [64.9351, 0.0])
+    """
+    plant = continuous(plant)
+    _check_signals(plant)
+    form = quasi_lpv(plant)
+    faults = {s.symbol for s in plant.f}
+    for block in ("A", "B", "offset"):
+        bad = form.block(block).free_symbols & faults
+        if bad:
+            name = str(sorted(map(str, bad))[0])
+            raise StructureError(
+                f"the fault {name} multiplies other signals in {block}; this method needs faults "
+                "that enter additively with a constant factor",
+                symbol=name,
+                condition="additive faults",
+            )
+    C, G = form.constant("C"), form.constant("B_f")
+    W1, W2 = form.constant("W1"), form.constant("W2")
+    if np.any(form.constant("D_f")):
+        name = plant.names("f")[int(np.nonzero(form.constant("D_f"))[1][0])]
+        raise StructureError(
+            f"the fault {name} enters an output; this method bounds faults of the dynamics only",
+            symbol=name,
+            condition="faults in the dynamics",
+        )
+    if np.any(form.constant("feedthrough")) or np.any(form.constant("output_offset")):
+        raise StructureError(
+            "an output has an input or a constant in it; declare the output without them",
+            condition="y = C x + v",
+        )
+    _check_signs(plant, C, G)
+    box = plant.box("w")
+    if noise and not np.isfinite(box).all():
+        name = plant.names("w")[int(np.flatnonzero(~np.isfinite(box).all(axis=1))[0])]
+        raise StructureError(
+            f"the disturbance {name} has no bound; declare it with bound=",
+            symbol=name,
+            condition="bounded disturbances",
+        )
+    if not noise:
+        box = np.zeros_like(box)
+    bounds = derive_bounds(form)
+    _check_readings(plant, bounds, C)
+    rate, input_rate = _speed(plant, C)
+    return Structure(form, bounds, C, G, W1, W2, box.mean(axis=1), _radius(box), rate, input_rate)
+
+
+def continuous(plant: Plant | Split) -> Plant:
+    """Return the continuous plant of a split or behind a discretisation made by the package.
+
+    Raises
+    ------
+    StructureError
+        The plant is discrete from the start.
+    """
+    if isinstance(plant, Split):
+        plant = plant.model
+    if plant.Ts is None:
+        return plant
+    behind = plant.continuous
+    if behind is None:
+        raise StructureError(
+            f"{plant.name!r} is a discrete plant; this method works in continuous time: declare "
+            "dynamics without Ts and give the method its sample time",
+            symbol=plant.name,
+            condition="continuous time",
+        )
+    return behind
+
+
+def output_of_fault(
+    C: FloatArray, A_lower: FloatArray, G: FloatArray, names: tuple[str, ...]
+) -> list[int]:
+    """Return for every fault the output that shows it first, by derivatives, then by size.
+
+    Parameters
+    ----------
+    C, A_lower, G : ndarray
+        Shapes (m, n), (n, n), (n, q); off the diagonal of A_lower only what is positive counts.
+    names : tuple of str
+        Of the faults, for the refusal.
+
+    Raises
+    ------
+    StructureError
+        No output shows the fault for certain.
+
+    Examples
+    --------
+    >>> output_of_fault(np.eye(2), np.zeros((2, 2)), np.eye(2)[:, ::-1], ("f1", "f2"))
+    [1, 0]
+    """
+    flow = np.maximum(A_lower, 0.0)
+    np.fill_diagonal(flow, 0.0)
+    found = []
+    for j, name in enumerate(names):
+        reached = G[:, j]
+        for _ in range(len(A_lower)):
+            shown = C @ reached
+            if shown.max() > 0.0:
+                found.append(int(np.argmax(shown)))
+                break
+            reached = flow @ reached
+        else:
+            raise StructureError(
+                f"no output is certain to show the fault {name}; measure a state that it drives",
+                symbol=name,
+                condition="a fault that shows",
+            )
+    return found
+
+
+def _check_signals(plant: Plant) -> None:
+    plant.check()
+    if plant.d:
+        raise StructureError(
+            f"the unknown input {plant.d[0].name} has no bound that this method could use; "
+            "declare it as a disturbance with bound=, or as a fault",
+            symbol=plant.d[0].name,
+            condition="no unknown inputs",
+        )
+    if not plant.f:
+        raise StructureError(
+            f"{plant.name!r} declares no fault; this method bounds faults",
+            symbol=plant.name,
+            condition="faults",
+        )
+    for signal in plant.x:
+        if not signal.bounded:
+            raise StructureError(
+                f"the state {signal.name} has no range; declare it with range=",
+                symbol=signal.name,
+                condition="bounded states",
+            )
+        if signal.lower < 0.0:
+            raise StructureError(
+                f"the state {signal.name} may be negative ({signal.lower:g}); A_m x <= A x <= A_M "
+                f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state",
+                symbol=signal.name,
+                condition="nonnegative states",
+            )
+    for signal in plant.f:
+        if not signal.bounded:
+            raise StructureError(
+                f"the fault {signal.name} has no range; declare it with range=",
+                symbol=signal.name,
+                condition="bounded faults",
+            )
+
+
+def _check_signs(plant: Plant, C: FloatArray, G: FloatArray) -> None:
+    if np.any(C < 0.0):
+        k, i = np.argwhere(C < 0.0)[0]
+        raise StructureError(
+            f"the output {plant.output_names[k]} falls with {plant.names('x')[i]}; Assumption 1 "
+            "needs C >= 0: measure its negative",
+            symbol=plant.output_names[k],
+            condition="C >= 0",
+        )
+    if np.any(G < 0.0):
+        i, j = np.argwhere(G < 0.0)[0]
+        name = plant.names("f")[j]
+        raise StructureError(
+            f"the fault {name} enters the row of {plant.names('x')[i]} with a negative factor; "
+            f"Assumption 1 needs G >= 0: declare -{name} as the fault",
+            symbol=name,
+            condition="G >= 0",
+        )
+
+
+def _check_readings(plant: Plant, bounds: EndBounds, C: FloatArray) -> None:
+    shown = {plant.names("x").index(s.name) for s in bounds.states}
+    for k, row in enumerate(C):
+        states = np.flatnonzero(row)
+        if len(states) != 1 or int(states[0]) not in shown:
+            raise StructureError(
+                f"the output {plant.output_names[k]} does not show one state; this method needs "
+                "outputs that are a positive multiple of one state each, plus noise",
+                symbol=plant.output_names[k],
+                condition="outputs show states",
+            )
+    if len({int(np.flatnonzero(row)[0]) for row in C}) != len(C):
+        raise StructureError(
+            "two outputs show the same state; keep the better one", condition="one output a state"
+        )
+
+
+def _speed(plant: Plant, C: FloatArray) -> tuple[FloatArray, FloatArray]:
+    values = plant.constant_values
+    rhs = [substitute(e, values) for e in plant.rhs]
+    u = [s.symbol for s in plant.u]
+    input_rate = np.zeros((len(C), len(u)))
+    rows: dict[tuple[int, int], sp.Expr] = {}
+    for k, output in enumerate(C):
+        i = int(np.flatnonzero(output)[0])
+        row = sp.expand(sp.Rational(float(output[i])) * rhs[i])
+        for j, symbol in enumerate(u):
+            factor = sp.diff(row, symbol)
+            if factor.is_number:
+                input_rate[k, j] = round_number(factor)[0]
+                row = sp.expand(row - factor * symbol)
+        rows[(k, 0)] = row
+    rate = np.zeros((len(C), 2))
+    entries = matrix_entries(rows, plant)
+    if entries.places:
+        found = entries.ranges(1e-3, "fast", "speed of output")
+        for position, (k, _) in enumerate(entries.places):
+            rate[k] = found.lower[position], found.upper[position]
+    return rate, input_rate
+
+
+def _radius(box: FloatArray) -> FloatArray:
+    """Half widths that, put around the middle in doubles, hold the box."""
+    middle = box.mean(axis=1)
+    radius: FloatArray = np.maximum(box[:, 1] - middle, middle - box[:, 0])
+    return np.nextafter(radius, np.inf) * (radius > 0.0)

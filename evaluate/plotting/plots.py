@@ -1,0 +1,311 @@
+"""Plots of runs: truth, estimate and interval, as in the figures of the papers.
+
+Every function draws into ``ax=`` when given, returns the axes it drew and never
+shows a window. matplotlib is imported on first use.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.evaluate.errors import ReportError
+from obsynth.evaluate.plotting.alarms import shade
+from obsynth.evaluate.plotting.layout import grid, name_lines, new_figure
+from obsynth.evaluate.plotting.style import (
+    BARS,
+    ESTIMATE,
+    INK,
+    INTERVAL,
+    INTERVAL_FILL,
+    SOFT,
+    style,
+)
+from obsynth.evaluate.run import Run
+from obsynth.evaluate.thin import thin
+from obsynth.evaluate.trace import Trace
+
+__all__ = ["plot_errors", "plot_run", "plot_signal"]
+
+Array = NDArray[np.float64]
+Window = tuple[float, float]
+
+
+def plot_signal(
+    run: Run,
+    name: str,
+    ax: Any = None,
+    zooms: Sequence[Window] | None = None,
+    legend: bool = True,
+) -> Any:
+    """Plot one signal with its estimate and interval, and zooms into it.
+
+    The counterpart of figures 2 to 13 of Buciakowski et al.: truth black,
+    estimate red, interval green.
+
+    Parameters
+    ----------
+    run : Run
+    name : str
+        A state, a fault, or any other signal of the run.
+    ax : matplotlib Axes, optional
+        Where to draw; zooms are then insets. Without it a figure is made with
+        the zooms in panels below.
+    zooms : sequence of (start, stop), optional
+        Windows in seconds. By default two for signals with an estimate: the
+        convergence after the start, and the inclusion where the fault moves or
+        in the middle of the run. An empty sequence draws none.
+    legend : bool
+        Whether the lines are named.
+
+    Returns
+    -------
+    Axes or ndarray of Axes
+        The axes given, or all axes of the new figure, the main one first.
+
+    Examples
+    --------
+    >>> axes = plot_signal(run, "h1")      # doctest: +SKIP
+    """
+    trace = run[name]
+    windows = _windows(run, trace) if zooms is None else list(zooms)
+    for start, stop in windows:
+        if not trace.t[0] <= start < stop <= trace.t[-1]:
+            raise ReportError(
+                f"the zoom ({start:g}, {stop:g}) is not inside the run, "
+                f"{trace.t[0]:g} to {trace.t[-1]:g} s.",
+                window=(start, stop),
+            )
+    with style():
+        if ax is not None:
+            _draw(ax, trace)
+            _labels(ax, trace)
+            if legend:
+                name_lines([ax], ax)
+            if windows:
+                low, high = ax.get_ylim()
+                ax.set_ylim(low, high + 0.8 * (high - low))
+            for i, window in enumerate(windows):
+                inset = ax.inset_axes((0.07 + 0.5 * i, 0.64, 0.4, 0.31))
+                _draw(inset, trace, window)
+                inset.tick_params(labelsize=6.5)
+            return ax
+        figure = new_figure((7.2, 4.6 if windows else 2.6))
+        if not windows:
+            main = figure.subplots()
+            _draw(main, trace)
+            _labels(main, trace)
+            if legend:
+                name_lines([main], main)
+            return np.array([main])
+        grid = figure.add_gridspec(2, len(windows), height_ratios=(1.35, 1.0))
+        main = figure.add_subplot(grid[0, :])
+        _draw(main, trace)
+        _labels(main, trace)
+        axes = [main]
+        for i, window in enumerate(windows):
+            panel = figure.add_subplot(grid[1, i])
+            _draw(panel, trace, window)
+            _labels(panel, trace, title=_window_title(i, window, zooms is None))
+            main.axvspan(*window, color=SOFT, alpha=0.18, linewidth=0)
+            axes.append(panel)
+        if legend:
+            name_lines(axes, main)
+        return np.array(axes)
+
+
+def plot_run(
+    run: Run, signals: Sequence[str] | None = None, axes: Any = None, window: Window | None = None
+) -> Any:
+    """Plot all estimated signals of a run in a grid.
+
+    Parameters
+    ----------
+    run : Run
+    signals : sequence of str, optional
+        Which signals; all states and faults by default.
+    axes : array of Axes, optional
+        One for each signal; a new figure with two columns by default.
+    window : (start, stop), optional
+        Seconds to show; the whole run by default.
+
+    Returns
+    -------
+    ndarray of Axes, one for each signal
+
+    Notes
+    -----
+    Of signals without bounds truth and estimate are drawn; where a fault detector ran, its
+    alarms shade the panels of the faults.
+    """
+    names = run.estimated if signals is None else tuple(signals)
+    with style():
+        flat = grid(len(names), axes)
+        for ax, name in zip(flat, names, strict=True):
+            _draw(ax, run[name], window)
+            _labels(ax, run[name])
+        name_lines(flat, flat[0])
+        return flat
+
+
+def plot_errors(
+    runs: Run | Mapping[str, Run],
+    signals: Sequence[str] | None = None,
+    axes: Any = None,
+    window: Window | None = None,
+) -> Any:
+    """Plot errors between the bounds that each run promised for them.
+
+    Parameters
+    ----------
+    runs : Run or mapping of label to Run
+        Several runs share the axes, for instance wide and narrow bounds.
+    signals : sequence of str, optional
+        Which signals; all states and faults by default.
+    axes : array of Axes, optional
+        One for each signal.
+    window : (start, stop), optional
+        Seconds to show; by default from where all intervals have come close to
+        their final width, as the transient would set the scale.
+
+    Returns
+    -------
+    ndarray of Axes, one for each signal
+    """
+    labelled = {"": runs} if isinstance(runs, Run) else dict(runs)
+    if not labelled:
+        raise ReportError("there is no run to plot.")
+    first = next(iter(labelled.values()))
+    names = first.estimated if signals is None else tuple(signals)
+    start = max(_settled(run) for run in labelled.values())
+    shown = (float(first.t[start]), float(first.t[-1])) if window is None else window
+    with style():
+        flat = grid(len(names), axes)
+        for ax, name in zip(flat, names, strict=True):
+            ax.axhline(0.0, color=SOFT, linewidth=0.7)
+            for j, (label, run) in enumerate(labelled.items()):
+                color = (INTERVAL, BARS[5], BARS[4])[j % 3]
+                trace = run[name]
+                estimate = np.zeros(0) if trace.estimate is None else trace.estimate
+                t, error = _cut(trace.t, trace.error, shown)
+                prefix = f"{label}: " if label else ""
+                for bound, word in ((trace.upper, f"{prefix}bounds"), (trace.lower, None)):
+                    if bound is not None and trace.bounded:
+                        at, line = _cut(trace.t, _finite(bound) - estimate, shown)
+                        ax.plot(*thin(at, line), color=color, linewidth=1.0, label=word)
+                ax.plot(
+                    *thin(t, error),
+                    color=INK if len(labelled) == 1 else color,
+                    linewidth=0.5,
+                    alpha=0.9,
+                    label=f"{prefix}error",
+                )
+            ax.set_xlim(*shown)
+            _labels(ax, first[name])
+            ax.set_ylabel(f"error of {first[name].label}")
+        name_lines(flat, flat[0])
+        return flat
+
+
+def _finite(bound: Array) -> Array:
+    """Leave a gap where a bound is infinite."""
+    return np.where(np.isinf(bound), np.nan, bound)
+
+
+def _cut(t: Array, values: Array, window: Window | None) -> tuple[Array, Array]:
+    if window is None:
+        return t, values
+    inside = (t >= window[0]) & (t <= window[1])
+    return t[inside], values[inside]
+
+
+def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
+    """Interval as a band with edges, truth as a strong line, the estimate fine on top of it."""
+    if trace.alarm is not None:
+        shade(ax, trace.t, trace.alarm)
+    if trace.lower is not None and trace.upper is not None and trace.bounded:
+        t, lower = _cut(trace.t, _finite(trace.lower), window)
+        _, upper = _cut(trace.t, _finite(trace.upper), window)
+        low, high = thin(t, lower), thin(t, upper)
+        if len(low[0]) == len(t):
+            ax.fill_between(t, lower, upper, color=INTERVAL_FILL, linewidth=0)
+        else:
+            band = np.unique(np.concatenate([low[0], high[0]]))
+            ax.fill_between(
+                band,
+                np.interp(band, *low),
+                np.interp(band, *high),
+                color=INTERVAL_FILL,
+                linewidth=0,
+            )
+        ax.plot(*low, color=INTERVAL, linewidth=0.8, label="interval")
+        ax.plot(*high, color=INTERVAL, linewidth=0.8)
+    t, true = _cut(trace.t, trace.true, window)
+    ax.plot(*thin(t, true), color=INK, linewidth=1.5, label="truth")
+    if trace.estimate is not None:
+        t, estimate = _cut(trace.t, trace.estimate, window)
+        ax.plot(*thin(t, estimate), color=ESTIMATE, linewidth=0.8, label="estimate")
+    if window is None:
+        _limits(ax, trace)
+    if len(t) > 1:
+        ax.set_xlim(t[0], t[-1])
+
+
+def _limits(ax: Any, trace: Trace) -> None:
+    """Let truth, estimate and settled interval set the scale, not the first wide intervals."""
+    settled = slice(len(trace.t) // 10, None)
+    series = [trace.true]
+    if trace.estimate is not None:
+        series.append(trace.estimate)
+    series += [bound[settled] for bound in (trace.lower, trace.upper) if bound is not None]
+    values = np.concatenate([s[np.isfinite(s)] for s in series])
+    if values.size:
+        low, high = float(values.min()), float(values.max())
+        pad = 0.06 * (high - low) or 1.0
+        ax.set_ylim(low - pad, high + pad)
+
+
+def _labels(ax: Any, trace: Trace, title: str | None = None) -> None:
+    ax.set_ylabel(trace.label)
+    ax.set_xlabel("time [s]")
+    if title is not None:
+        ax.set_title(title)
+
+
+def _window_title(i: int, window: Window, automatic: bool) -> str:
+    words = ("convergence", "inclusion") if automatic else ("", "")
+    word = words[i] if i < len(words) else ""
+    return word or f"{window[0]:g} s to {window[1]:g} s"
+
+
+def _settled(run: Run) -> int:
+    """Find the first instant from which no interval is much wider than at the end."""
+    start = len(run.t) // 100
+    for width in run.widths.values():
+        wide = np.flatnonzero(~(width <= 1.6 * width[-1]))
+        if np.isfinite(width[-1]) and wide.size:
+            start = max(start, int(wide[-1]) + 1)
+    return min(start, len(run.t) // 2)
+
+
+def _windows(run: Run, trace: Trace) -> list[Window]:
+    """Choose the start until the estimate has settled, and a stretch around a moving fault."""
+    n = len(trace.t)
+    if trace.estimate is None or n < 40:
+        return []
+    error = np.abs(trace.error)
+    usual = 1.5 * float(np.nanquantile(error[n // 2 :], 0.99))
+    strays = np.flatnonzero(~(error[: n // 4] <= usual))
+    # The transient ends before the first long stretch without a stray error.
+    ends = strays[np.diff(strays, append=n) > min(50, n // 10)]
+    settled = int(ends[0]) + 1 if ends.size else 1
+    stop = min(max(2 * settled, 20), n // 10)
+    length = max(n // 50, 20)
+    moved = np.flatnonzero(np.abs(np.diff(run.f, axis=0)).max(axis=1, initial=0.0) > 0)
+    centre = int(moved[len(moved) // 4]) if moved.size else n // 2
+    begin = min(max(centre - length // 2, 0), n - 1 - length)
+    return [
+        (float(trace.t[0]), float(trace.t[stop])),
+        (float(trace.t[begin]), float(trace.t[begin + length])),
+    ]
