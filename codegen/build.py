@@ -14,8 +14,6 @@ from pathlib import Path
 
 from obsynth.codegen.errors import BuildError, ComparisonError
 
-__all__ = ["FLAGS", "Build", "Comparison", "build_and_compare", "find_compiler"]
-
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
 """Flags of every build."""
 

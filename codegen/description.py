@@ -13,13 +13,12 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.interface import FloatArray, ObserverLike, PlantLike
+from obsynth.codegen.interface import ObserverLike, PlantLike
 from obsynth.codegen.kernel import STEP_INPUTS
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import project_name, unique
 from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
-
-__all__ = ["Description", "Field", "Port", "describe", "midpoints", "nominal_values"]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -52,24 +51,13 @@ class Port:
 class Description:
     """An observer as the templates see it.
 
-    Attributes
-    ----------
-    name : str
-        C name of the project.
-    observer : ObserverLike
-    sample_time : float
-        Seconds.
-    fields : tuple of Field
-        The memory in order.
-    x, u, y, f : tuple of Port
-    theta : tuple of Port
-        The measured scheduling signals; empty where the step does not read them.
-    scheduling : tuple of int
-        Their places among all scheduling signals of the plant.
-    start : ndarray of shape (n_memory,)
-        The initialised memory that ``NAME_init_default`` sets.
-    model_hash : str
-        SHA-256 of the plant's stored form.
+    name: C name of the project
+    sample_time: seconds
+    fields: the memory in order
+    theta: the measured scheduling signals; empty where the step does not read them
+    scheduling: their places among all scheduling signals of the plant
+    start (n_memory,): the initialised memory that ``NAME_init_default`` sets
+    model_hash: SHA-256 of the plant's stored form
     """
 
     name: str
@@ -109,20 +97,7 @@ def describe(
 ) -> Description:
     """Check that an observer can ship and collect what its C project says of it.
 
-    Parameters
-    ----------
-    observer : ObserverLike
-    name : str, optional
-        C name of the project; made from the plant's name by default.
-    memory : array_like of shape (n_memory,), optional
-        What ``NAME_init_default`` sets. By default ``observer.memory0`` for the nominal state (the
-        middle of its range where none is declared) and the declared ranges.
-
-    Raises
-    ------
-    CodegenError
-        If step, memory layout and plant do not fit together, if a memory of zeros does not
-        count as not initialised, or if the plant has no sample time.
+    Shapes: memory (n_memory,).
     """
     model = observer.model
     if model.Ts is None:

@@ -2,8 +2,6 @@
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["BuildError", "CodegenError", "ComparisonError"]
-
 
 class CodegenError(ObsynthError):
     """A project that cannot be generated or put where it was asked for.

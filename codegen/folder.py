@@ -12,8 +12,6 @@ from typing import TypeVar
 
 from obsynth.codegen.errors import CodegenError
 
-__all__ = ["KIND", "MANIFEST", "place"]
-
 KIND = "obsynth C project"
 MANIFEST = "manifest.json"
 _BUILD = "build"
@@ -27,31 +25,7 @@ def place(
     overwrite: bool,
     check: Callable[[Path], Result],
 ) -> tuple[Path, Result]:
-    """Write files to a folder beside the target, check them there, move the folder into place.
-
-    Parameters
-    ----------
-    folder : path
-        Where the project shall be; parents are made.
-    files : mapping of str to str
-        Text by relative path.
-    overwrite : bool
-        Whether an older project in the same place may be replaced.
-    check : callable
-        Called with the temporary folder; if it raises, the target stays as it was.
-
-    Returns
-    -------
-    Path
-        The folder.
-    Result
-        What the check returned.
-
-    Raises
-    ------
-    CodegenError
-        If the target holds anything but a project of ours, or one and `overwrite` is false.
-    """
+    """Write files to a folder beside the target, check them there, move the folder into place."""
     target = Path(folder).expanduser().resolve()
     _check_target(target, overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -6,19 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
-__all__ = [
-    "FloatArray",
-    "GuaranteeLike",
-    "ObserverLike",
-    "PlantLike",
-    "SchedulingLike",
-    "SignalLike",
-]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 class SignalLike(Protocol):

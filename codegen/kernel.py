@@ -11,8 +11,6 @@ from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.names import c_number
 from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
 
-__all__ = ["STEP_INPUTS", "Kernel", "generate_kernel"]
-
 STEP_INPUTS = ("memory", "u", "y", "theta")
 """Inputs of a step, in their order; the last one of scheduled observers only."""
 
@@ -45,19 +43,13 @@ _WORD = re.compile(r"(?<![\d.])[A-Za-z_]\w*")  # "e+300" of a literal is no word
 class Kernel:
     """C text of the arithmetic of one step.
 
-    Attributes
-    ----------
-    functions : str
-        Static functions; the last one is ``NAME_kernel``.
-    arguments : tuple of str
-        Its arguments: those of ``memory, u, y, theta, next, xhat, ...`` that it reads or writes.
-    library : tuple of str
-        What it calls from ``math.h``, sorted.
-    inexact : tuple of str
-        Those of them that IEEE 754 does not define to the last bit, so that another
-        machine's mathematics library may return another last bit.
-    operations : int
-        Instructions of the CasADi function, a measure of its length.
+    functions: static functions; the last one is ``NAME_kernel``
+    arguments: its arguments: those of ``memory, u, y, theta, next, xhat, ...`` that it reads or
+        writes
+    library: what it calls from ``math.h``, sorted
+    inexact: those of them that IEEE 754 does not define to the last bit, so that another machine's
+        mathematics library may return another last bit
+    operations: instructions of the CasADi function, a measure of its length
     """
 
     functions: str
@@ -120,34 +112,6 @@ def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
     CasADi's C passes arrays of pointers, work vectors and a memory index, exports some
     fifteen symbols and brings its own types. What is kept of it is the sequence of
     operations, statement by statement, with the arguments as plain arrays.
-
-    Parameters
-    ----------
-    step : casadi.Function
-        ``(memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
-        status)``.
-    prefix : str
-        Name of the project; every name at file scope starts with it.
-
-    Returns
-    -------
-    Kernel
-
-    Raises
-    ------
-    CodegenError
-        If the step uses what C99 does not offer, or CasADi's text has another form than the
-        known one.
-
-    Examples
-    --------
-    >>> memory, u, y = ca.SX.sym("memory"), ca.SX.sym("u"), ca.SX.sym("y")
-    >>> step = ca.Function("step", [memory, u, y], [ca.sqrt(u) + 0.1 * y] + 6 * [memory] + [0])
-    >>> kernel = generate_kernel(step, "demo")
-    >>> kernel.library
-    ('sqrt',)
-    >>> "next[0]=" in kernel.functions
-    True
     """
     function = _scalar_function(step)
     text = _casadi_text(function)

@@ -7,25 +7,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.interface import FloatArray
-
-__all__ = ["Machine"]
+from obsynth.symbolic.arrays import FloatArray
 
 
 class Machine:
     """A CasADi function of vectors as a function of NumPy vectors.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Inputs and outputs are vectors; structural zeros become zeros.
-
-    Examples
-    --------
-    >>> x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 0)
-    >>> machine = Machine(ca.Function("f", [x, u], [2 * x, u]))
-    >>> [result.tolist() for result in machine(np.array([1.0, 2.0]), np.array([]))]
-    [[2.0, 4.0], []]
+    function: inputs and outputs are vectors; structural zeros become zeros
     """
 
     def __init__(self, function: ca.Function) -> None:

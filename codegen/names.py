@@ -9,8 +9,6 @@ from collections.abc import Iterable
 
 from obsynth.codegen.errors import CodegenError
 
-__all__ = ["c_comment", "c_number", "identifier", "project_name", "unique"]
-
 _KEYWORD_TEXT = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl concept
     const const_cast consteval constexpr constinit continue co_await co_return co_yield decltype
@@ -70,28 +68,7 @@ def _ascii(text: str) -> str:
 
 
 def identifier(text: str) -> str:
-    r"""Return the C identifier closest to a name.
-
-    Parameters
-    ----------
-    text : str
-        A signal's or plant's name.
-
-    Returns
-    -------
-    str
-        Letters, digits and single underscores; no keyword of C or C++.
-
-    Raises
-    ------
-    CodegenError
-        If the name holds neither letters nor digits.
-
-    Examples
-    --------
-    >>> identifier("quadruple tank"), identifier("h_{1}"), identifier("α"), identifier("double")
-    ('quadruple_tank', 'h_1', 'alpha', 'double_')
-    """
+    r"""Return the C identifier closest to a name."""
     name = re.sub(r"[^A-Za-z0-9]+", "_", _ascii(text)).strip("_")
     if not name:
         raise CodegenError(
@@ -104,13 +81,7 @@ def identifier(text: str) -> str:
 
 
 def unique(names: Iterable[str]) -> tuple[str, ...]:
-    """Return C identifiers for names, told apart by a number where they fall together.
-
-    Examples
-    --------
-    >>> unique(["h_1", "h{1}", "d"])
-    ('h_1', 'h_1_2', 'd')
-    """
+    """Return C identifiers for names, told apart by a number where they fall together."""
     taken: list[str] = []
     for text in names:
         base = name = identifier(text)
@@ -123,25 +94,7 @@ def unique(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def project_name(name: str | None, plant: str) -> str:
-    """Return the project's name: checked when the user gave it, made from the plant's otherwise.
-
-    Parameters
-    ----------
-    name : str or None
-        The user's name.
-    plant : str
-        Name of the plant.
-
-    Raises
-    ------
-    CodegenError
-        If the name is no C identifier or hides a header or target that the build needs.
-
-    Examples
-    --------
-    >>> project_name(None, "quadruple tank")
-    'quadruple_tank'
-    """
+    """Return the project's name: checked when the user gave it, made from the plant's otherwise."""
     chosen = identifier(plant) if name is None else name
     advice = "give another one by name="
     if identifier(chosen) != chosen:
@@ -160,13 +113,7 @@ def project_name(name: str | None, plant: str) -> str:
 
 
 def c_comment(text: str) -> str:
-    """Return text that stays inside a C comment on one line, in ASCII.
-
-    Examples
-    --------
-    >>> c_comment("level*/ in °C")
-    'level* / in deg C'
-    """
+    """Return text that stays inside a C comment on one line, in ASCII."""
     plain = "".join(c if c.isprintable() else " " for c in _ascii(text))
     plain = re.sub(r"\?+", "?", plain.replace("\\", "/"))
     plain = plain.replace("*/", "* /").replace("/*", "/ *")
@@ -174,13 +121,7 @@ def c_comment(text: str) -> str:
 
 
 def c_number(value: float) -> str:
-    """Return the shortest C literal of type double that is read back as the same number.
-
-    Examples
-    --------
-    >>> [c_number(v) for v in (0.1, -0.0, 1e300, float("-inf"))]
-    ['0.1', '-0.0', '1e+300', '-INFINITY']
-    """
+    """Return the shortest C literal of type double that is read back as the same number."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):

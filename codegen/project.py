@@ -18,12 +18,11 @@ from obsynth.codegen.build import Build, Comparison, build_and_compare, find_com
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import KIND, MANIFEST, place
-from obsynth.codegen.interface import FloatArray, ObserverLike
+from obsynth.codegen.interface import ObserverLike
 from obsynth.codegen.kernel import Kernel, generate_kernel
 from obsynth.codegen.render import generator_name, render
 from obsynth.codegen.vectors import Vectors, make_vectors
-
-__all__ = ["BACKENDS", "PRECISIONS", "CProject", "generate_c"]
+from obsynth.symbolic.arrays import FloatArray
 
 PRECISIONS = ("double",)
 """Precisions that a project can be generated for."""

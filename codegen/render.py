@@ -12,14 +12,12 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, Port, midpoints, nominal_values
-from obsynth.codegen.interface import FloatArray
 from obsynth.codegen.kernel import Kernel
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import c_comment, c_number
 from obsynth.codegen.vectors import Vectors
 from obsynth.designs.core.observer import STATUS
-
-__all__ = ["generator_name", "render"]
+from obsynth.symbolic.arrays import FloatArray
 
 _MEANINGS = {
     "not_initialised": "the state has not been initialised; nothing else is of use",
@@ -75,21 +73,7 @@ def _listed(ports: tuple[Port, ...]) -> str:
 def render(
     description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
 ) -> dict[str, str]:
-    """Fill in the templates.
-
-    Parameters
-    ----------
-    description : Description
-    kernel : Kernel
-    vectors : Vectors
-    start_given : bool
-        Whether the memory of ``NAME_init_default`` came from the user.
-
-    Returns
-    -------
-    dict of str to str
-        Text by path relative to the project's folder; all but the manifest.
-    """
+    """Fill in the templates."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(

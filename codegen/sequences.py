@@ -6,10 +6,8 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, midpoints, nominal_values
-from obsynth.codegen.interface import FloatArray
 from obsynth.codegen.machine import Machine
-
-__all__ = ["Drive", "random_memory"]
+from obsynth.symbolic.arrays import FloatArray
 
 _KINDS = ("u", "d", "f", "w", "p", "rho")
 _HOLD = 20
@@ -26,13 +24,6 @@ def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
 class Drive:
     """Inputs, measurements and scheduling along random trajectories of the plant.
 
-    Parameters
-    ----------
-    description : Description
-    rng : numpy.random.Generator
-
-    Notes
-    -----
     The trajectories serve to reach the memories and branches that a step meets in service.
     Whether they are admissible does not matter: states that leave their declared range
     are put back on its border.
@@ -150,13 +141,7 @@ def _spread(rng: np.random.Generator, values: FloatArray) -> FloatArray:
 def random_memory(rng: np.random.Generator, near: FloatArray, scale: FloatArray) -> FloatArray:
     """Return a memory around one that was visited; some entries far from it.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    near : ndarray of shape (n_memory,)
-        A memory that occurred.
-    scale : ndarray of shape (n_memory,)
-        Largest magnitudes that occurred.
+    Shapes: near (n_memory,), scale (n_memory,).
     """
     size = near.size
     base = np.where(np.isfinite(near), near, scale)

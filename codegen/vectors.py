@@ -11,12 +11,10 @@ import numpy as np
 
 from obsynth.codegen.description import Description
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.interface import FloatArray
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.sequences import Drive, random_memory
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
-
-__all__ = ["MINIMUM", "SHARES", "Vectors", "bits", "make_vectors"]
+from obsynth.symbolic.arrays import FloatArray
 
 MINIMUM = 100
 """Fewest vectors that still hold some of every kind."""
@@ -56,18 +54,11 @@ _EXTREMES = np.array(
 class Vectors:
     """Vectors as the text that the C runner reads.
 
-    Attributes
-    ----------
-    text : str
-        One record a line, see the README of a generated project.
-    count : int
-        Number of steps.
-    values : int
-        How many numbers the runner has to compare: results, statuses and memories.
-    kinds : mapping of str to int
-        How many steps of which kind.
-    statuses : mapping of int to int
-        How often the steps returned which status.
+    text: one record a line, see the README of a generated project
+    count: number of steps
+    values: how many numbers the runner has to compare: results, statuses and memories
+    kinds: how many steps of which kind
+    statuses: how often the steps returned which status
     """
 
     text: str
@@ -82,11 +73,6 @@ def bits(values: FloatArray) -> str:
 
     Every NaN is written as the same one: which of the NaNs an operation returns is not
     defined, neither by IEEE 754 nor by C.
-
-    Examples
-    --------
-    >>> bits(np.array([1.0, -2.0, 0.0, 0.1]))
-    '3ff c 0 3fb999999999999a'
     """
     flat = np.array(values, dtype=float).ravel()
     flat[np.isnan(flat)] = np.nan
@@ -150,19 +136,6 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
     along by the C program itself; another fifth are such sequences with failing signals. The
     others start from random memories, hold extreme and non-finite numbers anywhere,
     or follow `NAME_init` without an initialised memory.
-
-    Parameters
-    ----------
-    description : Description
-    count : int
-        Number of steps, at least 100.
-    seed : int
-        Seed of NumPy's default generator.
-
-    Raises
-    ------
-    CodegenError
-        If the count is too small, or if the step returns a status that is no bit mask.
     """
     if count < MINIMUM:
         raise CodegenError(

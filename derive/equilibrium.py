@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Equilibrium", "equilibrium", "operating_point", "operating_values"]
-
 Array = NDArray[np.float64]
 _STARTS = 32
 _ITERATIONS = 60
@@ -43,20 +41,7 @@ class Equilibrium:
 
 
 def operating_values(model: Plant, kind: str) -> Array:
-    """Nominal values of one kind of signal: declared, else the middle of the range, else zero.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    kind : str
-        ``"x"``, ``"u"``, ``"p"`` or ``"rho"``.
-
-    Returns
-    -------
-    ndarray
-        One value per signal.
-    """
+    """Nominal values of one kind of signal: declared, else the middle of the range, else zero."""
     values = []
     for signal in getattr(model, kind):
         if signal.nominal is not None:
@@ -199,33 +184,7 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
 
 
 def operating_point(model: Plant, at: Any = None) -> Equilibrium:
-    """Read a point of operation, or find the nominal one.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    at : Equilibrium or (x, u), optional
-        The point; by default the equilibrium for the nominal inputs. It need not be an
-        equilibrium.
-
-    Returns
-    -------
-    Equilibrium
-        With the residual of the plant's equations at the point.
-
-    Raises
-    ------
-    DerivationError
-        Something that is no point of this plant.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> point = operating_point(quadruple_tank(), ([130, 172, 31, 39], [10, 10]))
-    >>> bool(0.0 < point.residual < 0.01)
-    True
-    """
+    """Read a point of operation, or find the nominal one."""
     if at is None:
         return equilibrium(model)
     if isinstance(at, Equilibrium):

@@ -2,8 +2,6 @@
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["DerivationError", "StructureError", "UnboundedError"]
-
 
 class DerivationError(ObsynthError):
     """A derivation that cannot be carried out for the plant as given."""

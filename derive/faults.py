@@ -5,8 +5,6 @@ from numpy.typing import NDArray
 
 from obsynth.derive.split import Split
 
-__all__ = ["invariant_zeros", "separable_faults"]
-
 Array = NDArray[np.float64]
 _RANK_TOLERANCE = 1e-9
 _ZERO_TOLERANCE = 1e-6
@@ -23,22 +21,6 @@ def separable_faults(split: Split, M: Array) -> tuple[tuple[str, ...], int, int]
 
     The normal rank of the transfer matrix from unknown inputs and faults to the outputs is taken
     at a few fixed points off the axes, where a rank below it has probability zero.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    M : ndarray, shape (n, n)
-        Matrix of the Jacobian family at which the plant is frozen.
-
-    Returns
-    -------
-    names : tuple of str
-        Faults whose effect is no combination of the effects of the others.
-    rank : int
-        Normal rank of the transfer matrix.
-    signals : int
-        Number of unknown inputs and faults.
     """
     names = split.model.names("f")
     q, n_f = split.D.shape[1], len(names)
@@ -69,27 +51,6 @@ def invariant_zeros(split: Split, M: Array) -> NDArray[np.complex128]:
     A zero that does not decay (modulus >= 1, real part >= 0 in continuous time) means that some
     motion of faults and unknown inputs grows without a trace in the outputs. With more outputs than
     signals there usually are none.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    M : ndarray, shape (n, n)
-        Matrix of the Jacobian family at which the plant is frozen.
-
-    Returns
-    -------
-    ndarray of complex
-        Finite zeros, the largest modulus first; empty when the transfer matrix has fewer outputs
-        than signals, where every number is one.
-
-    Examples
-    --------
-    >>> from obsynth.derive.split import split
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
-    >>> np.round(invariant_zeros(parts, np.zeros((4, 4))).real, 6).tolist()
-    [0.988667]
     """
     from scipy.linalg import eigvals
 

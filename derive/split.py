@@ -19,8 +19,6 @@ from obsynth.derive.rigour.numbers import is_zero, rational, round_number, subst
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["LinearForm", "Split", "split"]
-
 Array = NDArray[np.float64]
 LinearForm = Literal["frozen", "terms", "jacobian"]
 _FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")

@@ -5,28 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["read_box", "read_vector"]
-
-FloatArray = NDArray[np.float64]
 
 
 def read_vector(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
-    """Return one finite number for each name.
-
-    Raises
-    ------
-    ObsynthError
-        For other shapes, and for numbers that are not finite.
-
-    Examples
-    --------
-    >>> read_vector([1, 2], "guess", ("h1", "h2")).tolist()
-    [1.0, 2.0]
-    """
+    """Return one finite number for each name."""
     array = _numbers(value)
     if array is None or array.shape != (len(names),) or not np.isfinite(array).all():
         raise ObsynthError(
@@ -37,13 +22,7 @@ def read_vector(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
 
 
 def read_box(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
-    """Return a finite pair (lower, upper) for each name, shape (n, 2).
-
-    Raises
-    ------
-    ObsynthError
-        For other shapes, numbers that are not finite, and a lower end above its upper end.
-    """
+    """Return a finite pair (lower, upper) for each name, shape (n, 2)."""
     array = _numbers(value)
     if array is not None and array.size == 0 and not names:
         return np.zeros((0, 2))

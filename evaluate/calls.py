@@ -11,8 +11,6 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant, Scenario
 
-__all__ = ["first_memory", "refuse_algebraic_loop", "scheduling_columns", "step_function"]
-
 Array = NDArray[np.float64]
 
 _INPUTS = ("memory", "u", "y")

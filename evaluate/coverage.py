@@ -5,8 +5,6 @@ from collections.abc import Mapping, Sequence
 from obsynth.evaluate.run import Run, covered, percent
 from obsynth.evaluate.table import Table
 
-__all__ = ["coverage_summary", "coverage_table"]
-
 
 def coverage_table(runs: Mapping[str, Sequence[Run]]) -> Table:
     """Tabulate the coverage of all signals for every scenario, design and seed.

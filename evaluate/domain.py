@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import STATUS
 
-__all__ = ["Domain", "StatusCount"]
-
 _WORDS = {
     "not_initialised": "not initialised: no measurement has been processed yet",
     "non_finite_input": "a measurement was not finite; the step predicted without it",

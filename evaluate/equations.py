@@ -12,7 +12,6 @@ from obsynth.evaluate.table import Table
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant
 
-__all__ = ["constants_html", "equations_html", "signals_table"]
 
 _GROUPS = ("x", "u", "d", "f", "w", "rho", "p")
 

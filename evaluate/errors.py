@@ -2,8 +2,6 @@
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["ReportError", "SimulationError"]
-
 
 class SimulationError(ObsynthError):
     """A simulation that cannot be started or whose truth is no number any more."""

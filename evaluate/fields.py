@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
 
-__all__ = ["WORDS", "broken_assumptions", "finite", "function_values", "scenario_fields", "vector"]
-
 Array = NDArray[np.float64]
 
 WORDS: Mapping[str, str] = {

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from obsynth.evaluate.errors import ReportError
 
-__all__ = ["MANIFEST", "check_target", "complete_folder"]
-
 MANIFEST = "run.json"
 _KIND = "obsynth run"
 
@@ -22,28 +20,6 @@ def complete_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
     A manifest lists what was written, so that a later run may replace exactly
     that. If the block raises, or is interrupted, the target stays as it was.
-
-    Parameters
-    ----------
-    folder : path-like
-        Where the result shall be; parents are made.
-
-    Yields
-    ------
-    Path
-        The folder to write to.
-
-    Raises
-    ------
-    ReportError
-        If the target is a file or holds files that an earlier run did not write.
-
-    Examples
-    --------
-    >>> with complete_folder("result") as place:
-    ...     _ = (place / "page.html").write_text("done")
-    >>> sorted(path.name for path in Path("result").iterdir())
-    ['page.html', 'run.json']
     """
     target = check_target(folder)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.symbolic import Plant
 
-__all__ = ["StepObserver"]
-
 Array = NDArray[np.float64]
 
 

@@ -38,8 +38,6 @@ from obsynth.evaluate.truth import (
 )
 from obsynth.symbolic import Plant, Scenario
 
-__all__ = ["joint"]
-
 Array = NDArray[np.float64]
 
 # Runge-Kutta steps evaluated in one call; bounds what the signals' values take of memory.

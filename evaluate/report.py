@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer
     from obsynth.symbolic import Plant
 
-__all__ = ["report"]
 
 Tables = Table | Sequence[Table]
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from obsynth.evaluate.interface import StepObserver
     from obsynth.symbolic import Plant
 
-__all__ = ["Run", "covered", "percent"]
 
 Array = NDArray[np.float64]
 
@@ -314,13 +313,7 @@ def covered(run: Run, name: str) -> str:
 
 
 def percent(fraction: float) -> str:
-    """Write a fraction as per cent; never 100 % when one instant is missing.
-
-    Examples
-    --------
-    >>> percent(1.0), percent(5000 / 5001), percent(0.99999)
-    ('100 %', '99.98 %', '99.99 %')
-    """
+    """Write a fraction as per cent; never 100 % when one instant is missing."""
     if fraction == 1.0:
         return "100 %"
     return f"{np.floor(fraction * 1e4) / 1e2:.2f} %"

@@ -20,8 +20,6 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Call, Truth, dense
 from obsynth.symbolic import Plant, Scenario
 
-__all__ = ["simulate"]
-
 Array = NDArray[np.float64]
 
 

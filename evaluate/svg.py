@@ -7,8 +7,6 @@ from typing import Any
 
 from obsynth.evaluate.plotting.style import INK, SOFT
 
-__all__ = ["figure_svg", "math_svg"]
-
 # Drawn in these colours, shown in the page's own, so that dark pages have light ink.
 _VARIABLES = {INK: "var(--ink)", SOFT: "var(--soft)"}
 
@@ -19,16 +17,7 @@ _SETTINGS = {"svg.fonttype": "path", "svg.hashsalt": "obsynth", "path.simplify":
 
 
 def figure_svg(figure: Any, key: str, label: str) -> str:
-    """Return a matplotlib figure as an inline ``<svg>`` element.
-
-    Parameters
-    ----------
-    figure : matplotlib Figure
-    key : str
-        Prefix of all ids, so that several figures can stand in one page.
-    label : str
-        What the figure shows, for readers who cannot see it.
-    """
+    """Return a matplotlib figure as an inline ``<svg>`` element."""
     import matplotlib as mpl
 
     buffer = io.StringIO()
@@ -38,24 +27,7 @@ def figure_svg(figure: Any, key: str, label: str) -> str:
 
 
 def math_svg(latex: str, key: str, size: float = 12.0) -> str | None:
-    r"""Return a formula as an inline ``<svg>`` element, or None where mathtext cannot set it.
-
-    Parameters
-    ----------
-    latex : str
-        The formula without dollar signs.
-    key : str
-        Prefix of all ids.
-    size : float
-        Font size in points.
-
-    Examples
-    --------
-    >>> math_svg(r"\frac{a_1}{A_1}", "eq").startswith("<svg")
-    True
-    >>> math_svg(r"\begin{cases} 1 \end{cases}", "eq") is None
-    True
-    """
+    r"""Return a formula as an inline ``<svg>`` element, or None where mathtext cannot set it."""
     import matplotlib as mpl
     from matplotlib.font_manager import FontProperties
     from matplotlib.mathtext import math_to_image

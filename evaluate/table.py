@@ -8,21 +8,9 @@ from typing import Any
 
 from obsynth.evaluate.errors import ReportError
 
-__all__ = ["Table", "text"]
-
 
 def text(value: Any, digits: int = 4) -> str:
-    """Write a value for people: numbers to `digits` significant digits, yes/no, a dash for None.
-
-    Examples
-    --------
-    >>> text(0.0144585), text(True), text(None), text(5001), text("h3")
-    ('0.01446', 'yes', '–', '5001', 'h3')
-    >>> text(float("inf")), text(-2.5e-13)
-    ('∞', '−2.5e−13')
-    >>> text(-0.0)
-    '0'
-    """
+    """Write a value for people: numbers to `digits` significant digits, yes/no, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool):

@@ -5,8 +5,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["thin"]
-
 Array = NDArray[np.float64]
 
 
@@ -16,23 +14,7 @@ def thin(t: Array, values: Array, columns: int = 500) -> tuple[Array, Array]:
     At a resolution of `columns` pixels the picture is the same as that of all
     points, as every column shows its whole extent.
 
-    Parameters
-    ----------
-    t, values : (N,)
-    columns : int
-        Slices in time, about the width of the plot in pixels.
-
-    Returns
-    -------
-    t, values : (at most 4 * columns,)
-
-    Examples
-    --------
-    >>> t = np.arange(10_000.0)
-    >>> spike = np.where(t == 7777.0, 1.0, 0.0)
-    >>> few_t, few = thin(t, spike, columns=100)
-    >>> len(few) <= 400, float(few.max())
-    (True, 1.0)
+    Shapes: t, values (N,), t, values (at most 4 * columns,).
     """
     n = len(t)
     if n <= 4 * columns:

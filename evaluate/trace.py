@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from obsynth.evaluate.errors import SimulationError
 
-__all__ = ["Trace", "Violation"]
-
 Array = NDArray[np.float64]
 
 

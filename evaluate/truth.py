@@ -11,18 +11,6 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant
 
-__all__ = [
-    "Call",
-    "Truth",
-    "continuous_plant",
-    "dense",
-    "parameter_text",
-    "parameters",
-    "same_signals",
-    "sample_time",
-    "substeps_of",
-]
-
 Array = NDArray[np.float64]
 
 

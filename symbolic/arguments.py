@@ -14,8 +14,6 @@ from obsynth.symbolic.functions import ALIASES, BY_NAME
 from obsynth.symbolic.signals import Role, Signal
 from obsynth.symbolic.text import WORDS
 
-__all__ = ["RESERVED", "exact_number", "expand_names", "make_signals", "per_symbol"]
-
 RESERVED = (WORDS | BY_NAME.keys() | ALIASES.keys()) - {"phi1", "tanhc"}
 """Names that would read as something else; phi1 is too good a name for an angle."""
 
@@ -23,30 +21,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str, ...]:
-    """Expand names as ``sympy.symbols`` does.
-
-    Parameters
-    ----------
-    names : str or sequence of str
-        ``"h1:5"``, ``"a b"``, ``"a, b"`` or a list of such.
-    what : str
-        What is named, for messages.
-
-    Returns
-    -------
-    tuple of str
-        Plain identifiers, in order, each once.
-
-    Raises
-    ------
-    PlantError
-        No name, a name that is no identifier, a reserved word, a name given twice.
-
-    Examples
-    --------
-    >>> expand_names("h1:4")
-    ('h1', 'h2', 'h3')
-    """
+    """Expand names as ``sympy.symbols`` does."""
     parts = [names] if isinstance(names, str) else names
     if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
         raise PlantError(f"{what}: names are a string such as 'h1:5', not {names!r}", names=names)
@@ -72,32 +47,7 @@ def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str,
 
 
 def per_symbol(value: Any, names: Sequence[str], what: str) -> list[Any]:
-    """Return one value per symbol: a list is taken in order, anything else holds for all.
-
-    Parameters
-    ----------
-    value : object or sequence
-        One value for all symbols, or a sequence with one per symbol.
-    names : sequence of str
-        The symbols.
-    what : str
-        The keyword, for messages.
-
-    Returns
-    -------
-    list
-        As long as ``names``.
-
-    Raises
-    ------
-    PlantError
-        A sequence of another length.
-
-    Examples
-    --------
-    >>> per_symbol("cm", ["h1", "h2"], "unit")
-    ['cm', 'cm']
-    """
+    """Return one value per symbol: a list is taken in order, anything else holds for all."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, list | tuple):
@@ -112,30 +62,7 @@ def per_symbol(value: Any, names: Sequence[str], what: str) -> list[Any]:
 
 
 def exact_number(value: Any, what: str) -> sp.Expr:
-    """Return a number as SymPy holds it: rationals exact, floats as their double.
-
-    Parameters
-    ----------
-    value : int, float, Fraction or sympy number
-        The number. A constant expression such as ``sqrt(2)`` is a number too.
-    what : str
-        What it is, for messages.
-
-    Returns
-    -------
-    sympy.Expr
-        A finite real number.
-
-    Raises
-    ------
-    PlantError
-        Anything else.
-
-    Examples
-    --------
-    >>> exact_number(Fraction(1, 3), "a")
-    1/3
-    """
+    """Return a number as SymPy holds it: rationals exact, floats as their double."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, Fraction):
@@ -169,21 +96,6 @@ def make_signals(
 
     Every keyword is one value for all symbols or a list with one per symbol;
     ``limits`` is one pair or a list of pairs.
-
-    Returns
-    -------
-    tuple of Signal
-        In the order of the names.
-
-    Raises
-    ------
-    PlantError
-        Names or values that cannot be accepted.
-
-    Examples
-    --------
-    >>> [s.upper for s in make_signals(Role.DISTURBANCE, "w1:3", bound=[0.1, 0.2])]
-    [0.1, 0.2]
     """
     found = expand_names(names, str(role))
     if limits is not None and bound is not None:

@@ -17,8 +17,6 @@ from sympy.logic.boolalg import And, BooleanFalse, BooleanTrue, Not, Or
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
 
-__all__ = ["nearest_double", "to_sx"]
-
 _RELATIONS = {
     sp.StrictLessThan: lambda a, b: a < b,
     sp.LessThan: lambda a, b: a <= b,

@@ -8,36 +8,12 @@ import sympy as sp
 from obsynth.symbolic.arguments import exact_number
 from obsynth.symbolic.errors import PlantError
 
-__all__ = ["METHODS", "check_method", "next_values", "runge_kutta", "sampling_time"]
-
 METHODS = ("euler", "rk4")
 """The methods by name."""
 
 
 def sampling_time(Ts: Any) -> sp.Expr:
-    """Read a sampling time in seconds.
-
-    Parameters
-    ----------
-    Ts : float, int, Fraction or sympy number
-        A float that is a short binary fraction (1.0, 0.5, 0.125) is taken as that
-        rational, so that exact coefficients stay exact; other floats keep their double.
-
-    Returns
-    -------
-    sympy.Expr
-        A positive number.
-
-    Raises
-    ------
-    PlantError
-        Not a finite positive number.
-
-    Examples
-    --------
-    >>> sampling_time(0.5), sampling_time(sp.Rational(1, 10))
-    (1/2, 1/10)
-    """
+    """Read a sampling time in seconds."""
     number = exact_number(Ts, "Ts")
     if not number.is_positive:
         raise PlantError(f"the sampling time Ts={Ts} is not positive", Ts=Ts)
@@ -48,13 +24,7 @@ def sampling_time(Ts: Any) -> sp.Expr:
 
 
 def check_method(method: str) -> str:
-    """Return the name of a method, or refuse it with the names there are.
-
-    Examples
-    --------
-    >>> check_method("euler")
-    'euler'
-    """
+    """Return the name of a method, or refuse it with the names there are."""
     if method not in METHODS:
         raise PlantError(
             f"discretisation {method!r} is unknown; methods are {', '.join(METHODS)}",
@@ -66,30 +36,7 @@ def check_method(method: str) -> str:
 def next_values(
     method: str, x: Sequence[sp.Symbol], rates: Sequence[sp.Expr], step: sp.Expr
 ) -> tuple[sp.Expr, ...]:
-    """Return the next value of every state, everything else held over the step.
-
-    Parameters
-    ----------
-    method : {"euler", "rk4"}
-        Euler keeps quasi-LPV and QPV structure. A Runge-Kutta step substitutes the
-        equations into themselves three times, so its expressions are long.
-    x : sequence of sympy.Symbol
-        States.
-    rates : sequence of sympy.Expr
-        Their time derivatives.
-    step : sympy.Expr
-        Sampling time.
-
-    Returns
-    -------
-    tuple of sympy.Expr
-
-    Examples
-    --------
-    >>> z = sp.Symbol("z")
-    >>> next_values("rk4", [z], [-z], sp.Integer(1))
-    (3*z/8,)
-    """
+    """Return the next value of every state, everything else held over the step."""
     state, derivative = sp.Matrix(x), sp.Matrix(rates)
     if method == "euler":
         return tuple(state + step * derivative)
@@ -101,25 +48,7 @@ def next_values(
 
 
 def runge_kutta(rates: Callable[[Any], Any], x: Any, step: Any) -> Any:
-    """Return one step of the classical formula of order four.
-
-    Parameters
-    ----------
-    rates : callable
-        Maps a state column to its derivative; SymPy, SX or NumPy.
-    x : column
-    step : number
-
-    Returns
-    -------
-    column
-        Of the kind that ``rates`` returns.
-
-    Examples
-    --------
-    >>> round(runge_kutta(lambda x: x, 1.0, 0.1), 6)
-    1.105171
-    """
+    """Return one step of the classical formula of order four."""
     k1 = rates(x)
     k2 = rates(x + step / 2 * k1)
     k3 = rates(x + step / 2 * k2)

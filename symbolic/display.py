@@ -10,27 +10,9 @@ from obsynth.symbolic.signals import Signal
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = ["plant_html", "plant_latex"]
-
 
 def plant_latex(plant: "Plant") -> str:
-    r"""Return the equations of a plant, faults inserted, as one LaTeX environment.
-
-    Parameters
-    ----------
-    plant : Plant
-        What it still lacks is left out.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> plant_latex(quadruple_tank()).splitlines()[-2]
-    'y_{3} &= h_{3} + w_{3}'
-    """
+    r"""Return the equations of a plant, faults inserted, as one LaTeX environment."""
     # A Runge-Kutta step written out fills pages; its derivatives say the same.
     original = plant.continuous
     if original is not None and plant.discretisation != "euler":
@@ -52,23 +34,7 @@ def plant_latex(plant: "Plant") -> str:
 
 
 def plant_html(plant: "Plant") -> str:
-    """Return equations and a table of signals for a notebook.
-
-    Parameters
-    ----------
-    plant : Plant
-
-    Returns
-    -------
-    str
-        HTML; the equations are LaTeX between dollar signs, which notebooks set.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> "<td>h3</td>" in plant_html(quadruple_tank())
-    True
-    """
+    """Return equations and a table of signals for a notebook."""
     time = "continuous time" if plant.Ts is None else f"sampled every {plant.Ts:g} s"
     method = f", {plant.discretisation}" if plant.discretisation else ""
     heads = ("signal", "role", "range", "nominal", "rate", "unit")

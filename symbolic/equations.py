@@ -17,8 +17,6 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
 from obsynth.symbolic.text import TextError, read_text, undeclared
 
-__all__ = ["canonical", "read_dynamics", "read_outputs", "read_rows"]
-
 _PLAIN = (
     sp.Symbol,
     sp.Add,
@@ -32,34 +30,7 @@ _PLAIN = (
 
 
 def read_rows(rows: Any, symbols: Mapping[str, sp.Symbol], what: str) -> tuple[sp.Expr, ...]:
-    """Read the rows of a system of equations.
-
-    Parameters
-    ----------
-    rows : sequence of expressions, or a column matrix
-        SymPy expressions, numbers or text in the language of ``symbolic/text.py``.
-    symbols : mapping of str to sympy.Symbol
-        What is declared. A symbol of the user's own without assumptions is matched by name.
-    what : str
-        ``"dynamics"`` or ``"outputs"``, for messages.
-
-    Returns
-    -------
-    tuple of sympy.Expr
-        One canonical expression per row.
-
-    Raises
-    ------
-    PlantError
-        An undeclared symbol (with the declared names and the closest match), an unsupported
-        function, a relation in place of an expression, a number that is not finite.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> read_rows([sp.Symbol("x") ** 2], {"x": x}, "dynamics") == (x**2,)
-    True
-    """
+    """Read the rows of a system of equations."""
     if isinstance(rows, sp.MatrixBase):
         if rows.shape[1] != 1:
             raise PlantError(f"{what}: a column matrix is needed, not one of shape {rows.shape}")
@@ -76,30 +47,7 @@ def read_rows(rows: Any, symbols: Mapping[str, sp.Symbol], what: str) -> tuple[s
 def read_dynamics(
     rows: Any, symbols: Mapping[str, sp.Symbol], states: Sequence[str]
 ) -> tuple[sp.Expr, ...]:
-    """Read one row for each state.
-
-    Parameters
-    ----------
-    rows : sequence of expressions, or a column matrix
-    symbols : mapping of str to sympy.Symbol
-    states : sequence of str
-        Names of the states.
-
-    Returns
-    -------
-    tuple of sympy.Expr
-
-    Raises
-    ------
-    PlantError
-        As :func:`read_rows`; another number of rows than states, or no state at all.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> read_dynamics(["-x"], {"x": x}, ["x"])
-    (-x,)
-    """
+    """Read one row for each state."""
     if not states:
         raise PlantError("a plant needs at least one state; declare states first")
     found = read_rows(rows, symbols, "dynamics")
@@ -115,34 +63,7 @@ def read_dynamics(
 def read_outputs(
     rows: Any, symbols: Mapping[str, sp.Symbol], names: Any, unit: Any
 ) -> tuple[dict[str, sp.Expr], tuple[str, ...]]:
-    """Read outputs with their names and units.
-
-    Parameters
-    ----------
-    rows : sequence of expressions, or a column matrix
-    symbols : mapping of str to sympy.Symbol
-    names : str, sequence of str or None
-        None: y1, y2, ...
-    unit : str or sequence of str
-
-    Returns
-    -------
-    dict of str to sympy.Expr
-        The outputs by name.
-    tuple of str
-        Their units.
-
-    Raises
-    ------
-    PlantError
-        As :func:`read_rows`; no output, names that are taken or not as many as rows.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> read_outputs([x], {"x": x}, None, "cm")
-    ({'y1': x}, ('cm',))
-    """
+    """Read outputs with their names and units."""
     found = read_rows(rows, symbols, "outputs")
     if not found:
         raise PlantError("outputs is empty: an observer needs at least one measurement")
@@ -170,20 +91,6 @@ def canonical(expression: sp.Expr) -> sp.Expr:
 
     What SymPy was told not to evaluate is evaluated, and every float becomes the double
     it prints as, so that equal text means equal expressions.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-
-    Returns
-    -------
-    sympy.Expr
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> canonical(sp.Mul(2, x + 1, evaluate=False))
-    2*x + 2
     """
     for _ in range(8):
         rebuilt = _rebuild(expression, {})

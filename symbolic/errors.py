@@ -2,8 +2,6 @@
 
 from typing import Any
 
-__all__ = ["ObsynthError", "ObsynthWarning", "PlantError"]
-
 
 class ObsynthWarning(UserWarning):
     """Something worth knowing that is not wrong."""

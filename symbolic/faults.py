@@ -9,35 +9,9 @@ from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal
 
-__all__ = ["check_targets", "fault_units", "insert_faults", "read_targets"]
-
 
 def read_targets(role: Role, names: Sequence[str], of: Any) -> list[str]:
-    """Read ``of=``: the name of one input or output for every fault.
-
-    Parameters
-    ----------
-    role : Role
-        Actuator or sensor fault, for messages.
-    names : sequence of str
-        The faults.
-    of : str, Symbol or a sequence of them
-        Names as in ``sympy.symbols``, or the symbols a declaration returned.
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    PlantError
-        Not names, or not as many as there are faults.
-
-    Examples
-    --------
-    >>> read_targets(Role.SENSOR_FAULT, ["f1", "f2"], "y1:3")
-    ['y1', 'y2']
-    """
+    """Read ``of=``: the name of one input or output for every fault."""
     items = [of] if isinstance(of, str | sp.Symbol) else of
     if not isinstance(items, Sequence) or not all(isinstance(i, str | sp.Symbol) for i in items):
         raise PlantError(
@@ -60,20 +34,7 @@ def fault_units(targets: Sequence[str], units: Mapping[str, str]) -> list[str]:
 
 
 def check_targets(signals: Sequence[Signal], outputs: Sequence[str] | None) -> None:
-    """Refuse faults of what is not there, and two faults of the same signal.
-
-    Parameters
-    ----------
-    signals : sequence of Signal
-        All signals of a plant.
-    outputs : sequence of str or None
-        Names of its outputs; None where they are not declared yet.
-
-    Raises
-    ------
-    PlantError
-        Names the fault and what there is.
-    """
+    """Refuse faults of what is not there, and two faults of the same signal."""
     inputs = [s.name for s in signals if s.role is Role.INPUT]
     known = {Role.ACTUATOR_FAULT: ("input", inputs), Role.SENSOR_FAULT: ("output", outputs)}
     taken: dict[tuple[Role, str], str] = {}
@@ -106,25 +67,6 @@ def insert_faults(
 
     Every input v with an actuator fault f becomes v + f, in the outputs too, since it is
     what the actuator does; every output with a sensor fault becomes y + f.
-
-    Parameters
-    ----------
-    rows : sequence of sympy.Expr
-        The dynamics.
-    outputs : mapping of str to sympy.Expr
-        The outputs by name.
-    signals : sequence of Signal
-
-    Returns
-    -------
-    sympy.Matrix (n, 1), sympy.Matrix (m, 1)
-
-    Examples
-    --------
-    >>> x, v, f = sp.symbols("x v f", real=True)
-    >>> signals = [Signal("v", v, Role.INPUT), Signal("f", f, Role.ACTUATOR_FAULT, of="v")]
-    >>> insert_faults([v - x], {"y1": x}, signals)[0]
-    Matrix([[f + v - x]])
     """
     inputs = {s.name: s.symbol for s in signals if s.role is Role.INPUT}
     shift: dict[sp.Symbol, sp.Expr] = {}

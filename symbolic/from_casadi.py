@@ -18,7 +18,6 @@ from obsynth.symbolic.tape import expand_function, from_tape
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = ["CasadiSystem", "plant_from_casadi"]
 
 _METHODS = {
     "x": ("states", ("range", "unit", "nominal")),
@@ -34,33 +33,11 @@ _METHODS = {
 class CasadiSystem:
     """Right-hand side and outputs as one SX function of named scalars.
 
-    Parameters
-    ----------
-    columns : mapping of str to SX, MX, or a list of them
-        The symbols of each kind (x, u, d, f, w, p, rho).
-    rhs, y : SX, MX or a list of them
-        The expressions, both of the same type as the symbols.
-    names : mapping of str to names
-        Names of the signals of a kind where CasADi's own will not do.
-
-    Attributes
-    ----------
-    names : dict of str to tuple of str
-        The names of the signals of every kind given.
-    function : casadi.Function
-        The expanded function, blocks of symbols to scalar rows.
-
-    Raises
-    ------
-    PlantError
-        Symbols that are no symbols, types that are mixed, free symbols, MX that cannot
-        be expanded.
-
-    Examples
-    --------
-    >>> z = ca.SX.sym("z", 2)
-    >>> CasadiSystem({"x": z}, -z, z[0], {}).names
-    {'x': ('z_0', 'z_1')}
+    columns: the symbols of each kind (x, u, d, f, w, p, rho)
+    rhs, y: the expressions, both of the same type as the symbols
+    names: names of the signals of a kind where CasADi's own will not do
+    names: the names of the signals of every kind given
+    function: the expanded function, blocks of symbols to scalar rows
     """
 
     def __init__(
@@ -152,41 +129,6 @@ def plant_from_casadi(
 
     The equations are kept in SymPy from then on, compared with the CasADi function
     at random points of the box. Faults stand in the expressions themselves.
-
-    Parameters
-    ----------
-    x, u, d, f, w, p, rho : SX, MX or a list of them
-        Columns of symbols.
-    xdot, xnext : SX, MX or a list of them
-        Time derivatives, or next values with the sampling time ``Ts`` (1 s if left out).
-    y : SX, MX or a list of them
-        Outputs.
-    range, bound, nominal, unit, rate, constant, measured, value, tolerance : mapping
-        Keywords of the declarations, by kind (``{"x": ..., "u": ...}``) or by signal;
-        a plain value is for the states.
-    names : mapping of str to names, optional
-        By kind, where CasADi's own names will not do.
-    output_names : names, optional
-    output_unit : str or sequence of str
-
-    Returns
-    -------
-    Plant
-
-    Raises
-    ------
-    PlantError
-        Symbols that are no symbols, types that are mixed, symbols not listed, MX that cannot
-        be expanded, operations without a SymPy form, and what declarations refuse.
-    ParityError
-        The SymPy form is not the same function.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic import Plant
-    >>> h, v = ca.SX.sym("h"), ca.SX.sym("v")
-    >>> Plant.from_casadi("tank", x=h, u=v, xdot=v - ca.sqrt(h), y=h, range=(1, 9)).rhs
-    Matrix([[-sqrt(h) + v]])
     """
     if (xdot is None) == (xnext is None):
         raise PlantError("from_casadi: give xdot= (continuous) or xnext= (discrete)")

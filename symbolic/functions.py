@@ -7,8 +7,6 @@ from typing import Any
 import casadi as ca
 import sympy as sp
 
-__all__ = ["ALIASES", "BY_CLASS", "BY_NAME", "NamedFunction", "phi1", "tanhc"]
-
 # Inside |x| < 1/8 a quotient by x is replaced by its Taylor polynomial, whose first term
 # left out is below 1e-16 there. A constant patch would have a wrong derivative, and a
 # division by x itself would have no bound on an interval that contains zero.
@@ -132,16 +130,10 @@ def _fold(binary: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 class NamedFunction:
     """A function by its name in text, its SymPy constructor and its CasADi builder.
 
-    Parameters
-    ----------
-    name : str
-        The name in text.
-    sympy : callable
-        Builds the SymPy expression from SymPy arguments.
-    casadi : callable
-        Builds the SX expression from SX arguments.
-    least, most : int or None
-        How many arguments it takes; ``most=None`` is any number.
+    name: the name in text
+    sympy: builds the SymPy expression from SymPy arguments
+    casadi: builds the SX expression from SX arguments
+    least, most: how many arguments it takes; ``most=None`` is any number
     """
 
     name: str

@@ -5,8 +5,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.symbolic.errors import PlantError
 
-__all__ = ["bounded_noise", "splitmix64"]
-
 _INCREMENT = np.uint64(0x9E3779B97F4A7C15)
 _FACTORS = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _SHIFTS = (np.uint64(30), np.uint64(27), np.uint64(31))
@@ -14,33 +12,9 @@ _DROPPED = np.uint64(11)
 
 
 def splitmix64(seed: int, count: int) -> NDArray[np.float64]:
-    """Return numbers uniform in [0, 1), the same on every machine.
+    """Return numbers uniform in [0, 1), the same on every machine. Shapes: returns (count,).
 
-    Parameters
-    ----------
-    seed : int
-        First state, from 0 to 2^64 - 1.
-    count : int
-        How many numbers.
-
-    Returns
-    -------
-    ndarray of shape (count,)
-        Multiples of 2^-53.
-
-    Raises
-    ------
-    PlantError
-        A seed that is no 64-bit number.
-
-    References
-    ----------
     Steele, Lea, Flood: Fast splittable pseudorandom number generators, OOPSLA 2014.
-
-    Examples
-    --------
-    >>> splitmix64(1, 2).round(8).tolist()
-    [0.56656158, 0.74578176]
     """
     if isinstance(seed, bool) or int(seed) != seed or not 0 <= seed < 2**64:
         raise PlantError(f"seed={seed!r} is not a whole number from 0 to 2^64 - 1", seed=seed)
@@ -55,23 +29,7 @@ def splitmix64(seed: int, count: int) -> NDArray[np.float64]:
 def bounded_noise(seed: int, steps: int, bound: ArrayLike) -> NDArray[np.float64]:
     """Return noise uniform in [-bound, bound): one row for each sample, drawn row by row.
 
-    Parameters
-    ----------
-    seed : int
-        Of `splitmix64`.
-    steps : int
-        N; the rows are those of the samples 0..N.
-    bound : array_like of shape (n_w,)
-        Largest magnitude of each component.
-
-    Returns
-    -------
-    ndarray of shape (steps + 1, n_w)
-
-    Examples
-    --------
-    >>> [float(f"{v:.6g}") for v in bounded_noise(1, 10, [4.5e-3, 4.5e-3])[0]]
-    [0.000599054, 0.00221204]
+    Shapes: bound (n_w,), returns (steps + 1, n_w).
     """
     size = np.atleast_1d(np.asarray(bound, dtype=np.float64))
     drawn = splitmix64(seed, (steps + 1) * len(size)).reshape(steps + 1, len(size))

@@ -16,8 +16,6 @@ from sympy.logic.boolalg import And, Not, Or
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["POINTS", "TOLERANCE", "ParityError", "check_parity", "sample_box"]
-
 POINTS = 64
 """Random points of the box at which two forms are compared."""
 
@@ -35,28 +33,7 @@ class ParityError(ObsynthError):
 def sample_box(
     box: NDArray[np.float64], count: int = POINTS, seed: int = 0, around: Any = None
 ) -> NDArray[np.float64]:
-    """Return random points of a box; an infinite side becomes [-1, 1] about its nominal value.
-
-    Parameters
-    ----------
-    box : array (k, 2)
-        Lower and upper bounds.
-    count : int
-        Number of points.
-    seed : int
-        Seed of the generator.
-    around : array (k,), optional
-        Centre of the infinite sides; zero by default.
-
-    Returns
-    -------
-    array (count, k)
-
-    Examples
-    --------
-    >>> bool(np.all(sample_box(np.array([[2.0, 3.0]])) >= 2.0))
-    True
-    """
+    """Return random points of a box; an infinite side becomes [-1, 1] about its nominal value."""
     centre = np.zeros(len(box)) if around is None else np.asarray(around, dtype=np.float64)
     finite = np.isfinite(box).all(axis=1)
     lower = np.where(finite, box[:, 0], centre - 1.0)

@@ -23,8 +23,6 @@ from obsynth.symbolic.signals import KINDS, Role, Signal
 from obsynth.symbolic.sxmodel import SxModel, build_sx
 from obsynth.symbolic.text import read_text
 
-__all__ = ["Plant"]
-
 Rows = tuple[sp.Expr, ...]
 
 

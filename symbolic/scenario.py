@@ -13,7 +13,6 @@ from obsynth.symbolic.errors import PlantError
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 

@@ -9,20 +9,12 @@ import sympy as sp
 from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal
-from obsynth.symbolic.text import read_text, write_text
+from obsynth.symbolic.text import read_text
+from obsynth.symbolic.text_writer import write_text
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = [
-    "FORMAT",
-    "check_format",
-    "fill_from_dict",
-    "plant_to_dict",
-    "read_field",
-    "signal_from_dict",
-    "signal_to_dict",
-]
 
 FORMAT = "obsynth plant 1"
 """Value of ``format``; the number grows when an older reader would misunderstand."""
@@ -35,19 +27,6 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
 
     Expressions are text, infinite bounds null, and a discretised plant is its continuous
     original with method and sampling time, so that nothing is rounded on the way.
-
-    Parameters
-    ----------
-    plant : Plant
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    PlantError
-        The plant is not complete.
     """
     original = plant.check().continuous
     step = None if plant.exact_Ts is None else write_text(plant.exact_Ts)
@@ -74,32 +53,14 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
 
 
 def check_format(data: Mapping[str, Any]) -> None:
-    """Refuse data of another format.
-
-    Examples
-    --------
-    >>> check_format({"format": FORMAT})
-    """
+    """Refuse data of another format."""
     stored = read_field(data, "format", str)
     if stored != FORMAT:
         raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
 
 
 def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
-    """Declare in a new plant what stored data say.
-
-    Parameters
-    ----------
-    plant : Plant
-        Without signals.
-    data : dict
-        As :func:`plant_to_dict` writes it, of a plant that was not discretised.
-
-    Raises
-    ------
-    PlantError
-        A field that is missing or not of its type, and whatever the declarations refuse.
-    """
+    """Declare in a new plant what stored data say."""
     plant.add_signals([signal_from_dict(item) for item in read_field(data, "signals", list)])
     step = read_field(data, "Ts", str, None)
     rows = read_field(data, "dynamics", list)
@@ -122,13 +83,7 @@ def _row_text(row: sp.Expr, plant: "Plant") -> str:
 
 
 def signal_to_dict(signal: Signal) -> dict[str, Any]:
-    """Return a signal as JSON-able data.
-
-    Examples
-    --------
-    >>> signal_to_dict(Signal("h", sp.Symbol("h", real=True), Role.STATE))["lower"] is None
-    True
-    """
+    """Return a signal as JSON-able data."""
     return {
         "name": signal.name,
         "role": str(signal.role),
@@ -145,28 +100,7 @@ def signal_to_dict(signal: Signal) -> dict[str, Any]:
 
 
 def signal_from_dict(data: Any) -> Signal:
-    """Read a signal back.
-
-    Parameters
-    ----------
-    data : dict
-        As :func:`signal_to_dict` writes it.
-
-    Returns
-    -------
-    Signal
-
-    Raises
-    ------
-    PlantError
-        A field is missing or not of its type.
-
-    Examples
-    --------
-    >>> signal = Signal("h", sp.Symbol("h", real=True), Role.STATE, 0.5, 2.0, "m")
-    >>> signal_from_dict(signal_to_dict(signal)) == signal
-    True
-    """
+    """Read a signal back."""
     name = read_field(data, "name", str)
     if expand_names(name) != (name,):
         raise PlantError(f"stored signal {name!r}: this is not the name of one signal", symbol=name)
@@ -192,32 +126,7 @@ def signal_from_dict(data: Any) -> Signal:
 
 
 def read_field(data: Any, key: str, kind: type, default: Any = _REQUIRED) -> Any:
-    """Read one field of stored data and check its type.
-
-    Parameters
-    ----------
-    data : mapping
-    key : str
-    kind : type
-        ``float`` takes integers too.
-    default : object, optional
-        What null or a missing field means; without it the field has to be there.
-
-    Returns
-    -------
-    object
-        Of type ``kind``, or the default.
-
-    Raises
-    ------
-    PlantError
-        Names the field and what was found.
-
-    Examples
-    --------
-    >>> read_field({"rate": 1}, "rate", float)
-    1.0
-    """
+    """Read one field of stored data and check its type."""
     if not isinstance(data, Mapping):
         raise PlantError(f"stored plant: a table with {key!r} is needed, not {data!r}", key=key)
     value = data.get(key)

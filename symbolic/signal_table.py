@@ -12,24 +12,11 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.faults import check_targets, fault_units, read_targets
 from obsynth.symbolic.signals import KINDS, Role, Signal
 
-__all__ = ["SignalTable"]
-
 
 class SignalTable:
     """Signals in order of declaration, each name once.
 
-    Parameters
-    ----------
-    signals : sequence of Signal
-        The first ones.
-
-    Examples
-    --------
-    >>> table = SignalTable()
-    >>> table.declare(Role.STATE, "h1:3", limits=(0, 1))
-    (h1, h2)
-    >>> table.names("x")
-    ('h1', 'h2')
+    signals: the first ones
     """
 
     def __init__(self, signals: Sequence[Signal] = ()) -> None:
@@ -80,21 +67,7 @@ class SignalTable:
     def declare(
         self, role: Role, names: Any, taken: Sequence[str] = (), **keywords: Any
     ) -> tuple[sp.Symbol, ...]:
-        """Make signals from the arguments of a declaration and add them.
-
-        Parameters
-        ----------
-        role : Role
-        names : str or sequence of str
-        taken : sequence of str
-            Names of outputs, which signals cannot have.
-        **keywords
-            As ``arguments.make_signals`` takes them.
-
-        Returns
-        -------
-        tuple of sympy.Symbol
-        """
+        """Make signals from the arguments of a declaration and add them."""
         signals = make_signals(role, names, **keywords)
         self.add(signals, taken)
         return tuple(signal.symbol for signal in signals)
@@ -102,23 +75,7 @@ class SignalTable:
     def declare_faults(
         self, role: Role, names: Any, of: Any, outputs: Mapping[str, str], **keywords: Any
     ) -> tuple[sp.Symbol, ...]:
-        """Declare faults that add to inputs or outputs, with the units of these.
-
-        Parameters
-        ----------
-        role : Role
-            Actuator or sensor fault.
-        names : str or sequence of str
-        of : str, Symbol or a sequence of them
-        outputs : mapping of str to str
-            Units of the outputs declared so far, by name.
-        **keywords
-            As ``arguments.make_signals`` takes them; ``unit=None`` is the unit of the target.
-
-        Returns
-        -------
-        tuple of sympy.Symbol
-        """
+        """Declare faults that add to inputs or outputs, with the units of these."""
         targets = read_targets(role, expand_names(names, str(role)), of)
         if keywords.get("unit") is None:
             inputs = {signal.name: signal.unit for signal in self.kind("u")}
@@ -127,13 +84,7 @@ class SignalTable:
         return self.declare(role, names, tuple(outputs), of=targets, **keywords)
 
     def add(self, signals: Sequence[Signal], outputs: Sequence[str] = ()) -> None:
-        """Add signals, all of them or none.
-
-        Raises
-        ------
-        PlantError
-            A name that is taken, a fault of something that does not exist.
-        """
+        """Add signals, all of them or none."""
         added: dict[str, Signal] = {}
         for signal in signals:
             taken = self._signals.get(signal.name) or added.get(signal.name)

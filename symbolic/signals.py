@@ -8,8 +8,6 @@ import sympy as sp
 
 from obsynth.symbolic.errors import PlantError
 
-__all__ = ["FAULT_ROLES", "KINDS", "Role", "Signal"]
-
 
 class Role(StrEnum):
     """What a signal is to the plant; the value is the word used in messages and files.

@@ -16,8 +16,6 @@ from obsynth.symbolic.signals import KINDS
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-__all__ = ["SxModel", "build_sx"]
-
 
 @dataclass(frozen=True, eq=False)
 class SxModel:
@@ -60,22 +58,6 @@ def build_sx(plant: "Plant", constants: Literal["value", "symbol"]) -> SxModel:
 
     A Runge-Kutta step is composed in SX from the derivatives of the continuous plant,
     which keeps the graph small; these are what is compared then.
-
-    Parameters
-    ----------
-    plant : Plant
-    constants : {"value", "symbol"}
-
-    Returns
-    -------
-    SxModel
-
-    Raises
-    ------
-    PlantError
-        A function without a CasADi form.
-    ParityError
-        The two forms differ.
     """
     if constants not in ("value", "symbol"):
         raise PlantError(f"constants= is 'value' or 'symbol', not {constants!r}")

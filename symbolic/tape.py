@@ -8,8 +8,6 @@ import sympy as sp
 
 from obsynth.symbolic.errors import PlantError
 
-__all__ = ["expand_function", "from_tape"]
-
 
 def _lift(function: Callable[..., Any]) -> Callable[..., Any]:
     """Let a function of numbers take conditions, which CasADi counts as 0 and 1."""
@@ -183,29 +181,7 @@ def _operation_name(code: int) -> str:
 
 
 def expand_function(function: ca.Function) -> ca.Function:
-    """Expand an MX function to SX, or say what in it cannot be expanded.
-
-    Parameters
-    ----------
-    function : casadi.Function
-
-    Returns
-    -------
-    casadi.Function
-        The same function on SX.
-
-    Raises
-    ------
-    PlantError
-        It calls something without an SX form (an integrator, an external function, a
-        linear solver); the message names it.
-
-    Examples
-    --------
-    >>> z = ca.MX.sym("z", 2)
-    >>> expand_function(ca.Function("f", [z], [ca.sum1(z)])).is_a("SXFunction")
-    True
-    """
+    """Expand an MX function to SX, or say what in it cannot be expanded."""
     if function.is_a("SXFunction"):
         return function
     expanded, reason = _expand(function)

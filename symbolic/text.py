@@ -28,9 +28,6 @@ from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue,
 
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import ALIASES, BY_NAME
-from obsynth.symbolic.text_writer import write_text
-
-__all__ = ["WORDS", "TextError", "read_text", "undeclared", "write_text"]
 
 WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
 """Words of the language that cannot name a symbol."""
@@ -79,13 +76,7 @@ def read_text(text: str, symbols: Mapping[str, sp.Symbol]) -> sp.Expr:
 
 
 def undeclared(name: str, declared: Mapping[str, object]) -> str:
-    """Return the message about a symbol that is not declared.
-
-    Examples
-    --------
-    >>> undeclared("h3", {"h1": None, "v": None})
-    'the symbol h3 is not declared (declared: h1, v); did you mean h1?'
-    """
+    """Return the message about a symbol that is not declared."""
     close = difflib.get_close_matches(name, declared, n=1, cutoff=0.5)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"the symbol {name} is not declared (declared: {', '.join(declared) or 'none'}){hint}"

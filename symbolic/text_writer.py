@@ -7,8 +7,6 @@ from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue,
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS
 
-__all__ = ["write_text"]
-
 _SIGNS = {sp.Lt: "<", sp.Le: "<=", sp.Gt: ">", sp.Ge: ">=", sp.Eq: "==", sp.Ne: "!="}
 _CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
 
@@ -17,28 +15,7 @@ _OR, _AND, _NOT, _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(8)
 
 
 def write_text(expression: sp.Basic) -> str:
-    """Write an expression so that :func:`~obsynth.symbolic.text.read_text` gives it back.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        In the canonical form that a plant keeps (see ``equations.canonical``).
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    PlantError
-        A part of the expression has no text form.
-
-    Examples
-    --------
-    >>> x, y = sp.symbols("x y", real=True)
-    >>> write_text(sp.sqrt(x) / (2 * y) - sp.Rational(1, 3))
-    'sqrt(x)/2/y - 1/3'
-    """
+    """Write an expression so that :func:`~obsynth.symbolic.text.read_text` gives it back."""
     return _write(expression, _OR)
 
 

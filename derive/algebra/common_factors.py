@@ -9,37 +9,13 @@ from collections.abc import Callable
 
 import sympy as sp
 
-__all__ = ["cancel_common_factors"]
-
 _LARGEST = 200
 
 
 def cancel_common_factors(
     expression: sp.Expr, may_vanish: Callable[[sp.Expr], bool]
 ) -> sp.Expr | None:
-    """Cancel what numerators have in common with denominators that may be zero.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Exact, without floating-point numbers.
-    may_vanish : callable
-        Whether an expression may be zero in the box.
-
-    Returns
-    -------
-    sympy.Expr or None
-        The same function, continued where numerator and denominator vanish together, or None where
-        nothing cancels.
-
-    Examples
-    --------
-    >>> x, y = sp.symbols("x y", real=True)
-    >>> cancel_common_factors((x**2 - y**2) / (x - y) + sp.sin(x), lambda e: True)
-    x + y + sin(x)
-    >>> cancel_common_factors((x**2 + y**2) / (x - y), lambda e: True) is None
-    True
-    """
+    """Cancel what numerators have in common with denominators that may be zero."""
     found = _cancelled(expression, may_vanish)
     return None if found == expression else found
 

@@ -5,20 +5,14 @@ from dataclasses import dataclass
 
 import sympy as sp
 
-__all__ = ["Divisor", "Factorisation", "divisors", "expand_terms", "factorise"]
-
 
 @dataclass(frozen=True, eq=False)
 class Divisor:
     """A homogeneous linear form by which a term is divided.
 
-    Attributes
-    ----------
-    form : sympy.Expr
-        The form: one signal, or a combination of several.
-    weights : tuple of (int, sympy.Expr)
-        Position of every signal among states, then inputs, and its coefficient in the form. The
-        term is (term / form) times the sum of weight times signal.
+    form: the form: one signal, or a combination of several
+    weights: position of every signal among states, then inputs, and its coefficient in the form.
+        The term is (term / form) times the sum of weight times signal
     """
 
     form: sp.Expr
@@ -29,16 +23,10 @@ class Divisor:
 class Factorisation:
     """f = A x + B u + offset with matrices that depend on x and u.
 
-    Attributes
-    ----------
-    A : sympy.Matrix, shape (n, n)
-        State coefficients.
-    B : sympy.Matrix, shape (n, n_u)
-        Input coefficients.
-    offset : sympy.Matrix, shape (n, 1)
-        Terms in which neither a state nor an input can be factored out.
-    linear_A, linear_B : sympy.Matrix
-        The part of A and B that comes from terms with a constant coefficient.
+    A: state coefficients
+    B: input coefficients
+    offset: terms in which neither a state nor an input can be factored out
+    linear_A, linear_B: the part of A and B that comes from terms with a constant coefficient
     """
 
     A: sp.Matrix
@@ -65,24 +53,7 @@ def _opaque(expression: sp.Expr, known: dict[sp.Expr, sp.Dummy]) -> sp.Expr:
 
 
 def expand_terms(expression: sp.Expr) -> list[sp.Expr]:
-    """List the additive terms of an expression; functions, roots and denominators stay whole.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Any expression.
-
-    Returns
-    -------
-    list of sympy.Expr
-        Their sum is the expression.
-
-    Examples
-    --------
-    >>> x, y = sp.symbols("x y", real=True)
-    >>> sorted(map(str, expand_terms(x * (y + sp.sin(x + y)) + 1)))
-    ['1', 'x*sin(x + y)', 'x*y']
-    """
+    """List the additive terms of an expression; functions, roots and denominators stay whole."""
     known: dict[sp.Expr, sp.Dummy] = {}
     expanded = sp.expand(_opaque(sp.sympify(expression), known))
     back = {dummy: original for original, dummy in known.items()}
@@ -130,31 +101,7 @@ def _linear_form(term: sp.Expr, states: Sequence[sp.Symbol]) -> Divisor | None:
 def divisors(
     term: sp.Expr, own: int, states: Sequence[sp.Symbol], inputs: Sequence[sp.Symbol]
 ) -> Iterator[Divisor]:
-    """List what a term can be divided by without a new singularity, the preferred one first.
-
-    Parameters
-    ----------
-    term : sympy.Expr
-        A term that depends on states or inputs.
-    own : int
-        Index of the state whose row it stands in; -1 for none.
-    states, inputs : sequence of sympy.Symbol
-        x and u.
-
-    Yields
-    ------
-    Divisor
-        States that are factors (the row's own state before others); inputs that are factors; the
-        state in which a term of one state vanishes; the linear form with which a term vanishes.
-
-    Examples
-    --------
-    >>> x, y, u = sp.symbols("x y u", real=True)
-    >>> [d.form for d in divisors(x * y * u, 1, [x, y], [u])]
-    [y, x, u]
-    >>> [d.form for d in divisors(sp.sin(x - y), 0, [x, y], [u])]
-    [x - y]
-    """
+    """List what a term can be divided by without a new singularity, the preferred one first."""
     one = sp.Integer(1)
     factors = _factors(term, states)
     for j in sorted(factors, key=lambda k: k != own):
@@ -183,25 +130,6 @@ def factorise(
     state (sqrt(h) = (sqrt(h)/h) h); the homogeneous linear form through which alone it depends on
     the states (two columns for phi(x1 - x3)); otherwise to the offset. `quasi_lpv` weighs all
     choices against each other.
-
-    Parameters
-    ----------
-    rows : sympy.Matrix, shape (n, 1)
-        f(x, u).
-    states, inputs : sequence of sympy.Symbol
-        x and u.
-
-    Returns
-    -------
-    Factorisation
-        The sum A x + B u + offset equals the rows identically.
-
-    Examples
-    --------
-    >>> h, v = sp.symbols("h v", real=True)
-    >>> form = factorise(sp.Matrix([h - sp.sqrt(h) + 2 * v]), [h], [v])
-    >>> form.A, form.B
-    (Matrix([[1 - 1/sqrt(h)]]), Matrix([[2]]))
     """
     n, n_u = len(states), len(inputs)
     columns, linear = sp.zeros(n, n + n_u), sp.zeros(n, n + n_u)

@@ -10,8 +10,6 @@ from obsynth.derive.algebra.linear_parts import LinearPart
 from obsynth.derive.rigour.numbers import is_zero, substitute
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["IdentityProof", "prove_identity"]
-
 Array = NDArray[np.float64]
 
 
@@ -57,24 +55,7 @@ class IdentityProof:
 def prove_identity(
     model: Plant, A: sp.Matrix, B: sp.Matrix, g: sp.Matrix, parts: dict[str, LinearPart]
 ) -> IdentityProof:
-    """Show that exact parts add up to the plant's own expressions.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    A, B : sympy.Matrix, shapes (n, n), (n, n_u)
-        Exact matrices.
-    g : sympy.Matrix, shape (n, 1)
-        The nonlinearity.
-    parts : dict of str to LinearPart
-        D, B_f, W1, C, W2 and D_f.
-
-    Returns
-    -------
-    IdentityProof
-        One method per row; empty where the row was not proved.
-    """
+    """Show that exact parts add up to the plant's own expressions."""
     values = model.constant_values
     symbols = {k: [s.symbol for s in getattr(model, k)] for k in "xudfw"}
     column = {k: sp.Matrix(len(found), 1, found) for k, found in symbols.items()}

@@ -11,21 +11,14 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour.numbers import is_zero, round_number, substitute
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["LinearPart", "constant_columns", "rounded"]
-
 
 @dataclass(frozen=True, eq=False)
 class LinearPart:
     """A constant matrix, exactly and as doubles.
 
-    Attributes
-    ----------
-    exact : sympy.Matrix
-        Exact entries.
-    value : ndarray
-        Nearest doubles.
-    rounding : ndarray
-        Bounds of |exact - value|; zero where the entry is a double.
+    exact: exact entries
+    value: nearest doubles
+    rounding: bounds of |exact - value|; zero where the entry is a double
     """
 
     exact: sp.Matrix
@@ -34,24 +27,7 @@ class LinearPart:
 
 
 def rounded(exact: sp.Matrix) -> LinearPart:
-    """Round a matrix of exact numbers to doubles, with bounds of the errors.
-
-    Parameters
-    ----------
-    exact : sympy.Matrix
-        Real numbers.
-
-    Returns
-    -------
-    LinearPart
-        Exact and rounded.
-
-    Examples
-    --------
-    >>> part = rounded(sp.Matrix([[sp.Rational(1, 2), sp.Rational(1, 3)]]))
-    >>> part.value[0, 0], part.rounding[0, 0], bool(part.rounding[0, 1] > 0)
-    (np.float64(0.5), np.float64(0.0), True)
-    """
+    """Round a matrix of exact numbers to doubles, with bounds of the errors."""
     value, error = np.zeros(exact.shape), np.zeros(exact.shape)
     for i in range(exact.rows):
         for j in range(exact.cols):
@@ -62,32 +38,7 @@ def rounded(exact: sp.Matrix) -> LinearPart:
 def constant_columns(
     model: Plant, rows: sp.Matrix, symbols: Sequence[sp.Symbol], what: str, row_names: Sequence[str]
 ) -> LinearPart:
-    """Matrix M of rows = M symbols + (something free of the symbols).
-
-    Parameters
-    ----------
-    model : Plant
-        Where the constants have their values.
-    rows : sympy.Matrix, shape (n, 1)
-        Right-hand side or output map.
-    symbols : sequence of sympy.Symbol
-        Signals that have to enter linearly, with constant coefficients.
-    what : str
-        What these signals are, for messages.
-    row_names : sequence of str
-        Names of the rows, for messages.
-
-    Returns
-    -------
-    LinearPart
-        Shape (n, number of symbols).
-
-    Raises
-    ------
-    StructureError
-        A signal enters nonlinearly or with a coefficient that is not constant; ``symbol`` and
-        ``row`` say which and where.
-    """
+    """Matrix M of rows = M symbols + (something free of the symbols)."""
     exact = sp.zeros(rows.rows, len(symbols))
     values = model.constant_values
     for i, row in enumerate(rows):

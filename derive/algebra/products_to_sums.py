@@ -8,33 +8,11 @@ Lagrange's method, shrink to a fraction. Every rewritten part is proved equal to
 
 import sympy as sp
 
-__all__ = ["products_to_sums", "same_waves"]
-
 _LARGEST = 3000
 
 
 def products_to_sums(expression: sp.Expr) -> sp.Expr | None:
-    """Write products of sines and cosines as sums, in every part where that is possible.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Exact, without floating-point numbers.
-
-    Returns
-    -------
-    sympy.Expr or None
-        The same function, or None where there are no such products, where the expression is too
-        large, or where the proof did not succeed.
-
-    Examples
-    --------
-    >>> a, b, v = sp.symbols("a b v", real=True)
-    >>> products_to_sums(v * (sp.cos(a) * sp.cos(a + b) + sp.sin(a) * sp.sin(a + b)))
-    v*cos(b)
-    >>> products_to_sums(v * sp.cos(a)) is None
-    True
-    """
+    """Write products of sines and cosines as sums, in every part where that is possible."""
     if not _has_products(expression) or expression.count_ops() > _LARGEST:
         return None
     result = _rewritten(expression)
@@ -103,27 +81,7 @@ def _short(factor: sp.Expr) -> sp.Expr:
 
 
 def same_waves(one: sp.Expr, other: sp.Expr) -> bool:
-    """Prove that two polynomials in sines and cosines are the same function.
-
-    Parameters
-    ----------
-    one, other : sympy.Expr
-        Exact expressions.
-
-    Returns
-    -------
-    bool
-        True when their difference, written in complex exponentials of single terms, expands to
-        zero.
-
-    Examples
-    --------
-    >>> a, b = sp.symbols("a b", real=True)
-    >>> same_waves(2 * sp.sin(a) * sp.cos(b), sp.sin(a + b) + sp.sin(a - b))
-    True
-    >>> same_waves(2 * sp.sin(a) * sp.cos(b), sp.sin(a + b) - sp.sin(a - b))
-    False
-    """
+    """Prove that two polynomials in sines and cosines are the same function."""
     waves = {wave: _exponentials(wave) for wave in _waves(one) | _waves(other)}
     return bool(sp.expand(one.xreplace(waves) - other.xreplace(waves)) == 0)
 

@@ -10,34 +10,13 @@ import sympy as sp
 
 from obsynth.symbolic.functions import phi1, tanhc
 
-__all__ = ["at_zero", "quotients", "secant"]
-
 Rule = Callable[[sp.Expr, sp.Expr], sp.Expr]
 _LARGEST_ROOT = 12
 _HALF = sp.Rational(1, 2)
 
 
 def at_zero(expression: sp.Expr, variable: sp.Symbol) -> sp.Expr | None:
-    """Value where a variable is zero.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Any expression.
-    variable : sympy.Symbol
-        What becomes zero.
-
-    Returns
-    -------
-    sympy.Expr or None
-        None when the value is not finite or not real.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> at_zero(sp.cos(x), x), at_zero(1 / x, x)
-    (1, None)
-    """
+    """Value where a variable is zero."""
     value = expression.subs(variable, 0)
     if value.has(sp.zoo, sp.nan, sp.oo, sp.S.NegativeInfinity, sp.I):
         return None
@@ -45,34 +24,7 @@ def at_zero(expression: sp.Expr, variable: sp.Symbol) -> sp.Expr | None:
 
 
 def secant(expression: sp.Expr, variable: sp.Symbol) -> sp.Expr | None:
-    """Slope of the chord from zero: expression - (its value at zero) = secant * variable.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        A function of the variable and of other symbols.
-    variable : sympy.Symbol
-        The variable.
-
-    Returns
-    -------
-    sympy.Expr or None
-        An expression without a removable singularity where there is a closed form; None where
-        there is none (a jump, erf, a value at zero that is not finite). Products with a factor
-        that is zero at zero are divided through that factor, whatever the other factors do there.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> secant(sp.sin(x), x)
-    sinc(x)
-    >>> secant(sp.sqrt(x + 4), x)
-    1/(sqrt(x + 4) + 2)
-    >>> secant(1 / (x**2 + 10), x)
-    -x/(10*x**2 + 100)
-    >>> secant(sp.sign(x) * sp.sqrt(sp.Abs(x)), x)
-    1/sqrt(Abs(x))
-    """
+    """Slope of the chord from zero: expression - (its value at zero) = secant * variable."""
     if not expression.has(variable):
         return sp.Integer(0)
     if expression == variable:
@@ -96,24 +48,7 @@ def secant(expression: sp.Expr, variable: sp.Symbol) -> sp.Expr | None:
 
 
 def quotients(expression: sp.Expr) -> sp.Expr:
-    """Write sinc, phi1, tanhc and sign as the quotients that they are away from zero, acos by asin.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Any expression.
-
-    Returns
-    -------
-    sympy.Expr
-        Equal wherever no argument of these functions is zero; for zero tests.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> quotients(sp.sinc(2 * x))
-    sin(2*x)/(2*x)
-    """
+    """Write sinc, phi1, tanhc and sign as the quotients that they are off zero, acos by asin."""
     return (
         expression.replace(sp.sinc, lambda a: sp.sin(a) / a)
         .replace(phi1, lambda a: (sp.exp(a) - 1) / a)

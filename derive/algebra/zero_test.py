@@ -10,8 +10,6 @@ import sympy as sp
 
 from obsynth.derive.algebra.secants import quotients
 
-__all__ = ["NUMERIC", "FormProof", "prove_zero"]
-
 Box = Mapping[sp.Symbol, tuple[float, float]]
 NUMERIC = "numerically zero at 60 digits"
 _ORDER = ("syntactic", "expand", "cancel", "simplify", NUMERIC)
@@ -32,13 +30,9 @@ _GRID = 10**6
 class FormProof:
     """Proof that the parts of a form add up to the plant, row by row.
 
-    Attributes
-    ----------
-    rows : tuple of str
-        Names of the rows: states, then outputs.
-    methods : tuple of str
-        How every row was proved: ``"syntactic"``, ``"expand"``, ``"cancel"``, ``"simplify"``, or
-        that it is numerically zero at 60 digits only.
+    rows: names of the rows: states, then outputs
+    methods: how every row was proved: ``"syntactic"``, ``"expand"``, ``"cancel"``, ``"simplify"``,
+        or that it is numerically zero at 60 digits only
     """
 
     rows: tuple[str, ...]
@@ -64,32 +58,7 @@ class FormProof:
 
 
 def prove_zero(expression: sp.Expr, box: Box) -> str:
-    """Prove that an expression is zero, or find that it is not.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Exact, without floating-point numbers.
-    box : mapping of sympy.Symbol to (float, float)
-        Where the symbols live; random points and signs are taken from there. Symbols that are
-        missing are unbounded.
-
-    Returns
-    -------
-    str
-        ``"syntactic"``, ``"expand"``, ``"cancel"`` or ``"simplify"`` for a proof, `NUMERIC` for an
-        expression that vanishes to 60 digits at random points of the box and resisted the proof,
-        empty for one that is not zero. Quotients like sinc(x) = sin(x)/x are compared away from
-        x = 0; what is equal there is equal at x = 0 by continuity.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> prove_zero(sp.cos(12 * x) - 1 + 12 * x * sp.sin(6 * x) * sp.sinc(6 * x), {})
-    'cancel'
-    >>> prove_zero(sp.sqrt(x) - x, {x: (1, 2)})
-    ''
-    """
+    """Prove that an expression is zero, or find that it is not."""
     expression = sp.sympify(expression)
     if expression == 0:
         return "syntactic"

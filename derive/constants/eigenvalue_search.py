@@ -25,8 +25,6 @@ from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.rigour.eigenvalues import UNIT, finite, largest_eigenvalue, perron_bound, rotate
 
-__all__ = ["EIGENVALUE_BUDGETS", "Maximum", "largest_over_box"]
-
 Array = NDArray[np.float64]
 EIGENVALUE_BUDGETS = {"fast": 500, "normal": 20_000, "tight": 400_000}
 _MOST_NUMBERS = 2_000_000
@@ -98,20 +96,7 @@ class _Boxes:
 
 
 def interval_bound(field: SymmetricField, centre: Array, radius: Array) -> Array:
-    """Bound the largest eigenvalue over a batch of interval matrices.
-
-    Parameters
-    ----------
-    field : SymmetricField
-        Its places say which signs are free.
-    centre, radius : ndarray, shape (N, k, k)
-        The intervals.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Upper bounds.
-    """
+    """Bound the largest eigenvalue over a batch of interval matrices."""
     coupled = np.zeros((field.size, field.size), dtype=bool)
     coupled[field.rows, field.columns] = True
     patterns = sign_patterns(coupled | coupled.T, _FEW_SIGNS)
@@ -215,33 +200,7 @@ def largest_over_box(
     rtol: float = 1e-6,
     effort: str = "normal",
 ) -> Maximum:
-    """Bound the largest eigenvalue of a symmetric matrix function over its box.
-
-    Parameters
-    ----------
-    field : SymmetricField
-        The matrices.
-    names : sequence of str
-        Names of the variables.
-    known : float
-        An upper bound that is known already; the search only improves on it.
-    known_method : str
-        Where it comes from.
-    pieces : sequence of (indices, values)
-        Values of some variables that are worth trying together.
-    level : float
-        A value attained elsewhere; a bound below it is good enough.
-    rtol : float
-        Wanted gap, relative to the value or to a thousandth of the largest modulus of an
-        eigenvalue met.
-    effort : {"fast", "normal", "tight"}
-        How many boxes may be spent: 500, 20 000, 400 000.
-
-    Returns
-    -------
-    Maximum
-        Guaranteed bound, attained value and point.
-    """
+    """Bound the largest eigenvalue of a symmetric matrix function over its box."""
     low, high = field.problem.lower, field.problem.upper
     best, where, scale = _sample(field, pieces)
     bounded = bool(np.isfinite(low).all() and np.isfinite(high).all())

@@ -15,15 +15,6 @@ from numpy.typing import NDArray
 
 from obsynth.derive.rigour.eigenvalues import UNIT, largest_eigenvalue, perron_bound
 
-__all__ = [
-    "MOST_SIGNS",
-    "IntervalExtreme",
-    "augment",
-    "eigenvalue_over_interval",
-    "norm_over_interval",
-    "sign_patterns",
-]
-
 Array = NDArray[np.float64]
 MOST_SIGNS = 16
 
@@ -32,17 +23,11 @@ MOST_SIGNS = 16
 class IntervalExtreme:
     """Largest eigenvalue or norm over an interval matrix.
 
-    Attributes
-    ----------
-    upper : float
-        Guaranteed bound for every matrix of the interval.
-    attained : float
-        Guaranteed lower bound of the value at ``matrix``.
-    matrix : ndarray
-        A matrix of the interval where the value is ``attained``.
-    exact : bool
-        True when all sign matrices were looked at, so that only rounding lies between the two;
-        False for the cheap bound, centre plus norm of the radius.
+    upper: guaranteed bound for every matrix of the interval
+    attained: guaranteed lower bound of the value at ``matrix``
+    matrix: A matrix of the interval where the value is ``attained``
+    exact: true when all sign matrices were looked at, so that only rounding lies between the two;
+        False for the cheap bound, centre plus norm of the radius
     """
 
     upper: float
@@ -52,18 +37,7 @@ class IntervalExtreme:
 
 
 def augment(matrix: Array) -> Array:
-    """Return [0 A; A' 0], whose largest eigenvalue is the norm of A.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (..., m, n)
-        One matrix or a batch.
-
-    Returns
-    -------
-    ndarray, shape (..., m + n, m + n)
-        Symmetric.
-    """
+    """Return [0 A; A' 0], whose largest eigenvalue is the norm of A."""
     *front, m, n = matrix.shape
     result = np.zeros((*front, m + n, m + n))
     result[..., :m, m:] = matrix
@@ -72,25 +46,7 @@ def augment(matrix: Array) -> Array:
 
 
 def sign_patterns(coupled: NDArray[np.bool_], most: int = MOST_SIGNS) -> Array | None:
-    """List the sign vectors that can make a difference.
-
-    Parameters
-    ----------
-    coupled : ndarray of bool, shape (k, k)
-        Where the radius is positive; symmetric.
-    most : int
-        Largest number of free signs.
-
-    Returns
-    -------
-    ndarray, shape (2^s, k), or None
-        None when there are more than ``most`` free signs.
-
-    Examples
-    --------
-    >>> len(sign_patterns(np.ones((3, 3), dtype=bool))), len(sign_patterns(np.eye(3, dtype=bool)))
-    (4, 1)
-    """
+    """List the sign vectors that can make a difference."""
     k = len(coupled)
     free: list[int] = []
     seen = np.zeros(k, dtype=bool)
@@ -115,26 +71,8 @@ def sign_patterns(coupled: NDArray[np.bool_], most: int = MOST_SIGNS) -> Array |
 def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
     """Bound the largest eigenvalue of all symmetric matrices of an interval.
 
-    Parameters
-    ----------
-    centre, radius : ndarray, shape (k, k)
-        Symmetric; the interval is centre +- radius, elementwise.
-
-    Returns
-    -------
-    IntervalExtreme
-        By the sign matrices of Hertz; by the cheap bound when more than 16 signs are free.
-
-    References
-    ----------
     D. Hertz, The extreme eigenvalues and stability of real symmetric interval matrices, IEEE
     Transactions on Automatic Control 37(4), 1992.
-
-    Examples
-    --------
-    >>> found = eigenvalue_over_interval(np.zeros((2, 2)), np.array([[0.0, 2.0], [2.0, 0.0]]))
-    >>> round(found.upper, 12), round(found.attained, 12), found.exact
-    (2.0, 2.0, True)
     """
     patterns = sign_patterns(radius > 0.0)
     if patterns is None:
@@ -156,27 +94,9 @@ def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
 def norm_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
     """Bound the norm of all matrices of an interval.
 
-    Parameters
-    ----------
-    centre, radius : ndarray, shape (m, n)
-        The interval is centre +- radius, elementwise.
-
-    Returns
-    -------
-    IntervalExtreme
-        ``matrix`` has the shape of ``centre``.
-
-    References
-    ----------
     J. Rohn, Bounds on eigenvalues of interval matrices, ZAMM 78(S3), 1998; M. Hladik, D. Daney,
     E. Tsigaridas, Bounds on real eigenvalues and singular values of interval matrices, SIAM Journal
     on Matrix Analysis and Applications 31(4), 2010.
-
-    Examples
-    --------
-    >>> found = norm_over_interval(np.zeros((1, 2)), np.array([[3.0, 4.0]]))
-    >>> round(found.upper, 12)
-    5.0
     """
     found = eigenvalue_over_interval(augment(centre), augment(radius))
     return IntervalExtreme(

@@ -17,8 +17,6 @@ from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["InnerBound", "LipschitzConstants", "lipschitz"]
-
 Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 _MOST_VERTICES = 4096

@@ -24,8 +24,6 @@ from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.split import Split
 
-__all__ = ["Majorant", "RowMajorant", "majorant"]
-
 Array = NDArray[np.float64]
 
 

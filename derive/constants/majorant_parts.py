@@ -15,16 +15,6 @@ from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.derive.rigour.numbers import rational
 
-__all__ = [
-    "UP",
-    "RowMajorant",
-    "connected_groups",
-    "is_rounding",
-    "largest_together",
-    "row_majorant",
-    "scaled",
-]
-
 Array = NDArray[np.float64]
 UP = 1.0 + 2.0**-50
 """Covers the rounding of a few operations."""
@@ -108,34 +98,7 @@ def row_majorant(
     rtol: float,
     effort: str,
 ) -> RowMajorant:
-    """Find R of one row: the smallest multiple of a direction, some elements fixed.
-
-    Parameters
-    ----------
-    entries : MatrixEntries
-        Of dg/dx.
-    sizes : ndarray, shape (n,)
-        Guaranteed bounds of the entries of the row.
-    row : int
-        Which row.
-    fixed : mapping of int to float
-        Elements that are given, by column.
-    names : tuple of str
-        Of the states.
-    rtol : float
-        Wanted gap.
-    effort : {"fast", "normal", "tight"}
-        How many boxes may be spent.
-
-    Returns
-    -------
-    RowMajorant
-
-    Raises
-    ------
-    DerivationError
-        Fixed elements that are too small.
-    """
+    """Find R of one row: the smallest multiple of a direction, some elements fixed."""
     chosen = entries.take([k for k, place in enumerate(entries.places) if place[0] == row])
     values = {j: chosen.values[k] for k, (_, j) in enumerate(chosen.places)}
     free = [j for j in values if j not in fixed]

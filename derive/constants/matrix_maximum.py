@@ -13,8 +13,6 @@ from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.rigour.eigenvalues import largest_eigenvalue, perron_bound
 
-__all__ = ["EntryRanges", "Hull", "matrix_maximum"]
-
 Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 _TINY = 1e-13
@@ -24,12 +22,9 @@ _TINY = 1e-13
 class EntryRanges:
     """Guaranteed ranges of the entries of a matrix function, and where they are extreme.
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (m,)
-        The ranges.
-    points_lower, points_upper : ndarray, shape (m, v)
-        Points with values near the ends, in the order of the variables of the entries.
+    lower, upper: the ranges
+    points_lower, points_upper: points with values near the ends, in the order of the variables of
+        the entries
     """
 
     lower: Array
@@ -48,12 +43,8 @@ class EntryRanges:
 class Hull:
     """Matrices whose convex hull holds all values of a matrix function, up to a radius.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (N, n, k)
-        N = 0 where they are not known.
-    radius : ndarray, shape (n, k)
-        Elementwise.
+    vertices: N = 0 where they are not known
+    radius: elementwise
     """
 
     vertices: Array
@@ -97,26 +88,6 @@ def matrix_maximum(
     largest one) do not connect and are added as a perturbation at the end. A block whose entries
     share one row and column has the eigenvalue sqrt(sum of squares), a scalar; the others take the
     smallest of the bounds by sign matrices, by vertices and by branch and bound.
-
-    Parameters
-    ----------
-    entries : MatrixEntries
-        At (row, column) with row <= column.
-    ranges : EntryRanges
-        Their guaranteed ranges.
-    fixed : ndarray, shape (k, k)
-        Symmetric part that does not vary.
-    hull : Hull, optional
-        Symmetric matrices whose hull holds all values.
-    rtol : float
-        Wanted gap.
-    effort : {"fast", "normal", "tight"}
-        How many boxes may be spent.
-
-    Returns
-    -------
-    Maximum
-        Guaranteed from above, attained from below.
     """
     size = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
     largest = max(float(size.max(initial=0.0)), float(np.abs(fixed).max(initial=0.0)))

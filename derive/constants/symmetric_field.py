@@ -10,8 +10,6 @@ from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.rigour.eigenvalues import UNIT
 
-__all__ = ["FieldRange", "SymmetricField"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -20,14 +18,9 @@ Mask = NDArray[np.bool_]
 class FieldRange:
     """What the matrices and their derivatives can be over a batch of boxes.
 
-    Attributes
-    ----------
-    centre, radius : ndarray, shape (N, k, k)
-        The matrices lie within centre +- radius.
-    slope_centre, slope_radius : ndarray, shape (N, v, k, k)
-        So do their partial derivatives.
-    smooth : ndarray of bool, shape (N,)
-        Where the derivatives say how the matrices change over the box.
+    centre, radius: the matrices lie within centre +- radius
+    slope_centre, slope_radius: so do their partial derivatives
+    smooth: where the derivatives say how the matrices change over the box
     """
 
     centre: Array
@@ -41,16 +34,10 @@ class FieldRange:
 class SymmetricField:
     """S(z) = fixed + sum over e of s_e(z) at (row_e, column_e) and its mirror image.
 
-    Attributes
-    ----------
-    problem : Problem
-        The expressions s_e with their gradients and the box.
-    rows, columns : sequence of int
-        Place of every expression, row <= column.
-    fixed : ndarray, shape (k, k)
-        Symmetric part that does not depend on z.
-    lower, upper : ndarray, shape (m,)
-        Guaranteed ranges of the expressions over the whole box.
+    problem: the expressions s_e with their gradients and the box
+    rows, columns: place of every expression, row <= column
+    fixed: symmetric part that does not depend on z
+    lower, upper: guaranteed ranges of the expressions over the whole box
     """
 
     problem: Problem
@@ -80,18 +67,7 @@ class SymmetricField:
         return np.moveaxis(result, (0, 1), (-2, -1))
 
     def over(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Enclose the matrices over boxes.
-
-        Parameters
-        ----------
-        lower, upper : ndarray, shape (v, N)
-            The boxes.
-
-        Returns
-        -------
-        centre, radius : ndarray, shape (N, k, k)
-            Radius infinite where nothing is known.
-        """
+        """Enclose the matrices over boxes."""
         m = len(self.rows)
         found = enclose(self.problem.program, lower, upper, range(m), 0)
         return self._matrices(found.lower, found.upper)
@@ -109,18 +85,7 @@ class SymmetricField:
         return centre, radius + 2.0 * UNIT * (np.abs(centre) + np.abs(self.fixed))
 
     def with_slopes(self, lower: Array, upper: Array) -> FieldRange:
-        """Enclose matrices and derivatives over boxes.
-
-        Parameters
-        ----------
-        lower, upper : ndarray, shape (v, N)
-            The boxes.
-
-        Returns
-        -------
-        FieldRange
-            Derivatives of structurally independent entries are zero.
-        """
+        """Enclose matrices and derivatives over boxes."""
         problem, m = self.problem, len(self.rows)
         used = sorted({k for k in problem.gradient.ravel().tolist() if k >= 0})
         found = enclose(problem.program, lower, upper, [*range(m), *used], m)

@@ -12,33 +12,6 @@ import numpy as np
 
 from obsynth.derive.rigour.interval import Array, Interval, Mask, absolute, hull, negate, up, widen
 
-__all__ = [
-    "ULPS",
-    "arctangent2",
-    "boundary_weight",
-    "ceiling",
-    "conjunction",
-    "copysign",
-    "cosh",
-    "cosine",
-    "disjunction",
-    "equal",
-    "floor",
-    "hypotenuse",
-    "if_else_zero",
-    "increasing",
-    "less",
-    "less_equal",
-    "logical_not",
-    "power",
-    "power_const",
-    "remainder",
-    "select",
-    "sign",
-    "sine",
-    "tangent",
-]
-
 ULPS = 8
 _HALF_PI = 0.5 * np.pi
 _TWO_PI = 2.0 * np.pi
@@ -51,22 +24,7 @@ def increasing(
     top: float = np.inf,
     domain: tuple[float, float] = (-np.inf, np.inf),
 ) -> Callable[[Interval], Interval]:
-    """Make the range rule of an increasing function.
-
-    Parameters
-    ----------
-    function : callable
-        Vectorised, accurate to `ULPS` units in the last place.
-    bottom, top : float
-        Bounds of the function itself, which rounding must not leave.
-    domain : (float, float)
-        Where it is defined; an operand that reaches outside gives nothing.
-
-    Returns
-    -------
-    callable
-        From intervals to intervals.
-    """
+    """Make the range rule of an increasing function. Shapes: domain (float, float)."""
 
     def rule(a: Interval) -> Interval:
         lo, hi = widen((function(a[0]), function(a[1])), ULPS)

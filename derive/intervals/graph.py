@@ -10,8 +10,6 @@ import numpy as np
 from obsynth.derive.intervals.rules import COMMUTATIVE, RULES
 from obsynth.derive.rigour.interval import Array, Interval, point
 
-__all__ = ["Graph", "Node"]
-
 _RATIONAL: dict[str, Callable[..., Fraction]] = {
     "add": lambda a, b: a + b,
     "subtract": lambda a, b: a - b,
@@ -32,14 +30,9 @@ class Node:
 class Graph:
     """Nodes in an order in which they can be evaluated, and the values of the constant ones.
 
-    Attributes
-    ----------
-    nodes : list of Node
-        Operands always precede their node.
-    constants : dict of int to Interval
-        Nodes that do not depend on the box, already evaluated.
-    memory : dict
-        What rewrites remember of nodes.
+    nodes: operands always precede their node
+    constants: nodes that do not depend on the box, already evaluated
+    memory: what rewrites remember of nodes
     """
 
     nodes: list[Node] = field(default_factory=list)

@@ -25,33 +25,12 @@ from obsynth.derive.intervals.rewriting.rewrites import REWRITES
 from obsynth.derive.intervals.rules import JUMPS, NAMES, PARTIAL
 from obsynth.derive.intervals.schedule import Schedule
 
-__all__ = ["CONSTANT_ULPS", "Program", "constant_interval"]
-
 CONSTANT_ULPS = 4
 _SIGNIFICANT_BITS = 24
 
 
 def constant_interval(value: float) -> tuple[float, float]:
-    """Enclose what a constant of a CasADi expression stands for.
-
-    Parameters
-    ----------
-    value : float
-        The double found in the expression.
-
-    Returns
-    -------
-    (float, float)
-        The number itself when it has at most 24 significant bits, else widened.
-
-    Examples
-    --------
-    >>> constant_interval(0.5)
-    (0.5, 0.5)
-    >>> lo, hi = constant_interval(0.1)
-    >>> lo < 0.1 < hi
-    True
-    """
+    """Enclose what a constant of a CasADi expression stands for."""
     if not math.isfinite(value):
         return (math.nan, math.nan) if math.isnan(value) else (value, value)
     mantissa, _ = math.frexp(value)
@@ -67,15 +46,9 @@ def constant_interval(value: float) -> tuple[float, float]:
 class Program(Graph):
     """A function of a box as a list of interval operations.
 
-    Attributes
-    ----------
-    n_variables : int
-        Number of box variables.
-    outputs : list of int
-        Node of every scalar output, in the order of the function's nonzeros.
+    n_variables: number of box variables
+    outputs: node of every scalar output, in the order of the function's nonzeros
 
-    Notes
-    -----
     Build one with `Program.from_casadi`; evaluate it with
     `obsynth.derive.intervals.evaluate`.
     """
@@ -94,34 +67,7 @@ class Program(Graph):
         function: ca.Function,
         constants: Mapping[int, Sequence[tuple[float, float]]] | None = None,
     ) -> "Program":
-        """Build the program of an SX function.
-
-        Parameters
-        ----------
-        function : casadi.Function
-            SX function with dense inputs; MX functions have to be expanded before.
-        constants : mapping, optional
-            For inputs that are not part of the box: the enclosure of every element.
-            All other inputs, one after the other, are the box variables.
-
-        Returns
-        -------
-        Program
-            With one output per nonzero of the function's outputs.
-
-        Raises
-        ------
-        DerivationError
-            An operation without a range rule, by name.
-
-        Examples
-        --------
-        >>> import casadi as ca
-        >>> x = ca.SX.sym("x")
-        >>> program = Program.from_casadi(ca.Function("f", [x], [x * x + x * x]))
-        >>> [node.op for node in program.nodes]
-        ['input', 'power_int', 'twice']
-        """
+        """Build the program of an SX function."""
         given = dict(constants or {})
         arguments: list[list[int]] = []
         program = cls()
@@ -140,25 +86,7 @@ class Program(Graph):
         return self.append(Node("input", (), number))
 
     def insert(self, function: ca.Function, arguments: Sequence[Sequence[int]]) -> list[int]:
-        """Add what an SX function computes from nodes.
-
-        Parameters
-        ----------
-        function : casadi.Function
-            SX function with dense inputs.
-        arguments : sequence of sequence of int
-            For every input, the nodes of its elements.
-
-        Returns
-        -------
-        list of int
-            One node per nonzero of the outputs.
-
-        Raises
-        ------
-        DerivationError
-            An operation without a range rule, by name.
-        """
+        """Add what an SX function computes from nodes."""
         work: dict[int, int] = {}
         results: dict[tuple[int, int], int] = {}
         for k in range(function.n_instructions()):
@@ -189,18 +117,7 @@ class Program(Graph):
         ]
 
     def live(self, outputs: Sequence[int]) -> list[int]:
-        """List the nodes needed for some outputs, in order; remembered between calls.
-
-        Parameters
-        ----------
-        outputs : sequence of int
-            Positions in ``self.outputs``.
-
-        Returns
-        -------
-        list of int
-            Node numbers in an order in which they can be evaluated.
-        """
+        """List the nodes needed for some outputs, in order; remembered between calls."""
         key = tuple(outputs)
         if key not in self._live:
             needed: set[int] = set()
@@ -215,19 +132,7 @@ class Program(Graph):
         return self._live[key]
 
     def schedule(self, outputs: Sequence[int], judged: int) -> Schedule:
-        """Arrange the nodes needed for some outputs; remembered between calls.
-
-        Parameters
-        ----------
-        outputs : sequence of int
-            Positions in ``self.outputs``.
-        judged : int
-            How many of them, from the first, are asked whether they are rough.
-
-        Returns
-        -------
-        Schedule
-        """
+        """Arrange the nodes needed for some outputs; remembered between calls."""
         key = tuple(outputs), judged
         if key not in self._schedules:
             breaks = [self.breaks(k) for k in outputs[:judged]]
@@ -236,18 +141,7 @@ class Program(Graph):
         return self._schedules[key]
 
     def breaks(self, output: int) -> list[int]:
-        """List the operations under an output that may jump or be undefined.
-
-        Parameters
-        ----------
-        output : int
-            Position in ``self.outputs``.
-
-        Returns
-        -------
-        list of int
-            Node numbers, without those that are constant and without divisions by a number.
-        """
+        """List the operations under an output that may jump or be undefined."""
         if output not in self._breaks:
             self._breaks[output] = [
                 k
@@ -264,19 +158,7 @@ class Program(Graph):
         return bool(lo[0] > 0.0 or hi[0] < 0.0)
 
     def decisive(self, output: int) -> list[int]:
-        """List the nodes under an output without which it has no range, in order.
-
-        Parameters
-        ----------
-        output : int
-            Position in ``self.outputs``.
-
-        Returns
-        -------
-        list of int
-            Node numbers, without constants and without the first operand of every ``meet``,
-            which may be undefined where the second one is not.
-        """
+        """List the nodes under an output without which it has no range, in order."""
         needed: set[int] = set()
         stack = [self.outputs[output]]
         while stack:
@@ -288,17 +170,6 @@ class Program(Graph):
         return sorted(needed)
 
     def support(self, output: int) -> tuple[int, ...]:
-        """List the variables on which an output depends.
-
-        Parameters
-        ----------
-        output : int
-            Position in ``self.outputs``.
-
-        Returns
-        -------
-        tuple of int
-            Indices of box variables, ascending.
-        """
+        """List the variables on which an output depends."""
         found = {self.nodes[k].number for k in self.live([output]) if self.nodes[k].op == "input"}
         return tuple(sorted(found))

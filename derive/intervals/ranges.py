@@ -17,8 +17,6 @@ from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.intervals.search.stages import staged
 from obsynth.derive.rigour.interval import Array
 
-__all__ = ["EFFORTS", "Failure", "Ranges", "Status", "bound_ranges", "make_problem"]
-
 
 class Status(StrEnum):
     """How good a bound is; the value is a sentence for the reader.
@@ -46,14 +44,9 @@ EFFORTS = {
 class Failure:
     """An expression without a finite bound.
 
-    Attributes
-    ----------
-    index : int
-        Which expression.
-    operation : str
-        The first operation without a finite result.
-    lower, upper : ndarray, shape (v,)
-        The sub-box where that happens.
+    index: which expression
+    operation: the first operation without a finite result
+    lower, upper: the sub-box where that happens
     """
 
     index: int

@@ -10,8 +10,6 @@ from obsynth.derive.intervals import functions as fn
 from obsynth.derive.rigour import interval as ar
 from obsynth.derive.rigour.interval import Array, Interval
 
-__all__ = ["COMMUTATIVE", "JUMPS", "NAMES", "PARTIAL", "RULES", "uncertain"]
-
 
 def _erf(value: Array) -> Array:
     from scipy.special import erf
@@ -172,22 +170,7 @@ JUMPS = frozenset(
 
 
 def uncertain(op: str, result: Interval, operands: list[Interval]) -> NDArray[np.bool_]:
-    """Where an operation may jump or be undefined inside the box.
-
-    Parameters
-    ----------
-    op : str
-        A member of `PARTIAL` or `JUMPS`.
-    result : Interval
-        Its range.
-    operands : list of Interval
-        The ranges it came from.
-
-    Returns
-    -------
-    ndarray of bool
-        True where the derivative says nothing about the change of the value over the box.
-    """
+    """Where an operation may jump or be undefined inside the box."""
     lo, hi = result
     if op in PARTIAL:
         return np.asarray(~(np.isfinite(lo) & np.isfinite(hi)))

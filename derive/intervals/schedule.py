@@ -15,8 +15,6 @@ from obsynth.derive.intervals.graph import Graph
 from obsynth.derive.intervals.rules import PARTIAL, RULES, uncertain
 from obsynth.derive.rigour.interval import Array, Interval, Mask
 
-__all__ = ["Schedule", "Values"]
-
 Rows = slice | NDArray[np.int64]
 
 # Numbers in the working memory of a program, and limits of the boxes done together.
@@ -38,12 +36,8 @@ class _Step:
 class Values:
     """Ranges of the nodes that were asked for, over a batch.
 
-    Attributes
-    ----------
-    table : ndarray, shape (2, n_rows, N)
-        Lower and upper ends.
-    row : dict of int to int
-        Row of every node that was asked for.
+    table: lower and upper ends
+    row: row of every node that was asked for
     """
 
     table: Array
@@ -58,34 +52,11 @@ class Values:
 class Schedule:
     """Order of the nodes behind some outputs.
 
-    Parameters
-    ----------
-    graph : Graph
-        The nodes.
-    live : sequence of int
-        Nodes that are needed, operands first.
-    wanted : sequence of int
-        Nodes whose ranges are asked for.
-    breaks : sequence of sequence of int
-        For every output that is judged, the nodes under it that may jump or be undefined.
-
-    Attributes
-    ----------
-    count : int
-        Number of steps, each of them some calls of NumPy.
-
-    Examples
-    --------
-    >>> from obsynth.derive.intervals.graph import Node
-    >>> graph = Graph()
-    >>> x, y = (graph.append(Node("input", (), k)) for k in (0, 1))
-    >>> squares = [graph.append(Node("power_int", (k,), 2)) for k in (x, y)]
-    >>> total = graph.plain("add", squares)
-    >>> schedule = Schedule(graph, [x, y, *squares, total], [total])
-    >>> schedule.count
-    2
-    >>> schedule.run(np.array([[1.0], [2.0]]), np.array([[2.0], [3.0]])).of(total)
-    (array([5.]), array([13.]))
+    graph: the nodes
+    live: nodes that are needed, operands first
+    wanted: nodes whose ranges are asked for
+    breaks: for every output that is judged, the nodes under it that may jump or be undefined
+    count: number of steps, each of them some calls of NumPy
     """
 
     def __init__(
@@ -137,18 +108,7 @@ class Schedule:
         self._under = [np.array([position[k] for k in some], dtype=np.int64) for some in breaks]
 
     def run(self, lower: Array, upper: Array) -> Values:
-        """Enclose nodes over every box of a batch.
-
-        Parameters
-        ----------
-        lower, upper : ndarray, shape (n_variables, N)
-            The boxes, one per column.
-
-        Returns
-        -------
-        Values
-            With ``nan`` where nothing is known.
-        """
+        """Enclose nodes over every box of a batch."""
         n = lower.shape[1]
         size = min(n, self._block)
         first, second = self._constants.shape[1], self._constants.shape[1] + len(self._inputs)
@@ -172,17 +132,7 @@ class Schedule:
             table[0, step.target], table[1, step.target] = found
 
     def rough(self, values: Values) -> Mask:
-        """Tell where an output may jump or be undefined in a box.
-
-        Parameters
-        ----------
-        values : Values
-            What `run` has found.
-
-        Returns
-        -------
-        ndarray of bool, shape (n_judged, N)
-        """
+        """Tell where an output may jump or be undefined in a box."""
         n = values.table.shape[2]
         result = np.zeros((len(self._under), n), dtype=bool)
         if not len(self._partial) and not self._others:

@@ -8,8 +8,6 @@ from obsynth.derive.intervals.search.batch import RowRanges, Rows
 from obsynth.derive.intervals.search.curvature import Hessians, tangent_rise
 from obsynth.derive.rigour.interval import Array, Mask, up
 
-__all__ = ["concave_bounds"]
-
 _STEPS = 4
 
 
@@ -42,24 +40,6 @@ def concave_bounds(
 
     A concave f lies below every tangent, f(x) <= f(c) + f'(c) (x - c). Whatever c is, the bound
     holds; at the top of the box it is the largest value, up to rounding.
-
-    Parameters
-    ----------
-    rows : Rows
-        Boxes over which the goals are concave in every variable that has width.
-    hessians : Hessians
-        Second derivatives, for the direction of the steps only.
-    start, slope : ndarray, shape (v, N)
-        A point of every box and the gradient there.
-    evaluate : callable
-        Values and gradients at points (rows without width).
-    is_open : callable
-        Whether rows still matter.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Upper bounds.
     """
     bound, index = rows.bound.copy(), np.arange(rows.count)
     at = start

@@ -16,8 +16,6 @@ from obsynth.derive.rigour.numbers import enclose_number
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["JacobianBounds", "jacobian_bounds"]
-
 Array = NDArray[np.float64]
 
 

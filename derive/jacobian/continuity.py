@@ -19,8 +19,6 @@ from obsynth.derive.rigour.numbers import enclose_number, is_zero, substitute
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["refuse_jumps"]
-
 Box = Mapping[sp.Symbol, tuple[float, float]]
 _STEPS = (sp.floor, sp.ceiling, sp.Mod)
 
@@ -30,22 +28,6 @@ def refuse_jumps(model: Plant) -> None:
 
     Every sign, step and piecewise definition has to agree on both sides of its switching surface,
     provably, or the surface has to lie outside the box.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-
-    Raises
-    ------
-    StructureError
-        A jump, or a switching surface on which both sides could not be proved equal; ``row`` and
-        ``surface`` say where.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> refuse_jumps(quadruple_tank())
     """
     kinds = ("x", "u", "d", "f", "w", "p", "rho")
     box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
@@ -70,14 +52,10 @@ def refuse_jumps(model: Plant) -> None:
 class _Switch:
     """Where a row changes its definition, and by what.
 
-    Attributes
-    ----------
-    surface : sympy.Expr
-        Zero on the switching surface.
-    differences : tuple of sympy.Expr
-        The row on one side minus the row on the other, for every pair of sides that may meet.
-    only_where_negative : sympy.Expr or None
-        The surface counts only where this expression is not positive.
+    surface: zero on the switching surface
+    differences: the row on one side minus the row on the other, for every pair of sides that may
+        meet
+    only_where_negative: the surface counts only where this expression is not positive
     """
 
     surface: sp.Expr

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.rigour.numbers import is_zero
 
-__all__ = ["AffineDependence", "entry_name", "find_dependences"]
-
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _RANK_TOLERANCE = 1e-8
@@ -26,25 +24,7 @@ _ROUNDING = 1e-14
 
 
 def entry_name(entry: Entry, name: str = "m") -> str:
-    """Return what an entry is called in texts, counted from 1.
-
-    Parameters
-    ----------
-    entry : (int, int)
-        Row and column, from 0.
-    name : str
-        Letter of the matrix.
-
-    Returns
-    -------
-    str
-        Such as ``m13``, or ``m10,11`` where two digits would be misread.
-
-    Examples
-    --------
-    >>> entry_name((0, 2)), entry_name((9, 10))
-    ('m13', 'm10,11')
-    """
+    """Return what an entry is called in texts, counted from 1. Shapes: entry (int, int)."""
     i, j = entry[0] + 1, entry[1] + 1
     return f"{name}{i}{j}" if max(i, j) < 10 else f"{name}{i},{j}"
 
@@ -144,36 +124,7 @@ def find_dependences(
     variables: Sequence[sp.Symbol],
     name: str = "m",
 ) -> tuple[list[Entry], list[AffineDependence]]:
-    """Split entries into independent ones and ones that depend affinely on them.
-
-    Parameters
-    ----------
-    entries : mapping of (row, column) to sympy.Expr
-        Exact expressions without floating-point numbers.
-    samples : mapping of (row, column) to ndarray, shape (N,)
-        Their values at N points of the box.
-    variables : sequence of sympy.Symbol
-        The variables.
-    name : str
-        How entries are called in texts.
-
-    Returns
-    -------
-    basis : list of (row, column)
-        Entries that are not known to depend on others, in order of rows.
-    dependences : list of AffineDependence
-        One for every other entry, proved.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> at = np.linspace(1, 2, 9)
-    >>> entries = {(0, 0): sp.sin(x), (1, 0): 3 - 2 * sp.sin(x)}
-    >>> samples = {(0, 0): np.sin(at), (1, 0): 3 - 2 * np.sin(at)}
-    >>> basis, found = find_dependences(entries, samples, [x])
-    >>> basis, str(found[0])
-    ([(0, 0)], 'm21 = -2 m11 + 3: both depend on x only; difference proved zero (syntactic)')
-    """
+    """Split entries into independent ones and ones that depend affinely on them."""
     known = set(variables)
     if any(len(values) <= len(entries) for values in samples.values()):
         return sorted(entries), []

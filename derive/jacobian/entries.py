@@ -19,8 +19,6 @@ from obsynth.symbolic.convert import nearest_double, to_sx
 from obsynth.symbolic.parity import ParityError, check_parity, sample_box
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["JacobianEntries", "jacobian_entries", "sample_entries"]
-
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _SAMPLES = 96
@@ -37,26 +35,15 @@ _POINTS = 16
 class JacobianEntries:
     """Entries of the Jacobian that are not structurally zero.
 
-    Attributes
-    ----------
-    places : list of (int, int)
-        Row and column of every entry.
-    values : casadi.SX, shape (m, 1)
-        The entries, with constants as symbols.
-    variables : casadi.SX, shape (v, 1)
-        Variables of the box: all states, and the other signals that occur.
-    names, symbols : tuple of str, list of sympy.Symbol
-        Their names and SymPy symbols.
-    box : ndarray, shape (v, 2)
-        Their ranges.
-    constants : casadi.SX
-        Symbols that stand for numbers.
-    constant_box : list of (float, float)
-        Their enclosures.
-    symbolic : dict of (int, int) to sympy.Expr
-        The entries, exact.
-    quotients : Quotients or None
-        What further symbols in the values stand for.
+    places: row and column of every entry
+    values: the entries, with constants as symbols
+    variables: variables of the box: all states, and the other signals that occur
+    names, symbols: their names and SymPy symbols
+    box: their ranges
+    constants: symbols that stand for numbers
+    constant_box: their enclosures
+    symbolic: the entries, exact
+    quotients: what further symbols in the values stand for
     """
 
     places: list[Entry]
@@ -72,29 +59,7 @@ class JacobianEntries:
 
 
 def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntries:
-    """Collect the entries of a Jacobian that are not structurally zero.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    part : Split or None
-        Its split, for the Jacobian of g in place of that of the right-hand side.
-    wrt : {"states", "inputs"}
-        What to differentiate by.
-
-    Returns
-    -------
-    JacobianEntries
-        Rows with products of sines and cosines are taken in the form with the narrower ranges.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import planar_arm_bias
-    >>> found = jacobian_entries(planar_arm_bias(2), None, "states")
-    >>> found.symbolic[(3, 1)]
-    -dq1**2*cos(q2)
-    """
+    """Collect the entries of a Jacobian that are not structurally zero."""
     kind = {"states": "x", "inputs": "u"}[wrt]
     sx = model.sx(constants="symbol")
     columns = getattr(sx, kind)
@@ -272,25 +237,7 @@ def _is_narrower(one: Array, other: Array) -> bool:
 
 
 def sample_entries(entries: JacobianEntries) -> dict[Entry, Array]:
-    """Evaluate all entries at fixed random points of the box.
-
-    Parameters
-    ----------
-    entries : JacobianEntries
-        The entries.
-
-    Returns
-    -------
-    dict of (int, int) to ndarray, shape (N,)
-        Values at the points where all entries are defined.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import planar_arm_bias
-    >>> found = sample_entries(jacobian_entries(planar_arm_bias(2), None, "states"))
-    >>> bool(np.all(np.abs(found[(3, 1)]) <= 0.25))
-    True
-    """
+    """Evaluate all entries at fixed random points of the box."""
     rng = np.random.default_rng(0)
     lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)
     upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)

@@ -11,8 +11,6 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name
 from obsynth.derive.rigour.numbers import round_number
 
-__all__ = ["AffineFamily", "build_family"]
-
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _UNIT = 2.0**-53
@@ -174,25 +172,7 @@ def build_family(
 ) -> AffineFamily:
     """Assemble the family from independent entries and proved dependences.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Of the matrices.
-    basis : sequence of (row, column)
-        Entries that serve as scalars.
-    dependences : sequence of AffineDependence
-        One for every other entry that is not structurally zero.
-    ranges : mapping
-        Guaranteed range of every basis entry.
-    supports : mapping
-        Names of the variables of every basis entry.
-    name : str
-        How entries are called in labels.
-
-    Returns
-    -------
-    AffineFamily
-        With rounding errors of coefficients and vertices in ``radius``.
+    Shapes: shape (int, int).
     """
     constant, radius = np.zeros(shape), np.zeros(shape)
     directions = np.zeros((len(basis), *shape))

@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
+from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.search.batch import Problem
+from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.rigour.numbers import enclose_number, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
-
-__all__ = ["MatrixEntries", "exact_jacobian", "matrix_entries"]
 
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
@@ -36,24 +35,14 @@ _EXACT_BITS = 24
 class MatrixEntries:
     """Entries that are not identically zero, as functions of the signals they depend on.
 
-    Attributes
-    ----------
-    exact : dict of (row, column) to sympy.Expr
-        Exact expressions, in the order of everything else here.
-    values : casadi.SX, shape (m, 1)
-        The same, with numbers as symbols in ``constants``.
-    variables : casadi.SX, shape (v, 1)
-        Signals that occur; the first state where none does.
-    names, symbols : tuple
-        Their names and SymPy symbols.
-    box : ndarray, shape (v, 2)
-        Their ranges.
-    constants : casadi.SX
-        Symbols that stand for numbers.
-    constant_box : list of (float, float)
-        Their enclosures.
-    model : Plant
-        Whose signals they are.
+    exact: exact expressions, in the order of everything else here
+    values: the same, with numbers as symbols in ``constants``
+    variables: signals that occur; the first state where none does
+    names, symbols: their names and SymPy symbols
+    box: their ranges
+    constants: symbols that stand for numbers
+    constant_box: their enclosures
+    model: whose signals they are
     """
 
     exact: dict[Entry, sp.Expr]
@@ -96,27 +85,7 @@ class MatrixEntries:
         )
 
     def ranges(self, rtol: float, effort: str, what: str = "entry") -> Ranges:
-        """Bound every entry over the box.
-
-        Parameters
-        ----------
-        rtol : float
-            Wanted gap.
-        effort : {"fast", "normal", "tight"}
-            How many boxes may be spent.
-        what : str
-            What an entry is called in messages; row and column follow in brackets.
-
-        Returns
-        -------
-        Ranges
-            All finite.
-
-        Raises
-        ------
-        UnboundedError
-            An entry without a finite bound.
-        """
+        """Bound every entry over the box."""
         found = bound_ranges(
             self.values,
             self.variables,
@@ -176,20 +145,7 @@ class MatrixEntries:
 
 
 def exact_jacobian(split_or_model: Split | Plant) -> sp.Matrix:
-    """Differentiate g of a split, or the right-hand side of a plant, by the states.
-
-    Parameters
-    ----------
-    split_or_model : Split or Plant
-        Where the function comes from.
-
-    Returns
-    -------
-    sympy.Matrix, shape (n, n)
-        Exact, constants as numbers. Where the function has a kink or is written with a sign whose
-        jump cancels, the derivative is the one beside it: right almost everywhere, which is what
-        bounds of a continuous function need.
-    """
+    """Differentiate g of a split, or the right-hand side of a plant, by the states."""
     if isinstance(split_or_model, Split):
         rows, model = split_or_model.g, split_or_model.model
     else:
@@ -202,30 +158,7 @@ def exact_jacobian(split_or_model: Split | Plant) -> sp.Matrix:
 def matrix_entries(
     entries: Mapping[Entry, sp.Expr], model: Plant, more: Sequence[Signal] = ()
 ) -> MatrixEntries:
-    """Prepare exact expressions of a plant's signals for the interval engine.
-
-    Parameters
-    ----------
-    entries : mapping of (row, column) to sympy.Expr
-        Exact expressions; those that are identically zero are left out.
-    model : Plant
-        The signals and their ranges.
-    more : sequence of Signal
-        Further variables that occur, with ranges of their own.
-
-    Returns
-    -------
-    MatrixEntries
-        In the order of rows and columns.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> plant = quadruple_tank()
-    >>> found = matrix_entries({(0, 0): sp.sqrt(2) * plant.x[0].symbol}, plant)
-    >>> found.names, len(found.constant_box)
-    (('h1',), 1)
-    """
+    """Prepare exact expressions of a plant's signals for the interval engine."""
     exact = {
         place: expression
         for place in sorted(entries)

@@ -19,10 +19,8 @@ from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import rational, substitute
 from obsynth.symbolic import Plant, Role, Signal
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Monotone", "with_ranges"]
-
-FloatArray = NDArray[np.float64]
 Signs = NDArray[np.int64]
 
 
@@ -37,18 +35,7 @@ class Piece:
 class Monotone:
     """Signs of slopes of the equations of a plant over its declared ranges.
 
-    Parameters
-    ----------
-    plant : Plant
-        See `with_ranges` for another box.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> box = [(0.0, 1.0)] * 3
-    >>> plant = with_ranges(three_tanks(), box)
-    >>> Monotone(plant).signs(2, plant.x).tolist()
-    [1, 1, -1]
+    plant: see `with_ranges` for another box
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -60,13 +47,7 @@ class Monotone:
             self.rows.append(self._replace(sp.expand(substitute(row, values))))
 
     def signs(self, row: int, signals: Sequence[Signal]) -> Signs:
-        """Return -1, 0 or 1 for the slope of an equation in each signal.
-
-        Raises
-        ------
-        StructureError
-            A slope that has no constant sign over the box; equation and signal are named.
-        """
+        """Return -1, 0 or 1 for the slope of an equation in each signal."""
         found = np.zeros(len(signals), dtype=np.int64)
         for j, signal in enumerate(signals):
             parts = self._parts(self.rows[row], signal.symbol)

@@ -17,8 +17,6 @@ from obsynth.derive.polytopes.support import basis_entries
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["drop_scalars", "principal_family"]
-
 Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 _ROUND = 1.0 + 2.0**-44

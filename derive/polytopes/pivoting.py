@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 
-__all__ = ["Degenerate", "walk_vertices"]
-
 Vector = list[Fraction]
 _STARTS = 24
 
@@ -46,34 +44,7 @@ def _dot(a: Sequence[Fraction], b: Sequence[Fraction]) -> Fraction:
 
 
 def walk_vertices(normals: list[Vector], offsets: Vector) -> dict[tuple[int, ...], Vector]:
-    """List the vertices of {x : normals x <= offsets}.
-
-    Parameters
-    ----------
-    normals : list of list of Fraction, m rows of length n
-        Outer normals.
-    offsets : list of Fraction
-        Right-hand sides.
-
-    Returns
-    -------
-    dict of tuple of int to list of Fraction
-        Exact vertices by the faces on which they lie.
-
-    Raises
-    ------
-    DerivationError
-        The polytope is empty or not bounded.
-    Degenerate
-        More than n faces meet in a vertex.
-
-    Examples
-    --------
-    >>> one, zero = Fraction(1), Fraction(0)
-    >>> corners = walk_vertices([[one, zero], [zero, one], [-one, -one]], [one, one, one])
-    >>> sorted([float(v) for v in corner] for corner in corners.values())
-    [[-2.0, 1.0], [1.0, -2.0], [1.0, 1.0]]
-    """
+    """List the vertices of {x : normals x <= offsets}."""
     start = _start(normals, offsets)
     found: dict[tuple[int, ...], Vector] = {}
     stack = [start]

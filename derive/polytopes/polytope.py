@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.polytopes.pivoting import Degenerate, walk_vertices
 
-__all__ = ["Label", "Polytope", "polytope_from_halfspaces", "polytope_from_vertices"]
-
 Array = NDArray[np.float64]
 # Faces are moved outwards by so much of the size, each by a different multiple, until no more than
 # n of them meet in a vertex.
@@ -19,13 +17,7 @@ _NUDGES = (2.0**-44, 2.0**-40, 2.0**-34)
 
 
 class Label(StrEnum):
-    """What a polytope says about the set it stands for; the value is a sentence for the reader.
-
-    Examples
-    --------
-    >>> print(Label.OUTER)
-    outer: holds the set, with proof, and may be larger
-    """
+    """What a polytope says about the set it stands for; the value is a sentence for the reader."""
 
     EXACT = "exact: the hull of the set, up to the tolerance of its ranges"
     OUTER = "outer: holds the set, with proof, and may be larger"
@@ -79,13 +71,7 @@ class Polytope:
 
 
 def hull_volume(points: Array) -> float:
-    """Return the volume of the hull of points, 0 when it is flat.
-
-    Examples
-    --------
-    >>> hull_volume(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]]))
-    1.0
-    """
+    """Return the volume of the hull of points, 0 when it is flat."""
     if points.shape[1] == 1:
         return float(np.ptp(points[:, 0])) if len(points) else 0.0
     from scipy.spatial import ConvexHull, QhullError

@@ -14,8 +14,6 @@ from obsynth.derive.polytopes.support import basis_entries, scalar_values
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["SampledHull", "sampled_hull"]
-
 Array = NDArray[np.float64]
 _MOST_SCALARS = 6
 
@@ -27,16 +25,10 @@ class SampledHull:
     No design takes this type: between the samples, and in the corners of the box that they missed,
     the Jacobian may lie outside.
 
-    Attributes
-    ----------
-    matrices : ndarray, shape (N, n, k)
-        Jacobians at the samples that are corners of the hull.
-    scalars : ndarray, shape (N, K)
-        Their scalars.
-    label : Label
-        Always SAMPLED.
-    samples : int
-        How many points were looked at.
+    matrices: jacobians at the samples that are corners of the hull
+    scalars: their scalars
+    label: always SAMPLED
+    samples: how many points were looked at
     """
 
     matrices: Array

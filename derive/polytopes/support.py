@@ -31,15 +31,6 @@ from obsynth.derive.polytopes.thinning import thin
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-__all__ = [
-    "Group",
-    "JacobianPolytope",
-    "basis_entries",
-    "groups_of",
-    "jacobian_polytope",
-    "scalar_values",
-]
-
 Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _UNIT = 2.0**-53
@@ -55,18 +46,12 @@ _SPACE = tuple(d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0))
 class Group:
     """Scalars of a family that share variables, and the polytope in which they lie.
 
-    Attributes
-    ----------
-    scalars : tuple of int
-        Positions in the family.
-    places : tuple of (row, column)
-        The entries they are.
-    polytope : Polytope
-        Holds every combination that occurs.
-    label : Label
-        EXACT for a single scalar with a tight range, OUTER for others.
-    attained : ndarray, shape (N, K)
-        Combinations that occur, up to rounding: the polytope can be no smaller than their hull.
+    scalars: positions in the family
+    places: the entries they are
+    polytope: holds every combination that occurs
+    label: EXACT for a single scalar with a tight range, OUTER for others
+    attained: combinations that occur, up to rounding: the polytope can be no smaller than their
+        hull
     """
 
     scalars: tuple[int, ...]
@@ -201,22 +186,7 @@ class JacobianPolytope:
 
 
 def groups_of(supports: Sequence[Sequence[str]]) -> list[tuple[int, ...]]:
-    """Join scalars that share variables, directly or through others.
-
-    Parameters
-    ----------
-    supports : sequence of sequence of str
-        Variables of every scalar.
-
-    Returns
-    -------
-    list of tuple of int
-
-    Examples
-    --------
-    >>> groups_of([("x",), ("y", "z"), ("u",), ("z",)])
-    [(0,), (1, 3), (2,)]
-    """
+    """Join scalars that share variables, directly or through others."""
     groups: list[tuple[set[str], list[int]]] = []
     for k, names in enumerate(supports):
         joined, members = set(names), [k]
@@ -309,22 +279,7 @@ def _radius(family: AffineFamily, groups: Sequence[Group]) -> Array:
 
 
 def scalar_values(entries: JacobianEntries, places: Sequence[Entry], points: Array) -> Array:
-    """Evaluate entries at points of the box, in doubles.
-
-    Parameters
-    ----------
-    entries : JacobianEntries
-        The entries.
-    places : sequence of (row, column), length K
-        Which of them.
-    points : ndarray, shape (N, v)
-        Points, in the order of the entries' variables.
-
-    Returns
-    -------
-    ndarray, shape (M, K)
-        One row per point at which all of them are defined.
-    """
+    """Evaluate entries at points of the box, in doubles."""
     columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
     expressions = ca.vertcat(*[columns[place] for place in places])
     if entries.quotients is not None:
@@ -336,17 +291,7 @@ def scalar_values(entries: JacobianEntries, places: Sequence[Entry], points: Arr
 
 
 def basis_entries(bounds: JacobianBounds) -> list[Entry]:
-    """List the entries that are the scalars of a family, in its order.
-
-    Parameters
-    ----------
-    bounds : JacobianBounds
-        Bounds with their family.
-
-    Returns
-    -------
-    list of (row, column)
-    """
+    """List the entries that are the scalars of a family, in its order."""
     dependent = {d.entry for d in bounds.dependences}
     found = []
     for direction in bounds.family.directions:

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from obsynth.derive.polytopes.polytope import hull_volume
 
-__all__ = ["corners", "thin"]
-
 Array = NDArray[np.float64]
 _NOTHING = 1e-9
 # Polygons of up to so many faces are searched for among all of them.
@@ -17,29 +15,7 @@ _EXHAUSTIVE = 4
 
 
 def corners(normals: Array, offsets: Array, inside: Array) -> Array | None:
-    """Approximate vertices of a polytope around a point, None if it is not bounded.
-
-    Parameters
-    ----------
-    normals : ndarray, shape (m, n)
-        Outer normals.
-    offsets : ndarray, shape (m,)
-        Right-hand sides.
-    inside : ndarray, shape (n,)
-        A point in the inside.
-
-    Returns
-    -------
-    ndarray, shape (N, n) or None
-
-    Examples
-    --------
-    >>> square = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    >>> len(corners(square, np.ones(4), np.zeros(2)))
-    4
-    >>> corners(square[:3], np.ones(3), np.zeros(2)) is None
-    True
-    """
+    """Approximate vertices of a polytope around a point, None if it is not bounded."""
     from scipy.spatial import ConvexHull, QhullError
 
     room = offsets - normals @ inside
@@ -60,30 +36,7 @@ def corners(normals: Array, offsets: Array, inside: Array) -> Array | None:
 
 
 def thin(normals: Array, offsets: Array, inside: Array, most: int | None = None) -> list[int]:
-    """Choose the faces that matter.
-
-    Parameters
-    ----------
-    normals : ndarray, shape (m, n)
-        Outer normals, scaled to similar lengths.
-    offsets : ndarray, shape (m,)
-        Right-hand sides.
-    inside : ndarray, shape (n,)
-        A point in the inside.
-    most : int, optional
-        Largest number of vertices; by default only faces go that cut off next to nothing.
-
-    Returns
-    -------
-    list of int
-        Faces to keep, ascending; those left bound a polytope that holds the original one.
-
-    Examples
-    --------
-    >>> faces = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0]])
-    >>> thin(faces, np.array([1.0, 1.0, 1.0, 1.0, 2.0]), np.zeros(2))
-    [0, 1, 2, 3]
-    """
+    """Choose the faces that matter."""
     kept = list(range(len(offsets)))
     points = corners(normals, offsets, inside)
     if points is None:

@@ -16,8 +16,6 @@ from obsynth.derive.rigour.interval import Interval, add, multiply
 from obsynth.symbolic.discretise import check_method, sampling_time
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["discretisation_remainder"]
-
 Array = NDArray[np.float64]
 _ORDER = {"euler": 2, "rk4": 5}
 _RANDOM = 32

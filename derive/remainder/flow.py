@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.ranges import EFFORTS, make_problem
+from obsynth.derive.intervals.ranges import EFFORTS
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.branch import maximise
+from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.remainder.system import System
-
-__all__ = ["FlowError", "flow_box", "flow_tubes"]
 
 Array = NDArray[np.float64]
 _ATTEMPTS = 40
@@ -32,35 +31,6 @@ def flow_box(dynamics: System, step: float) -> tuple[Array, Array]:
     first through the upper face of state i would have spent the time since it last was at the
     upper face of the box inside that slab, and would not have come far enough. Only rates on the
     slabs count, so that a box into which the flow points hardly grows.
-
-    Parameters
-    ----------
-    dynamics : System
-        The plant with its box.
-    step : float
-        Length of the step, an upper bound of it.
-
-    Returns
-    -------
-    lower, upper : ndarray, shape (n,)
-        The enclosure.
-
-    Raises
-    ------
-    FlowError
-        The rates are unbounded next to the box or grow faster than the candidate does.
-
-    Examples
-    --------
-    >>> from obsynth.derive.remainder.system import system
-    >>> from obsynth.symbolic import Plant
-    >>> plant = Plant("growth")
-    >>> (x,) = plant.states("x", range=(1, 2))
-    >>> plant.dynamics([x]); plant.outputs([x])
-    ('y1',)
-    >>> lower, upper = flow_box(system(plant), 0.1)
-    >>> bool(lower[0] < 1.0), bool(2 * np.exp(0.1) < upper[0] < 2.25)
-    (True, True)
     """
     n = len(dynamics.names)
     low, high = dynamics.lower[:n], dynamics.upper[:n]
@@ -121,25 +91,7 @@ def _failure(dynamics: System, row: int, bottom: Array, top: Array, step: float)
 def flow_tubes(
     dynamics: System, first: Array, last: Array, held: Array, step: float
 ) -> tuple[Array, Array]:
-    """Enclose the solutions over one step from every small box of a batch.
-
-    Parameters
-    ----------
-    dynamics : System
-        The plant.
-    first, last : ndarray, shape (n, N)
-        Lower and upper ends of the starting states.
-    held : ndarray, shape (n_v, N)
-        Held signals.
-    step : float
-        Length of the step.
-
-    Returns
-    -------
-    lower, upper : ndarray, shape (n, N)
-        By the theorem of Picard and Lindeloef: start + [0, step] f(Y) inside Y. Infinite where
-        no Y was found.
-    """
+    """Enclose the solutions over one step from every small box of a batch."""
     program = dynamics.program(dynamics.rhs)
     others = np.vstack([held, np.zeros((1, first.shape[1]))])
     margin = 1e-12 * np.maximum(np.abs(first), np.abs(last)) + 1e-300

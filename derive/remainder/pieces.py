@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
 
-__all__ = ["PIECES", "hull_over_pieces", "plan_cuts"]
-
 Array = NDArray[np.float64]
 PIECES = {"fast": 256, "normal": 4096, "tight": 65536}
 
@@ -21,34 +19,7 @@ PIECES = {"fast": 256, "normal": 4096, "tight": 65536}
 def hull_over_pieces(
     program: Program, box: Array, pieces: int, cuts: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
-    """Enclose all outputs of a program over a box.
-
-    Parameters
-    ----------
-    program : Program
-        The function.
-    box : ndarray, shape (v, 2)
-        Finite.
-    pieces : int
-        How many pieces to make.
-    cuts : sequence of int, optional
-        Variables to halve one after the other; by default `plan_cuts` of the box.
-
-    Returns
-    -------
-    lower, upper : ndarray, shape (n_outputs,)
-        Infinite where a piece has no finite bound.
-
-    Examples
-    --------
-    >>> import casadi as ca
-    >>> x = ca.SX.sym("x")
-    >>> program = Program.from_casadi(ca.Function("f", [x], [x - x**2]))
-    >>> for count in (1, 64):
-    ...     hull_over_pieces(program, np.array([[0.0, 1.0]]), count)[1].round(2).tolist()
-    [1.0]
-    [0.27]
-    """
+    """Enclose all outputs of a program over a box."""
     lower, upper = box[:, :1].copy(), box[:, 1:].copy()
     for axis in plan_cuts(program, box, pieces) if cuts is None else cuts:
         lower, upper = _halve(lower, upper, axis)
@@ -61,20 +32,6 @@ def plan_cuts(program: Program, box: Array, pieces: int) -> list[int]:
 
     Every variable is halved once for a trial; the cuts go where they promise most, each one half
     of what the one before it gave.
-
-    Parameters
-    ----------
-    program : Program
-        The function.
-    box : ndarray, shape (v, 2)
-        Finite.
-    pieces : int
-        How many pieces the cuts may make.
-
-    Returns
-    -------
-    list of int
-        Variables, one per cut.
     """
     used = sorted({j for k in range(len(program.outputs)) for j in program.support(k)})
     axes = [j for j in used if box[j, 1] > box[j, 0]]

@@ -11,8 +11,6 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Remainder"]
-
 Array = NDArray[np.float64]
 
 

@@ -16,8 +16,6 @@ from obsynth.derive.rigour.numbers import enclose_number
 from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["System", "step_derivatives", "system", "time_derivatives"]
-
 Array = NDArray[np.float64]
 _HELD = ("u", "d", "f", "w", "p", "rho")
 
@@ -26,20 +24,12 @@ _HELD = ("u", "d", "f", "w", "p", "rho")
 class System:
     """dx/dt = f(x, v) with v held over a step.
 
-    Attributes
-    ----------
-    x, v, s : casadi.SX
-        States, held signals that occur, and the time within a step.
-    rhs : casadi.SX
-        f.
-    names, held : tuple of str
-        Names of states and held signals.
-    lower, upper : ndarray, shape (n + n_v,)
-        The box.
-    constants : casadi.SX
-        Constants of the plant.
-    constant_box : list of (float, float)
-        Their enclosures.
+    x, v, s: states, held signals that occur, and the time within a step
+    rhs: f
+    names, held: names of states and held signals
+    lower, upper: the box
+    constants: constants of the plant
+    constant_box: their enclosures
     """
 
     x: ca.SX
@@ -71,13 +61,7 @@ class System:
         return Program.from_casadi(function, {1: self.constant_box})
 
     def ranges(self, column: ca.SX, box: Array, what: str, rtol: float, effort: str) -> Ranges:
-        """Bound one expression per state over a box.
-
-        Raises
-        ------
-        UnboundedError
-            A row without a finite bound, by the name of its state.
-        """
+        """Bound one expression per state over a box."""
         found = bound_ranges(
             column,
             self.variables,
@@ -117,27 +101,7 @@ class System:
 
 
 def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None) -> System:
-    """Read a continuous plant.
-
-    Parameters
-    ----------
-    plant : Plant
-        Continuous, complete.
-    ranges : mapping of str to (lower, upper), optional
-        Ranges in place of the declared ones, by signal.
-
-    Returns
-    -------
-    System
-        With the held signals that occur in the dynamics.
-
-    Raises
-    ------
-    DerivationError
-        A discrete plant, a name that is no signal, a range out of order.
-    UnboundedError
-        A signal of the dynamics without a finite range.
-    """
+    """Read a continuous plant."""
     if plant.check().Ts is not None:
         raise DerivationError(
             f"plant {plant.name!r} is discrete (Ts = {plant.Ts:g} s); the remainder belongs to the "
@@ -194,30 +158,7 @@ def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None
 
 
 def time_derivatives(dynamics: System, order: int) -> list[ca.SX]:
-    """Form the derivatives of a solution by time, as functions of the state: f, J f, J(J f) f, ...
-
-    Parameters
-    ----------
-    dynamics : System
-        The plant.
-    order : int
-        Highest derivative.
-
-    Returns
-    -------
-    list of casadi.SX
-        Entry k - 1 is the k-th derivative.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic import Plant
-    >>> plant = Plant("decay")
-    >>> (x,) = plant.states("x", range=(1, 2))
-    >>> plant.dynamics([-x]); plant.outputs([x])
-    ('y1',)
-    >>> time_derivatives(system(plant), 2)
-    [SX((-x)), SX(x)]
-    """
+    """Form the time derivatives of a solution as functions of the state: f, J f, J(J f) f, ..."""
     found = [dynamics.rhs]
     for _ in range(order - 1):
         found.append(ca.cse(ca.jtimes(found[-1], dynamics.x, dynamics.rhs)))
@@ -225,22 +166,7 @@ def time_derivatives(dynamics: System, order: int) -> list[ca.SX]:
 
 
 def step_derivatives(dynamics: System, method: str, order: int) -> list[ca.SX]:
-    """Form the derivatives of a method's step by its length s, as functions of x and s.
-
-    Parameters
-    ----------
-    dynamics : System
-        The plant.
-    method : {"euler", "rk4"}
-        The method.
-    order : int
-        Highest derivative.
-
-    Returns
-    -------
-    list of casadi.SX
-        Entry k - 1 is the k-th derivative at length s.
-    """
+    """Form the derivatives of a method's step by its length s, as functions of x and s."""
     if method == "euler":
         return [dynamics.rhs] + [ca.SX.zeros(dynamics.x.numel())] * (order - 1)
     rates = ca.Function("rates", [dynamics.x, dynamics.v, dynamics.constants], [dynamics.rhs])

@@ -16,8 +16,6 @@ from typing import Any
 
 import casadi as ca
 
-__all__ = ["TABLEAUS", "Tree", "difference_term", "trees"]
-
 Tree = tuple[Any, ...]
 
 _HALF = Fraction(1, 2)
@@ -37,22 +35,7 @@ TABLEAUS: dict[str, tuple[list[list[Fraction]], list[Fraction]]] = {
 
 
 def trees(order: int) -> list[Tree]:
-    """List the rooted trees with a number of nodes.
-
-    Parameters
-    ----------
-    order : int
-        Number of nodes, at least 1.
-
-    Returns
-    -------
-    list of Tree
-
-    Examples
-    --------
-    >>> [len(trees(k)) for k in range(1, 8)]
-    [1, 1, 2, 4, 9, 20, 48]
-    """
+    """List the rooted trees with a number of nodes."""
     if order == 1:
         return [()]
     found: set[Tree] = set()
@@ -141,28 +124,7 @@ class _Differentials:
 
 
 def difference_term(x: ca.SX, rhs: ca.SX, method: str, order: int) -> ca.SX:
-    """D_k - S_k at s = 0: derivative of the solution minus derivative of the step.
-
-    Parameters
-    ----------
-    x, rhs : casadi.SX
-        States and right-hand side.
-    method : {"euler", "rk4"}
-        The method.
-    order : int
-        k; zero up to the order of the method.
-
-    Returns
-    -------
-    casadi.SX
-        One expression per state.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x")
-    >>> difference_term(x, -x, "rk4", 4), difference_term(x, -x, "rk4", 5)
-    (SX(00), SX((-x)))
-    """
+    """D_k - S_k at s = 0: derivative of the solution minus derivative of the step."""
     differentials = _Differentials(x, rhs)
     total = ca.SX(rhs.numel(), 1)
     for tree in trees(order):

@@ -16,8 +16,6 @@ from obsynth.derive.remainder.trees import difference_term
 from obsynth.derive.rigour.interval import Interval, add, multiply, subtract
 from obsynth.derive.rigour.numbers import enclose_number
 
-__all__ = ["Work", "step_factor"]
-
 Array = NDArray[np.float64]
 _QUARTERS = 4
 _PARTS = 16
@@ -27,27 +25,7 @@ _ZERO, _ONE = sp.Integer(0), sp.Integer(1)
 def step_factor(
     Ts: sp.Expr, order: int, first: sp.Expr = _ZERO, last: sp.Expr = _ONE
 ) -> tuple[float, float]:
-    """Enclose the integral of (Ts - s)^(order - 1) / (order - 1)! over a part of the step.
-
-    Parameters
-    ----------
-    Ts : sympy.Expr
-        Sampling time.
-    order : int
-        Power.
-    first, last : sympy.Expr
-        Ends of the part, as shares of the step; the whole step gives Ts^order / order!.
-
-    Returns
-    -------
-    (float, float)
-        Equal ends when the number is a double.
-
-    Examples
-    --------
-    >>> step_factor(sp.Rational(1, 2), 2)
-    (0.125, 0.125)
-    """
+    """Enclose the integral of (Ts - s)^(order - 1) / (order - 1)! over a part of the step."""
     weight = (1 - first) ** order - (1 - last) ** order
     return enclose_number(Ts**order * weight / sp.factorial(order))
 
@@ -60,18 +38,11 @@ def _interval(pair: tuple[float, float]) -> Interval:
 class Work:
     """One plant, method and step, with the box that solutions stay in until every quarter.
 
-    Attributes
-    ----------
-    dynamics : System
-        The plant.
-    method : str
-        The method.
-    Ts : sympy.Expr
-        Sampling time.
-    flows : list of (lower, upper)
-        Flow boxes until the end of every quarter of the step.
-    effort : {"fast", "normal", "tight"}
-        How many pieces hulls are made of.
+    dynamics: the plant
+    method: the method
+    Ts: sampling time
+    flows: flow boxes until the end of every quarter of the step
+    effort: how many pieces hulls are made of
     """
 
     dynamics: System
@@ -164,20 +135,7 @@ class Work:
         return found
 
     def attained(self, points: Array, order: int) -> Interval:
-        """Enclose the remainder at points, by the leading terms and a tail over their solutions.
-
-        Parameters
-        ----------
-        points : ndarray, shape (n + n_v, N)
-            States and held signals, inside the box.
-        order : int
-            Order of the method's error.
-
-        Returns
-        -------
-        Interval
-            Shapes (n, N); the whole line where the solution or the step may meet a kink.
-        """
+        """Enclose the remainder at points, by the leading terms and a tail over their solutions."""
         dynamics, level = self.dynamics, order + 2
         n, count = len(dynamics.names), points.shape[1]
         lower, upper = points[:n], points[:n]

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.derive.rigour.enclosure import UNIT_ROUNDOFF, Enclosure, gamma_bound
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["ProofResult", "prove_positive_definite"]
-
 # Generous bound on all underflow errors of one factorisation of a matrix scaled to a unit
 # diagonal: n (n + 2) 2^-1074 and the same again for the scaling.
 _UNDERFLOW = 1e-290
@@ -34,14 +32,9 @@ Matrix = NDArray[np.float64]
 class ProofResult:
     """Which matrices are proved positive definite, and by how much.
 
-    Parameters
-    ----------
-    proved : ndarray of bool, shape (N,)
-        True only where every matrix of the enclosure is positive definite.
-    margin : ndarray, shape (N,)
-        Guaranteed lower bound of the smallest eigenvalue; -inf where nothing is proved.
-    relative : ndarray, shape (N,)
-        The same after scaling the diagonal to about one: compare vertices by this.
+    proved: true only where every matrix of the enclosure is positive definite
+    margin: guaranteed lower bound of the smallest eigenvalue; -inf where nothing is proved
+    relative: the same after scaling the diagonal to about one: compare vertices by this
     """
 
     proved: NDArray[np.bool_]
@@ -61,38 +54,7 @@ class ProofResult:
 def prove_positive_definite(
     mid: ArrayLike | Enclosure, rad: ArrayLike = 0.0, *, floor: float = 0.0, sharp: bool = True
 ) -> ProofResult:
-    """Prove that every symmetric matrix within ``rad`` of ``mid`` is positive definite.
-
-    Parameters
-    ----------
-    mid : array_like, shape (n, n) or (N, n, n), or Enclosure
-        Midpoints, or the enclosure itself.
-    rad : array_like, broadcasts to the shape of mid
-        Radii, entry by entry.
-    floor : float
-        Prove that every eigenvalue is above this, not only above zero; not negative.
-    sharp : bool
-        Also search for the largest margin (eigenvalues and a second factorisation, about ten
-        times the work); without it the margin is positive but arbitrarily pessimistic.
-
-    Returns
-    -------
-    ProofResult
-        Matrices with a non-finite entry are not proved.
-
-    Raises
-    ------
-    ObsynthError
-        If a matrix is not square, or so far from symmetric that the radius cannot explain it.
-
-    Examples
-    --------
-    >>> result = prove_positive_definite([[2.0, 1.0], [1.0, 2.0]])
-    >>> result.all_proved, bool(0.99 < result.margin[0] < 1.0)
-    (True, True)
-    >>> prove_positive_definite([[1.0, 1.0], [1.0, 1.0]]).all_proved
-    False
-    """
+    """Prove that every symmetric matrix within ``rad`` of ``mid`` is positive definite."""
     matrices = mid if isinstance(mid, Enclosure) else Enclosure.of(mid, rad)
     if matrices.shape[0] != matrices.shape[1]:
         raise ObsynthError(f"a matrix of shape {matrices.shape} is not square")

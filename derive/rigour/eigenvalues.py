@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UNIT", "Rotation", "finite", "largest_eigenvalue", "perron_bound", "rotate"]
-
 Array = NDArray[np.float64]
 UNIT = 2.0**-53
 # What sums of products may lose to underflow; far below every tolerance.
@@ -33,16 +31,10 @@ def finite(matrices: Array) -> NDArray[np.bool_]:
 class Rotation:
     """A batch of symmetric matrices seen in the basis of their approximate eigenvectors.
 
-    Attributes
-    ----------
-    values : ndarray, shape (N, k)
-        Approximate eigenvalues, ascending.
-    vectors : ndarray, shape (N, k, k)
-        Approximate eigenvectors Q as columns.
-    error : ndarray, shape (N,)
-        Bound of the norm of Q'AQ - diag(values), radius of A included.
-    defect : ndarray, shape (N,)
-        Bound of the norm of Q'Q - I, below 1/2; infinite where LAPACK gave nothing of use.
+    values: approximate eigenvalues, ascending
+    vectors: approximate eigenvectors Q as columns
+    error: bound of the norm of Q'AQ - diag(values), radius of A included
+    defect: bound of the norm of Q'Q - I, below 1/2; infinite where LAPACK gave nothing of use
     """
 
     values: Array
@@ -70,20 +62,7 @@ class Rotation:
 
 
 def rotate(centre: Array, radius: Array) -> Rotation:
-    """Diagonalise a batch of symmetric matrices, with a bound of what is left.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (N, k, k)
-        Symmetric matrices.
-    radius : ndarray, shape (N, k, k)
-        Elementwise uncertainty, symmetric, >= 0.
-
-    Returns
-    -------
-    Rotation
-        Values, vectors and errors.
-    """
+    """Diagonalise a batch of symmetric matrices, with a bound of what is left."""
     count, k = centre.shape[:2]
     usable = finite(centre) & finite(radius)
     safe = np.where(usable[:, None, None], centre, 0.0)
@@ -109,26 +88,7 @@ def rotate(centre: Array, radius: Array) -> Rotation:
 
 
 def largest_eigenvalue(centre: Array, radius: Array | None = None) -> tuple[Array, Array]:
-    """Bound the largest eigenvalue of every matrix of a batch from both sides.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (N, k, k)
-        Symmetric matrices.
-    radius : ndarray, shape (N, k, k), optional
-        Elementwise uncertainty, symmetric: the bounds hold for every symmetric matrix within it.
-
-    Returns
-    -------
-    lower, upper : ndarray, shape (N,)
-        Infinite where an entry is not finite.
-
-    Examples
-    --------
-    >>> lower, upper = largest_eigenvalue(np.array([[[0.0, 1.0], [1.0, 0.0]]]))
-    >>> bool(lower[0] <= 1.0 <= upper[0]), bool(upper[0] - lower[0] < 1e-13)
-    (True, True)
-    """
+    """Bound the largest eigenvalue of every matrix of a batch from both sides."""
     radius = np.zeros_like(centre) if radius is None else radius
     if centre.shape[1] == 0:
         nothing = np.zeros(len(centre))
@@ -153,21 +113,6 @@ def perron_bound(matrix: Array) -> Array:
 
     For every positive vector v it is at most max_i (R v)_i / v_i (Collatz and Wielandt); v is close
     to the eigenvector, so that little is lost.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (N, k, k)
-        Nonnegative, symmetric.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Upper bounds, also of the norm of every matrix with entries no larger in modulus.
-
-    Examples
-    --------
-    >>> round(float(perron_bound(np.array([[[0.0, 3.0], [3.0, 0.0]]]))[0]), 12)
-    3.0
     """
     k = matrix.shape[1]
     usable = finite(matrix)

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["UNIT_ROUNDOFF", "Enclosure", "gamma_bound"]
-
 Matrix = NDArray[np.float64]
 
 UNIT_ROUNDOFF = 2.0**-53
@@ -27,18 +25,7 @@ _UNDERFLOW = 2.0**-1022
 
 
 def gamma_bound(n: int) -> float:
-    """Upper bound of n u / (1 - n u), the relative error of n roundings.
-
-    Parameters
-    ----------
-    n : int
-        Number of roundings, below 2^40.
-
-    Examples
-    --------
-    >>> gamma_bound(10) > 10 * UNIT_ROUNDOFF
-    True
-    """
+    """Upper bound of n u / (1 - n u), the relative error of n roundings."""
     return n * UNIT_ROUNDOFF * (1.0 + 2.0**-10)
 
 
@@ -49,19 +36,8 @@ class Enclosure:
     Numbers and arrays that meet an enclosure count as exact doubles. A leading axis holds one
     matrix per vertex. Entries that overflow become NaN or infinite and prove nothing.
 
-    Parameters
-    ----------
-    mid : ndarray, shape (r, c) or (N, r, c)
-        Midpoints.
-    rad : ndarray, same shape
-        Radii, not negative; one radius for all vertices may be a broadcast view.
-
-    Examples
-    --------
-    >>> tenth = Enclosure.of([[0.1]])
-    >>> total = tenth + tenth + tenth
-    >>> bool(total.rad[0, 0] > 0), total.contains([[0.1 * 3]])
-    (True, True)
+    mid: midpoints
+    rad: radii, not negative; one radius for all vertices may be a broadcast view
     """
 
     mid: Matrix
@@ -89,29 +65,7 @@ class Enclosure:
 
     @classmethod
     def combine(cls, centre: Enclosure, directions: Enclosure, weights: ArrayLike) -> Enclosure:
-        """Enclose ``centre + sum_k weights[i, k] directions[k]`` for every vertex i.
-
-        Parameters
-        ----------
-        centre : Enclosure, shape (r, c)
-            Common to all vertices.
-        directions : Enclosure, shape (K, r, c)
-            One per parameter.
-        weights : array_like, shape (N, K)
-            Exact doubles.
-
-        Returns
-        -------
-        Enclosure, shape (N, r, c)
-            With one radius for all vertices, so that large families stay cheap.
-
-        Examples
-        --------
-        >>> lines = Enclosure.of([[[0.1]], [[0.01]]])
-        >>> family = Enclosure.combine(Enclosure.of([[1.0]]), lines, [[1, 1], [-1, 1]])
-        >>> family.mid.ravel().round(3).tolist()
-        [1.11, 0.91]
-        """
+        """Enclose ``centre + sum_k weights[i, k] directions[k]`` for every vertex i."""
         table = np.asarray(weights, dtype=float)
         count, rows, columns = table.shape[1], *centre.shape
         steps = directions.mid.reshape(count, rows * columns)

@@ -10,34 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.lmi import ExactMatrix
-
-__all__ = [
-    "Exact",
-    "FloatArray",
-    "above",
-    "exact",
-    "from_text",
-    "hull",
-    "inverse",
-    "magnitude",
-    "nearest",
-    "negative",
-    "positive",
-    "to_text",
-]
+from obsynth.symbolic.arrays import FloatArray
 
 Exact = NDArray[np.object_]
-FloatArray = NDArray[np.float64]
 
 
 def exact(values: Any) -> Exact:
-    """Return the rational numbers (`flint.fmpq`) that doubles, fractions or SymPy rationals are.
-
-    Examples
-    --------
-    >>> exact([[0.5, 3]]).tolist()
-    [[1/2, 3]]
-    """
+    """Return the rational numbers (`flint.fmpq`) that doubles, fractions or SymPy rationals are."""
     from flint import fmpq
 
     def read(value: Any) -> Any:
@@ -65,13 +44,7 @@ def _fraction(value: Any) -> Fraction:
 
 
 def nearest(values: Exact) -> FloatArray:
-    """Return the nearest doubles.
-
-    Examples
-    --------
-    >>> nearest(exact([Fraction(1, 3)])).tolist()
-    [0.3333333333333333]
-    """
+    """Return the nearest doubles."""
     result = np.zeros(values.shape)
     for place, value in np.ndenumerate(values):
         result[place] = float(_fraction(value))
@@ -79,13 +52,7 @@ def nearest(values: Exact) -> FloatArray:
 
 
 def above(values: Exact) -> FloatArray:
-    """Return the smallest doubles that are not below the values.
-
-    Examples
-    --------
-    >>> float(above(exact([Fraction(1, 3)]))[0]) > 1 / 3
-    True
-    """
+    """Return the smallest doubles that are not below the values."""
     result = nearest(values)
     for place, value in np.ndenumerate(values):
         if Fraction(float(result[place])) < _fraction(value):
@@ -113,14 +80,7 @@ def negative(matrix: Any) -> Any:
 
 
 def hull(matrix: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
-    """Return the smallest box that holds M a for every a in a box, as (lower, upper).
-
-    Examples
-    --------
-    >>> low, high = hull(np.array([[1.0, -2.0]]), np.array([0.0, 0.0]), np.array([1.0, 1.0]))
-    >>> low.tolist(), high.tolist()
-    ([-2.0], [1.0])
-    """
+    """Return the smallest box that holds M a for every a in a box, as (lower, upper)."""
     plus, minus = positive(matrix), negative(matrix)
     return plus @ lower - minus @ upper, plus @ upper - minus @ lower
 
@@ -138,12 +98,6 @@ def to_text(values: Exact) -> list[Any]:
 
 
 def from_text(nested: Any, shape: tuple[int, ...]) -> Exact:
-    """Read what `to_text` wrote; empty arrays get their shape from the caller.
-
-    Raises
-    ------
-    ValueError
-        If a text is no rational number, or their number does not fit.
-    """
+    """Read what `to_text` wrote; empty arrays get their shape from the caller."""
     flat = np.array(nested, dtype=object).ravel()
     return exact(np.array([Fraction(str(v)) for v in flat], dtype=object).reshape(shape))

@@ -15,23 +15,12 @@ import numpy as np
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["ExactMatrix", "is_positive_definite"]
-
 
 @dataclass(frozen=True, eq=False)
 class ExactMatrix:
     """A rational matrix with the operators of the other arithmetics.
 
-    Parameters
-    ----------
-    entries : flint.fmpq_mat
-        The value; use :meth:`of` to make one from doubles, integers or fractions.
-
-    Examples
-    --------
-    >>> third = ExactMatrix.of([[Fraction(1, 3)]])
-    >>> (3 * third).to_fractions()
-    [[Fraction(1, 1)]]
+    entries: the value; use :meth:`of` to make one from doubles, integers or fractions
     """
 
     entries: Any
@@ -154,28 +143,7 @@ class ExactMatrix:
 
 
 def is_positive_definite(matrix: Any) -> bool:
-    """Decide definiteness exactly, by the signs of the leading minors.
-
-    Parameters
-    ----------
-    matrix : ExactMatrix, or anything :meth:`ExactMatrix.of` takes
-        Square and exactly symmetric.
-
-    Returns
-    -------
-    bool
-        True exactly if x'Ax > 0 for every x other than zero.
-
-    Raises
-    ------
-    ObsynthError
-        If the matrix is not symmetric.
-
-    Examples
-    --------
-    >>> is_positive_definite([[2, 1], [1, 2]]), is_positive_definite([[1, 1], [1, 1]])
-    (True, False)
-    """
+    """Decide definiteness exactly, by the signs of the leading minors."""
     exact = ExactMatrix.of(matrix)
     if exact.shape[0] != exact.shape[1] or exact.entries != exact.entries.transpose():
         raise ObsynthError(f"the exact {exact.shape} matrix is not symmetric")

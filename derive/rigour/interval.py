@@ -15,31 +15,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Array",
-    "Interval",
-    "Mask",
-    "absolute",
-    "add",
-    "divide",
-    "down",
-    "hull",
-    "maximum",
-    "meet",
-    "minimum",
-    "multiply",
-    "negate",
-    "nonnegative",
-    "point",
-    "power_int",
-    "sqrt",
-    "subtract",
-    "twice",
-    "up",
-    "widen",
-    "with_zero",
-]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Interval = tuple[Array, Array]
@@ -49,69 +24,23 @@ _EPS = float(np.finfo(float).eps)
 
 
 def down(value: Array) -> Array:
-    """Step to the next double towards minus infinity.
-
-    Parameters
-    ----------
-    value : ndarray
-        Any shape.
-
-    Returns
-    -------
-    ndarray
-        A lower bound of every real number that rounds to ``value``.
-    """
+    """Step to the next double towards minus infinity."""
     return np.nextafter(value, -_INF)
 
 
 def up(value: Array) -> Array:
-    """Step to the next double towards plus infinity; the counterpart of `down`.
-
-    Parameters
-    ----------
-    value : ndarray
-        Any shape.
-
-    Returns
-    -------
-    ndarray
-        An upper bound of every real number that rounds to ``value``.
-    """
+    """Step to the next double towards plus infinity; the counterpart of `down`."""
     return np.nextafter(value, _INF)
 
 
 def point(value: float) -> Interval:
-    """Make the degenerate interval of a number that is meant as the double it is.
-
-    Parameters
-    ----------
-    value : float
-        The number.
-
-    Returns
-    -------
-    Interval
-        Both ends equal, shape (1,).
-    """
+    """Make the degenerate interval of a number that is meant as the double it is."""
     array = np.array([value], dtype=float)
     return array, array
 
 
 def widen(a: Interval, ulps: int) -> Interval:
-    """Push both ends outwards by a number of units in the last place.
-
-    Parameters
-    ----------
-    a : Interval
-        Ends computed with a known error.
-    ulps : int
-        Error bound of the computation, in units in the last place.
-
-    Returns
-    -------
-    Interval
-        Encloses the exact ends.
-    """
+    """Push both ends outwards by a number of units in the last place."""
     lo, hi = a
     return down(lo - ulps * _EPS * np.abs(lo)), up(hi + ulps * _EPS * np.abs(hi))
 

@@ -8,48 +8,17 @@ import sympy as sp
 
 from obsynth.derive.errors import DerivationError
 
-__all__ = ["enclose_number", "is_zero", "rational", "round_number", "substitute"]
-
 _DIGITS = 60
 
 
 def rational(value: float) -> sp.Rational:
-    """Return the rational number that a double is.
-
-    Parameters
-    ----------
-    value : float
-        A finite double.
-
-    Returns
-    -------
-    sympy.Rational
-        Exactly the same number.
-
-    Examples
-    --------
-    >>> rational(0.75)
-    3/4
-    """
+    """Return the rational number that a double is."""
     fraction = Fraction(float(value))
     return sp.Rational(fraction.numerator, fraction.denominator)
 
 
 def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """Put exact numbers in place of symbols; floats of the user become the rational they are.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Any expression.
-    values : mapping
-        Exact values by symbol.
-
-    Returns
-    -------
-    sympy.Expr
-        Free of the symbols and of floating-point numbers.
-    """
+    """Put exact numbers in place of symbols; floats of the user become the rational they are."""
     result = sp.sympify(expression)
     if present := {s: values[s] for s in result.free_symbols if s in values}:
         result = result.subs(present)
@@ -58,31 +27,7 @@ def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.E
 
 
 def round_number(number: sp.Expr) -> tuple[float, float]:
-    """Round an exact real number to a double, with a bound of the rounding error.
-
-    Parameters
-    ----------
-    number : sympy.Expr
-        A real number: rational, algebraic or built from elementary functions.
-
-    Returns
-    -------
-    (float, float)
-        The double and an upper bound of its distance to the number; 0 when they are equal.
-
-    Raises
-    ------
-    DerivationError
-        The expression is not a finite real number.
-
-    Examples
-    --------
-    >>> round_number(sp.Rational(1, 4))
-    (0.25, 0.0)
-    >>> value, error = round_number(sp.sqrt(2))
-    >>> value, 0 < error < 2.3e-16
-    (1.4142135623730951, True)
-    """
+    """Round an exact real number to a double, with a bound of the rounding error."""
     number = sp.sympify(number)
     if number.is_Rational:
         exact = Fraction(int(number.p), int(number.q))
@@ -98,24 +43,7 @@ def round_number(number: sp.Expr) -> tuple[float, float]:
 
 
 def enclose_number(number: sp.Expr) -> tuple[float, float]:
-    """Enclose an exact real number between doubles.
-
-    Parameters
-    ----------
-    number : sympy.Expr
-        A real number.
-
-    Returns
-    -------
-    (float, float)
-        Equal ends when the number is a double, neighbours otherwise.
-
-    Examples
-    --------
-    >>> lo, hi = enclose_number(sp.Rational(1, 10))
-    >>> rational(lo) < sp.Rational(1, 10) < rational(hi)
-    True
-    """
+    """Enclose an exact real number between doubles."""
     value, error = round_number(number)
     if error == 0.0:
         return value, value
@@ -130,27 +58,7 @@ def _upper(distance: Fraction) -> float:
 
 
 def is_zero(expression: sp.Expr) -> str:
-    """Prove that an expression is identically zero.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Exact expression, without floating-point numbers.
-
-    Returns
-    -------
-    str
-        How it was proved: ``"syntactic"``, ``"expand"``, ``"cancel"`` or ``"simplify"``; empty when
-        no proof was found.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> is_zero((x + 1) ** 2 - x**2 - 2 * x - 1)
-    'expand'
-    >>> is_zero(x - 1)
-    ''
-    """
+    """Prove that an expression is identically zero."""
     expression = sp.sympify(expression)
     if expression == 0:
         return "syntactic"

@@ -12,94 +12,38 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.rigour.enclosure import Enclosure, gamma_bound
 from obsynth.derive.rigour.exact_matrix import ExactMatrix
-
-__all__ = ["TINY", "add_up", "lowered", "nearest", "product_up", "raised"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # Above the underflow of fewer than 2^40 operations, whether or not it is flushed to zero.
 TINY = 2.0**-980
 
 
 def raised(value: FloatArray, roundings: int) -> FloatArray:
-    """Return an upper bound of a nonnegative expression evaluated in doubles.
-
-    Parameters
-    ----------
-    value : ndarray
-        Computed from nonnegative doubles by additions, multiplications and
-        divisions.
-    roundings : int
-        Largest number of roundings that any of its terms has been through.
-
-    Returns
-    -------
-    ndarray
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bool(raised(np.array([0.1 + 0.2]), 1)[0] > 0.1 + 0.2)
-    True
-    """
+    """Return an upper bound of a nonnegative expression evaluated in doubles."""
     # three more: the factor, the product with it and the sum are rounded themselves
     return np.asarray(value * (1.0 + 2.0 * gamma_bound(roundings + 3)) + TINY)
 
 
 def lowered(value: FloatArray, roundings: int) -> FloatArray:
-    """Return a lower bound, not below zero, of such an expression.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bool(lowered(np.array([0.1 + 0.2]), 1)[0] < 0.1 + 0.2)
-    True
-    """
+    """Return a lower bound, not below zero, of such an expression."""
     return np.maximum(value * (1.0 - 2.0 * gamma_bound(roundings + 3)) - TINY, 0.0)
 
 
 def add_up(*terms: FloatArray) -> FloatArray:
-    """Return an upper bound of a sum of nonnegative arrays of one shape.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bool(add_up(np.array([0.1]), np.array([0.2]))[0] > 0.3)
-    True
-    """
+    """Return an upper bound of a sum of nonnegative arrays of one shape."""
     return raised(np.sum(np.stack(terms), axis=0), len(terms))
 
 
 def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return an upper bound of the product of nonnegative matrices.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bool(product_up(np.full((1, 3), 0.1), np.ones((3, 1)))[0, 0] > 0.3)
-    True
-    """
+    """Return an upper bound of the product of nonnegative matrices."""
     return raised(left @ right, left.shape[-1] + 1)
 
 
 def nearest(values: ExactMatrix) -> Enclosure:
-    """Round an exact matrix to doubles and bound what is lost.
-
-    Returns
-    -------
-    Enclosure
-        Its radius is zero where the double is exact.
-
-    Examples
-    --------
-    >>> third = nearest(ExactMatrix.of([[Fraction(1, 2), Fraction(1, 3)]]))
-    >>> float(third.rad[0, 0]), bool(0 < third.rad[0, 1] < 1e-16)
-    (0.0, True)
-    """
+    """Round an exact matrix to doubles and bound what is lost."""
     mid, rad = np.zeros(values.shape), np.zeros(values.shape)
     for i, row in enumerate(values.to_fractions()):
         for j, value in enumerate(row):

@@ -10,13 +10,6 @@ from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
 from obsynth.derive.structure.decoupling import Decoupling, decouple
 
-__all__ = [
-    "Detectability",
-    "augmented_pair",
-    "detectability",
-    "unknown_input_condition",
-]
-
 Array = NDArray[np.float64]
 Modes = NDArray[np.complex128]
 _RANK_TOLERANCE = 1e-9

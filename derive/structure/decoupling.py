@@ -6,13 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
-
-__all__ = ["Decoupling", "decouple"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def _exact(values: Any) -> Any:

@@ -10,8 +10,6 @@ from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
 from obsynth.derive.structure.conditions import augmented_pair, unknown_input_condition
 
-__all__ = ["WeakestMember", "pair_margin", "weakest_member"]
-
 Array = NDArray[np.float64]
 _STARTS = 2
 _RANDOM = 64
@@ -55,28 +53,7 @@ class WeakestMember:
 
 
 def pair_margin(A: Array, C: Array, discrete: bool) -> tuple[float, complex | None]:
-    """Distance of a pair from a hidden mode that does not decay.
-
-    Parameters
-    ----------
-    A, C : ndarray, shapes (n, n), (m, n)
-        The pair.
-    discrete : bool
-        Whether modes decay inside the unit circle or in the left half plane.
-
-    Returns
-    -------
-    margin : float
-        Smallest singular value of the pencil of Popov, Belevitch and Hautus with columns of size
-        one; 1 when every mode decays.
-    mode : complex or None
-        Where.
-
-    Examples
-    --------
-    >>> pair_margin(np.diag([1.0, 0.5]), np.array([[0.0, 1.0]]), discrete=True)
-    (0.0, (1+0j))
-    """
+    """Distance of a pair from a hidden mode that does not decay."""
     margin, where = 1.0, None
     for mode in np.linalg.eigvals(A).tolist():
         stays = abs(mode) >= 1.0 - _MODE_TOLERANCE if discrete else mode.real >= -_MODE_TOLERANCE

@@ -14,8 +14,6 @@ from obsynth.derive.rigour.numbers import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Excitation", "FaultEffect", "excitation"]
-
 _MOST_POINTS = 6
 
 
@@ -23,18 +21,11 @@ _MOST_POINTS = 6
 class FaultEffect:
     """How a fault enters: the derivative of dynamics and outputs by it, at fault zero.
 
-    Attributes
-    ----------
-    fault : str
-        Its name.
-    column : sympy.Matrix, shape (n + m, 1)
-        The derivative, dynamics first.
-    depends_on : tuple of str
-        Signals that occur in it; empty for an additive fault.
-    floor : float or None
-        Guaranteed lower bound of the norm of the column over the box; None without finite ranges.
-    at : dict of str to float
-        Where the norm is smallest, as far as found.
+    fault: its name
+    column: the derivative, dynamics first
+    depends_on: signals that occur in it; empty for an additive fault
+    floor: guaranteed lower bound of the norm of the column over the box; None without finite ranges
+    at: where the norm is smallest, as far as found
     """
 
     fault: str

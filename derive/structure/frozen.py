@@ -16,8 +16,6 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour.numbers import rational, substitute
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Frozen", "balls", "freeze", "original", "precision", "rank", "transfer"]
-
 _DIGITS = 40
 _BITS = 160
 _ZERO = 1e-20
@@ -28,14 +26,9 @@ _POINTS = 3
 class Frozen:
     """Derivatives of right-hand side and outputs at one point, without faults.
 
-    Attributes
-    ----------
-    A, D, B_f : sympy.Matrix, shapes (n, n), (n, n_d), (n, n_f)
-        By states, unknown inputs and faults.
-    C, C_d, D_f : sympy.Matrix, shapes (m, n), (m, n_d), (m, n_f)
-        The same of the outputs.
-    point : dict of str to float
-        Where.
+    A, D, B_f: by states, unknown inputs and faults
+    C, C_d, D_f: the same of the outputs
+    point: where
     """
 
     A: sp.Matrix
@@ -57,33 +50,7 @@ def original(model: Plant) -> Plant:
 
 
 def freeze(model: Plant, count: int = _POINTS) -> list[Frozen]:
-    """Evaluate the derivatives of a plant at fixed random points of its box.
-
-    Parameters
-    ----------
-    model : Plant
-        Any plant; nothing has to enter linearly.
-    count : int
-        Number of points.
-
-    Returns
-    -------
-    list of Frozen
-        Faults and disturbances zero; signals without a finite range between -1 and 1 around
-        their nominal value.
-
-    Raises
-    ------
-    DerivationError
-        No point of the box has finite derivatives.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> found = freeze(quadruple_tank())[0]
-    >>> found.A.shape, found.B_f.shape, found.D_f.shape
-    ((4, 4), (4, 2), (3, 2))
-    """
+    """Evaluate the derivatives of a plant at fixed random points of its box."""
     values = model.constant_values
     rows = [sp.Matrix([substitute(e, values) for e in part]) for part in (model.rhs, model.output)]
     kinds = {kind: [s.symbol for s in getattr(model, kind)] for kind in ("x", "d", "f", "w")}
@@ -126,18 +93,7 @@ def _numbers(matrix: sp.Matrix, point: dict[sp.Symbol, sp.Rational]) -> sp.Matri
 
 
 def balls(matrix: sp.Matrix) -> Any:
-    """Return a matrix of 40-digit numbers as balls that hold the exact ones.
-
-    Parameters
-    ----------
-    matrix : sympy.Matrix
-        Numbers.
-
-    Returns
-    -------
-    flint.arb_mat
-        Radius 1e-37 of each number's size.
-    """
+    """Return a matrix of 40-digit numbers as balls that hold the exact ones."""
     import flint
 
     def ball(value: Any) -> Any:
@@ -164,31 +120,7 @@ def precision() -> Iterator[None]:
 
 
 def rank(rows: Sequence[Sequence[Any]]) -> int:
-    """Rank of a matrix of balls, by elimination with complete pivoting.
-
-    Parameters
-    ----------
-    rows : sequence of rows
-        Balls; columns are scaled to size one first, zero columns count for nothing.
-
-    Returns
-    -------
-    int
-        Number of pivots that are not zero for certain. What is left is below 1e-20 of the scale,
-        so that a larger rank would need a coincidence of twenty digits.
-
-    Raises
-    ------
-    DerivationError
-        Entries too uncertain to decide.
-
-    Examples
-    --------
-    >>> with precision():
-    ...     third = balls(sp.Matrix([[1, 3]]))[0, 0] / 3
-    ...     rank([[third, 1], [1, 3]]), rank([[0.3333333333333333, 1], [1, 3]])
-    (1, 2)
-    """
+    """Rank of a matrix of balls, by elimination with complete pivoting."""
     import flint
 
     work = [[flint.arb(value) for value in row] for row in rows]
@@ -224,22 +156,7 @@ def rank(rows: Sequence[Sequence[Any]]) -> int:
 
 
 def transfer(frozen: Frozen, at: float) -> tuple[list[list[Any]], int]:
-    """Transfer matrix from unknown inputs and faults to the outputs, at one real number.
-
-    Parameters
-    ----------
-    frozen : Frozen
-        The plant at a point.
-    at : float
-        Where; no eigenvalue of A.
-
-    Returns
-    -------
-    rows : list of lists of flint.arb, shape (m, n_d + n_f)
-        Unknown inputs first. To be called, like `rank`, inside `precision`.
-    unknown : int
-        Number of columns that belong to unknown inputs.
-    """
+    """Transfer matrix from unknown inputs and faults to the outputs, at one real number."""
     import flint
 
     n = frozen.A.rows

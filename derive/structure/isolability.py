@@ -11,8 +11,6 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.structure.frozen import freeze, original, precision, rank, transfer
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["FaultIsolability", "fault_isolability"]
-
 # Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
 _FREQUENCIES = (1.3717, -0.8391, 2.1173)
 

@@ -16,8 +16,6 @@ from obsynth.derive.structure.summary import family_lines, fault_lines
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Check", "StructureReport", "analyse"]
-
 T = TypeVar("T")
 
 

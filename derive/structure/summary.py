@@ -11,25 +11,12 @@ from obsynth.derive.structure.zeros import zeros_over_polytope
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Line", "family_lines", "fault_lines"]
-
 Line = tuple[str, bool | None, str]
 _MOST_VERTICES = 512
 
 
 def fault_lines(model: Plant) -> list[Line]:
-    """Report which single faults show, which can be told apart, and what has to move for that.
-
-    Parameters
-    ----------
-    model : Plant
-        Complete; it need not have a split.
-
-    Returns
-    -------
-    list of (title, passed, text)
-        Empty without faults. A hidden fault fails, faults that cannot be told apart are told.
-    """
+    """Report which single faults show, which can be told apart, and what has to move for that."""
     if not model.f:
         return []
 
@@ -46,20 +33,7 @@ def fault_lines(model: Plant) -> list[Line]:
 
 
 def family_lines(split: Split, bounds: JacobianBounds) -> list[Line]:
-    """Report zeros at the vertices of the Jacobian family, and its weakest member.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    bounds : JacobianBounds
-        Bounds of dg/dx.
-
-    Returns
-    -------
-    list of (title, passed, text)
-        Zeros from the unknown inputs fail when they do not decay; those of the faults are told.
-    """
+    """Report zeros at the vertices of the Jacobian family, and its weakest member."""
     lines: list[Line] = []
     count = bounds.family.vertex_count
     if count > _MOST_VERTICES:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
 
-__all__ = ["PolytopeZeros", "system_zeros", "zeros_over_polytope"]
-
 Array = NDArray[np.float64]
 Numbers = NDArray[np.complex128]
 _TOLERANCE = 1e-10

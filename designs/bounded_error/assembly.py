@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds, Split, decouple
 from obsynth.designs.bounded_error.claims import prove_ellipsoid
@@ -19,10 +18,7 @@ from obsynth.designs.bounded_error.step import RuntimeBound, build_step, memory_
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import with_header
-
-__all__ = ["assemble", "prove", "to_record"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def to_record(design: UioDesign) -> dict[str, Any]:
@@ -31,15 +27,7 @@ def to_record(design: UioDesign) -> dict[str, Any]:
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
-    """Prove everything that the guarantee of a stored design rests on.
-
-    Parameters
-    ----------
-    record : mapping
-        Of `to_record`.
-    level : {"full", "lmi"}
-        Whether the split and the Jacobian bounds are derived again.
-    """
+    """Prove everything that the guarantee of a stored design rests on."""
     return _prove(UioDesign.from_record(record), level)
 
 
@@ -93,20 +81,7 @@ def assemble(
     level: Level = "lmi",
     derived: tuple[Split, JacobianBounds] | None = None,
 ) -> Observer:
-    """Prove a design and make its observer.
-
-    Parameters
-    ----------
-    record_or_design : mapping or UioDesign
-    level : {"full", "lmi"}
-    derived : tuple of Split and JacobianBounds, optional
-        What was just derived from the plant; proved too, without deriving it again.
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a design and make its observer."""
     if isinstance(record_or_design, UioDesign):
         design = record_or_design
     else:

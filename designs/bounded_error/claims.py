@@ -6,7 +6,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.error_system import (
     Arithmetic,
@@ -24,10 +23,8 @@ from obsynth.designs.lmi import (
     prove_positive_definite,
     symmetric_block,
 )
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["inverse_diagonal_bounds", "prove_ellipsoid", "recursion_block", "reduced_gain"]
-
-FloatArray = NDArray[np.float64]
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational LDL' on the worst vertex"
 
@@ -57,14 +54,7 @@ def recursion_block(
 
 
 def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
-    """Prove every matrix inequality behind an `EllipsoidBound`.
-
-    Returns
-    -------
-    tuple of Claim
-        ``lmi`` (the invariance at every vertex), ``weights``, ``half_widths``
-        and, for the shifted error, ``dropped_gain``.
-    """
+    """Prove every matrix inequality behind an `EllipsoidBound`."""
     bound = design.bound
     if not isinstance(bound, EllipsoidBound):
         raise TypeError("the design has no ellipsoidal bound")
@@ -153,17 +143,7 @@ def _prove_half_widths(bound: EllipsoidBound) -> Claim:
 def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
     """Doubles just above ``(P^-1)_ii``, proved, component i from its own ellipsoid.
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (s, p, p)
-        One matrix for all components, or one per component.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bounds = inverse_diagonal_bounds(np.array([[[2.0, 0.0], [0.0, 4.0]]]))
-    >>> bool(np.all(bounds > [0.5, 0.25]) and np.all(bounds < [0.5000001, 0.2500001]))
-    True
+    Shapes: shapes (s, p, p).
     """
     p = shapes.shape[-1]
     values = np.empty(p)

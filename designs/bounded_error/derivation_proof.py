@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import AffineFamily, JacobianBounds, Split, jacobian_bounds, split
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.core.certificate import Claim
 
-__all__ = ["covers", "prove_derivation"]
-
-FloatArray = NDArray[np.float64]
 # Magnitudes up to which signals without a declared range are covered.
 LARGEST_SIGNAL = 1e6
 
@@ -19,14 +15,7 @@ LARGEST_SIGNAL = 1e6
 def prove_derivation(
     design: UioDesign, parts: Split | None = None, bounds: JacobianBounds | None = None
 ) -> tuple[Claim, ...]:
-    """Derive split and Jacobian bounds from the stored equations and compare.
-
-    Parameters
-    ----------
-    design : UioDesign
-    parts, bounds : optional
-        What was derived a moment ago, so that it need not be derived twice.
-    """
+    """Derive split and Jacobian bounds from the stored equations and compare."""
     if parts is None:
         parts = split(design.plant, at=(design.x_at, design.u_at), linear=design.linear)
     if bounds is None:

@@ -11,25 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
 from obsynth.designs.lmi import Enclosure, ExactMatrix, block
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = [
-    "ERRORS",
-    "Arithmetic",
-    "ErrorKind",
-    "ErrorSystem",
-    "ModelData",
-    "build_error_system",
-    "kept_coordinates",
-    "lift",
-    "plain_error",
-    "shifted_error",
-]
-
-FloatArray = NDArray[np.float64]
 ErrorKind = Literal["plain", "shifted"]
 Arithmetic = Literal["float", "enclosure", "exact"]
 ERRORS: tuple[ErrorKind, ...] = ("plain", "shifted")
@@ -39,15 +25,11 @@ ERRORS: tuple[ErrorKind, ...] = ("plain", "shifted")
 class ModelData:
     """Everything numeric that the error system is formed from.
 
-    Attributes
-    ----------
-    A, B_f, C, W1, W2 : ndarray
-        Shapes (n, n), (n, n_f), (m, n), (n, n_w), (m, n_w).
-    E, T, Pi : ndarray
-        Of `Decoupling`, shapes (n, m), (n, n), (m, m).
-    vertices, vertex_radius : ndarray of shape (N, n, n)
-        Every Jacobian is a convex combination of matrices within the radius of the vertices.
-    w_radius, rate : ndarray of shape (n_w,), (n_f,)
+    A, B_f, C, W1, W2: shapes (n, n), (n, n_f), (m, n), (n, n_w), (m, n_w)
+    E, T, Pi: of `Decoupling`, shapes (n, m), (n, n), (m, m)
+    vertices, vertex_radius (N, n, n): every Jacobian is a convex combination of matrices within the
+        radius of the vertices
+    w_radius, rate (n_w,), (n_f,)
     """
 
     A: FloatArray
@@ -84,18 +66,14 @@ class ModelData:
 class ErrorSystem:
     """Matrices of the error recursion, arrays or enclosures, one member per vertex.
 
-    Attributes
-    ----------
-    Abar : (N, p, p)
-    Cbar : (m, p)
-    Wbar : (N, p, n_v) or (p, n_v)
-        Columns are scaled by the boxes, so that every component of v is in [-1, 1].
-    Vbar : (m, n_v)
-    basis : ndarray of shape (n, p - n_f)
-        State errors are ``basis @ xi[:p - n_f] + E W2 w_k`` (shifted) or the
-        first n entries of xi (plain).
-    blocks : int
-        3 where v = (w_k, eps_k, w_{k+1}), 2 where v = (w_k, eps_k).
+    Abar (N, p, p)
+    Cbar (m, p)
+    Wbar (N, p, n_v) or (p, n_v): columns are scaled by the boxes, so that every component of v is
+        in [-1, 1]
+    Vbar (m, n_v)
+    basis (n, p - n_f): state errors are ``basis @ xi[:p - n_f] + E W2 w_k`` (shifted) or the first
+        n entries of xi (plain)
+    blocks: 3 where v = (w_k, eps_k, w_{k+1}), 2 where v = (w_k, eps_k)
     """
 
     Abar: Any
@@ -153,14 +131,6 @@ def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:
 def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
     """Error system of the paper, xi = (e, e_f), v = (w_k, eps_k, w_{k+1}).
 
-    Parameters
-    ----------
-    data : ModelData
-    arithmetic : {"float", "enclosure", "exact"}
-        ``"enclosure"`` holds the exact matrices; ``"exact"`` takes the first vertex.
-
-    Notes
-    -----
     Eqs. (16)-(18) with the third block of Wbar corrected to E W2: e_{k+1}
     contains E y_{k+1}, and y_{k+1} contains W2 w_{k+1}.
     """
@@ -197,16 +167,6 @@ def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSys
 
     zeta stays in the range of the projector T, so it is written in coordinates
     of that range.
-
-    Parameters
-    ----------
-    data : ModelData
-    arithmetic : {"float", "enclosure", "exact"}
-
-    Raises
-    ------
-    StructureError
-        If T of the stored doubles is no exact projector onto coordinates.
     """
     n, n_f, m, _ = data.sizes
     keep = kept_coordinates(data.T)

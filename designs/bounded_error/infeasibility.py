@@ -20,25 +20,17 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["FixedPoint", "find_fixed_point", "verify_fixed_point"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True)
 class FixedPoint:
     """An error that no gain removes, in exact rational numbers.
 
-    Attributes
-    ----------
-    e, e_f, s : tuple of Fraction
-        State error (n,), fault error (n_f,) and value of the nonlinearity (n,).
-    q1, q2 : Fraction
-        The two quadratic constraints of (51) at this point; both are >= 0.
-    vertex : int
-        Number of the vertex M at which they were evaluated.
+    e, e_f, s: state error (n,), fault error (n_f,) and value of the nonlinearity (n,)
+    q1, q2: the two quadratic constraints of (51) at this point; both are >= 0
+    vertex: number of the vertex M at which they were evaluated
     """
 
     e: tuple[Fraction, ...]
@@ -82,20 +74,7 @@ def verify_fixed_point(
     e_f: tuple[Fraction, ...],
     s: tuple[Fraction, ...],
 ) -> tuple[Fraction, Fraction] | None:
-    """Check a fixed point in exact arithmetic.
-
-    Parameters
-    ----------
-    A, B_f, C, T, M : array_like
-        Shapes (n, n), (n, n_f), (m, n), (n, n), (n, n); entries are doubles,
-        integers or Fractions and are taken exactly.
-    e, e_f, s : tuples of Fraction
-
-    Returns
-    -------
-    tuple of Fraction or None
-        (q1, q2) if every condition holds, None if one does not.
-    """
+    """Check a fixed point in exact arithmetic."""
     A, B_f, C, T, M = (_fractions(matrix) for matrix in (A, B_f, C, T, M))
     error, fault, value = list(e), list(e_f), list(s)
     if not any(error) or any(_times(C, error)):
@@ -151,21 +130,8 @@ def find_fixed_point(
 ) -> FixedPoint | None:
     """Search every vertex for a fixed point that makes (51) infeasible.
 
-    Parameters
-    ----------
-    A, B_f, C, T : array_like
-        Matrices of the model, taken exactly.
-    vertices : array_like of shape (N, n, n)
-    seed, starts : int
-        Of the random starts of the local search.
+    Shapes: vertices (N, n, n).
 
-    Returns
-    -------
-    FixedPoint or None
-        None means that none was found, not that there is none.
-
-    Notes
-    -----
     The largest ``min(q1, q2)`` over the exact space of solutions is searched
     numerically; its coordinates are then rounded to short rationals and the
     conditions are checked in exact arithmetic.

@@ -19,8 +19,6 @@ from obsynth.designs.bounded_error.error_system import (
 )
 from obsynth.designs.lmi import Enclosure, he, symmetric_block
 
-__all__ = ["direct_block", "fixed_gain_block", "multiplier_block"]
-
 
 def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:
     """Quadratic boundedness at every vertex, without relaxation.
@@ -32,12 +30,7 @@ def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> 
     With ``keep = 1 - gamma`` and ``noise = gamma Q_v`` it says
     ``V+ <= (1 - gamma) V + gamma v'Q_v v``, so V <= 1 is invariant.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    P, H : expression, enclosure or array of shape (p, p), (p, m)
-    keep : number or enclosure of shape (1, 1)
-    noise : matrix of shape (n_v, n_v)
+    Shapes: P, H (p, p), (p, m), keep (1, 1), noise (n_v, n_v).
     """
     X = P @ system.Abar - H @ system.Cbar
     Z = P @ system.Wbar - H @ system.Vbar
@@ -62,20 +55,7 @@ def multiplier_block(
 ) -> Any:
     """Inequality (51), as printed or repaired, times -1.
 
-    Parameters
-    ----------
-    data : ModelData
-    P, H : expression or enclosure of shape (n + n_f, n + n_f), (n + n_f, m)
-    keep : number
-        1 - gamma.
-    noise : matrix
-        gamma Q_v in scaled coordinates.
-    a, b : matrix of shape (n, n)
-        ``alpha I`` and ``beta I`` for the printed form, diagonal for the
-        repaired one: (25) and (28) hold row by row, since s = M e.
-    U : matrix of shape (n, n), optional
-        The slack of Lemma 1; `b`, which is optimal, where it is not given.
-    arithmetic : {"float", "enclosure"}
+    Shapes: P, H (n + n_f, n + n_f), (n + n_f, m), a, b (n, n), U (n, n).
     """
     base = plain_error(data.without_nonlinearity(), arithmetic)
     n, n_f, _, _ = data.sizes

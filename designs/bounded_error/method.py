@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
 from obsynth.designs.bounded_error.error_system import (
@@ -32,6 +32,7 @@ from obsynth.designs.bounded_error.synthesis import (
     synthesise,
 )
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
@@ -40,9 +41,7 @@ if TYPE_CHECKING:
     from obsynth.designs.lmi import Problem
     from obsynth.symbolic import Plant
 
-__all__ = ["BoundedErrorUIO"]
 
-FloatArray = NDArray[np.float64]
 # Keeps sums of rounded weights at or below 1.
 BELOW_ONE = 1.0 - 2.0**-48
 FORMS = ("corrected", "printed", "repaired")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
@@ -13,10 +12,8 @@ from obsynth.derive.structure.conditions import detectability, unknown_input_con
 from obsynth.designs.bounded_error.noise import noise_box
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.symbolic import Plant, Role
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Prepared", "check_class", "prepare"]
-
-FloatArray = NDArray[np.float64]
 # Relative to the largest magnitude of each state: a few thousand roundings of one step.
 ROUNDING = 2.0**-40
 
@@ -25,12 +22,7 @@ ROUNDING = 2.0**-40
 class Prepared:
     """A model of the class (1)-(2) with everything derived from it.
 
-    Attributes
-    ----------
-    split : Split
-    bounds : JacobianBounds
-    design : UioDesign
-        Complete except for gains and bound, which are zero.
+    design: complete except for gains and bound, which are zero
     """
 
     split: Split
@@ -39,14 +31,7 @@ class Prepared:
 
 
 def check_class(model: Plant) -> None:
-    """Refuse what is outside the class (1)-(2) by the user's own names.
-
-    Raises
-    ------
-    StructureError
-        For continuous-time plants, uncertain parameters, scheduling variables,
-        sensor faults and boxes that are not finite.
-    """
+    """Refuse what is outside the class (1)-(2) by the user's own names."""
     if model.Ts is None:
         raise StructureError(
             f"{model.name} is in continuous time and the bounded-error observer works in discrete "
@@ -83,23 +68,7 @@ def check_class(model: Plant) -> None:
 
 
 def prepare(model_or_split: Plant | Split, bounds: JacobianBounds | None = None) -> Prepared:
-    """Split, check the structural conditions, bound the Jacobian.
-
-    Parameters
-    ----------
-    model_or_split : Plant or Split
-        Discrete time.
-    bounds : JacobianBounds, optional
-        Bounds of the Jacobian of the split's g that are at hand.
-
-    Raises
-    ------
-    StructureError
-        If the model is outside the class, rank(D) = rank(C D) = q fails, or a
-        fault or state cannot be detected.
-    UnboundedError
-        If an entry of the Jacobian is not bounded over the box.
-    """
+    """Split, check the structural conditions, bound the Jacobian."""
     model = model_or_split if isinstance(model_or_split, Plant) else model_or_split.model
     check_class(model)
     parts = split(model) if isinstance(model_or_split, Plant) else model_or_split

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds
 from obsynth.designs.bounded_error.error_system import ModelData
@@ -23,27 +22,13 @@ from obsynth.designs.bounded_error.synthesis import (
 )
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, symmetric
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = [
-    "box_vertices",
-    "largest_multiplier_gamma",
-    "multiplier_problem",
-    "refuse_printed",
-    "synthesise_multipliers",
-]
-
-FloatArray = NDArray[np.float64]
 MOST_ENTRIES = 12
 
 
 def box_vertices(bounds: JacobianBounds) -> FloatArray:
-    """All 2^k combinations of the k uncertain entries, as Remark 2 takes them.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If k is above 12: the printed form cannot be written down.
-    """
+    """All 2^k combinations of the k uncertain entries, as Remark 2 takes them."""
     low, high = bounds.min, bounds.max
     rows, columns = np.nonzero(low != high)
     count = rows.size
@@ -142,13 +127,7 @@ def synthesise_multipliers(
     form: Literal["printed", "repaired"],
     scale: FloatArray | None = None,
 ) -> EllipsoidSolution:
-    """Solve (51) at a fixed gamma.
-
-    Raises
-    ------
-    InfeasibleDesign, SolverTrouble
-        As the solver reports.
-    """
+    """Solve (51) at a fixed gamma."""
     p = sum(data.sizes[:2])
     scale = np.ones(p) if scale is None else scale
     problem = multiplier_problem(data, gamma, noise, objective, weights, form, scale)
@@ -159,13 +138,7 @@ def synthesise_multipliers(
 
 
 def refuse_printed(data: ModelData, vertices: FloatArray, gamma: float) -> None:
-    """Refuse the printed form where an error exists that no gain removes.
-
-    Raises
-    ------
-    InfeasibleDesign
-        With the exact fixed point as ``error.certificate``.
-    """
+    """Refuse the printed form where an error exists that no gain removes."""
     point = find_fixed_point(data.A, data.B_f, data.C, data.T, vertices)
     if point is None:
         return

@@ -6,28 +6,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant
-
-__all__ = ["NoiseBox", "noise_box"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseBox:
     """Boxes of the disturbances and of the fault increments.
 
-    Attributes
-    ----------
-    w_centre, w_radius : ndarray of shape (n_w,)
-        ``|w - w_centre| <= w_radius``, elementwise.
-    rate : ndarray of shape (n_f,)
-        ``|f_{k+1} - f_k| <= rate``, per step.
+    w_centre, w_radius (n_w,): ``|w - w_centre| <= w_radius``, elementwise
+    rate (n_f,): ``|f_{k+1} - f_k| <= rate``, per step
     """
 
     w_centre: FloatArray
@@ -56,14 +48,7 @@ class NoiseBox:
 
 
 def noise_box(model: Plant) -> NoiseBox:
-    """Read the boxes from a discrete plant.
-
-    Raises
-    ------
-    StructureError
-        If a disturbance has no bound or a fault no rate: without them no
-        interval can be guaranteed.
-    """
+    """Read the boxes from a discrete plant."""
     unbounded = [s.name for s in model.w if not np.isfinite([s.lower, s.upper]).all()]
     if unbounded:
         raise StructureError(

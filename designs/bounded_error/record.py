@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.split import LinearForm
@@ -16,29 +15,22 @@ from obsynth.designs.bounded_error.error_system import ERRORS, ErrorKind, ModelD
 from obsynth.designs.core.record import plain_fields, read_array, read_family, reading
 from obsynth.designs.lmi import Enclosure
 from obsynth.symbolic import Plant
-
-__all__ = ["METHOD", "EllipsoidBound", "PeakData", "UioDesign"]
+from obsynth.symbolic.arrays import FloatArray
 
 METHOD = "bounded_error_uio"
 LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidBound:
     """One or more invariant ellipsoids ``xi'P xi <= 1`` of the error system.
 
-    Attributes
-    ----------
-    error : {"plain", "shifted"}
-        The error that xi stands for.
-    P : ndarray of shape (s, p, p)
-        Shape matrices; s is 1 (common) or p (one per component).
-    gamma : ndarray of shape (s,)
-    weights : ndarray of shape (s, n_v)
-        Diagonal of Q_v for v scaled by its boxes; every row sums to at most 1.
-    inverse_diagonal : ndarray of shape (p,)
-        Proved upper bounds of ``(P^-1)_ii`` of the ellipsoid that bounds component i.
+    error: the error that xi stands for
+    P (s, p, p): shape matrices; s is 1 (common) or p (one per component)
+    gamma (s,)
+    weights (s, n_v): diagonal of Q_v for v scaled by its boxes; every row sums to at most 1
+    inverse_diagonal (p,): proved upper bounds of ``(P^-1)_ii`` of the ellipsoid that bounds
+        component i
     """
 
     error: ErrorKind
@@ -56,13 +48,9 @@ class EllipsoidBound:
 class PeakData:
     """Guaranteed peak bounds as stored.
 
-    Attributes
-    ----------
-    b : ndarray of shape (n_o,)
-        Bounds of the errors (n + n_f of them), then of the combinations of
-        errors that the Jacobian sees, see `PeakSystem.outputs`.
-    decay : float
-        lambda of the exponential tail of the first error.
+    b (n_o,): bounds of the errors (n + n_f of them), then of the combinations of errors that the
+        Jacobian sees, see `PeakSystem.outputs`
+    decay: lambda of the exponential tail of the first error
     """
 
     b: FloatArray
@@ -73,27 +61,16 @@ class PeakData:
 class UioDesign:
     """Everything that is deployed and proved, in doubles.
 
-    Attributes
-    ----------
-    plant : Plant
-        The discrete plant.
-    linear : str
-        How A was chosen, see `obsynth.split`.
-    x_at, u_at : ndarray of shape (n,), (n_u,)
-        The point at which it was chosen.
-    A, B, B_f, C, D, W1, W2 : ndarray
-        The split, shapes (n, n), (n, n_u), (n, n_f), (m, n), (n, q), (n, n_w), (m, n_w).
-    family : AffineFamily
-        The set of Jacobians of g.
-    w_centre, w_radius, rate : ndarray
-        Boxes of disturbances and fault increments.
-    E, T, Pi, K, F : ndarray
-        The observer.
-    rounding : ndarray of shape (n + n_f,)
-        Allowance for the rounding errors of one step.
-    bound : EllipsoidBound or PeakData
-    options : mapping
-        The options of the method, as given.
+    plant: the discrete plant
+    linear: how A was chosen, see `obsynth.split`
+    x_at, u_at (n,), (n_u,): the point at which it was chosen
+    A, B, B_f, C, D, W1, W2: the split, shapes (n, n), (n, n_u), (n, n_f), (m, n), (n, q), (n, n_w),
+        (m, n_w)
+    family: the set of Jacobians of g
+    w_centre, w_radius, rate: boxes of disturbances and fault increments
+    E, T, Pi, K, F: the observer
+    rounding (n + n_f,): allowance for the rounding errors of one step
+    options: the options of the method, as given
     """
 
     plant: Plant
@@ -152,13 +129,7 @@ class UioDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> UioDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             plant = Plant.from_dict(record["plant"])
             sizes = _sizes(plant)

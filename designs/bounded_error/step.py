@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.stepping import (
     FINITE,
@@ -19,13 +18,12 @@ from obsynth.designs.core.stepping import (
     select,
     status_word,
 )
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant
 
-__all__ = ["RuntimeBound", "build_step", "memory_layout"]
 
-FloatArray = NDArray[np.float64]
 ROUND_UP = 1.0 + 2.0**-50
 # covers the rounding of estimate - half and estimate + half
 ULPS = 2.0**-50
@@ -39,13 +37,8 @@ class RuntimeBound:
     ``sqrt(s * scale) + add`` if `root` is set (ellipsoids, eqs. (35)-(36)) and
     ``s * scale + add`` otherwise (peak bounds). All arrays have shape (n + n_f,).
 
-    Attributes
-    ----------
-    decay, offset, scale, add : ndarray
-    root : bool
-    reset : ndarray
-        Value of s that holds whenever the state, the fault and their estimates
-        lie in the declared boxes; infinite where no such box is declared.
+    reset: value of s that holds whenever the state, the fault and their estimates lie in the
+        declared boxes; infinite where no such box is declared
     """
 
     decay: FloatArray
@@ -106,18 +99,7 @@ def build_step(
     where f is the plant's own right-hand side without unknown input. This form
     needs neither the split nor N, G, L, so nothing is lost by rounding them.
 
-    Parameters
-    ----------
-    model : Plant
-        Discrete; states (n,), outputs (m,), faults (n_f,).
-    C, W2, E, T, K, F : ndarray
-        Shapes (m, n), (m, n_w), (n, m), (n, n), (n, m), (n_f, m).
-    w_centre, w_radius : ndarray of shape (n_w,)
-    bound : RuntimeBound
-
-    Returns
-    -------
-    casadi.Function
+    Shapes: w_centre, w_radius (n_w,).
     """
     n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), C.shape[0]
     layout = memory_layout(n, n_f)

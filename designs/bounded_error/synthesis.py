@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.error_system import ErrorSystem
 from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
@@ -29,24 +28,8 @@ from obsynth.designs.lmi import (
     symmetric_block,
     trace,
 )
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = [
-    "OBJECTIVES",
-    "EllipsoidSolution",
-    "Objective",
-    "analyse_gain",
-    "decay_problem",
-    "design_problem",
-    "explain_infeasible",
-    "largest_feasible",
-    "largest_gamma",
-    "search_gamma",
-    "set_objective",
-    "solve_reliably",
-    "synthesise",
-]
-
-FloatArray = NDArray[np.float64]
 Objective = Literal["trace_inverse", "log_det", "lambda_min", "trace"]
 OBJECTIVES: tuple[Objective, ...] = ("trace_inverse", "log_det", "lambda_min", "trace")
 
@@ -66,13 +49,9 @@ SEARCH_RTOL = 1e-3
 class EllipsoidSolution:
     """A solution of the design or analysis LMI.
 
-    Attributes
-    ----------
-    gain : ndarray of shape (p, m)
-    P : ndarray of shape (p, p)
-    gamma : float
-    weights : ndarray of shape (n_v,)
-        Diagonal of Q_v for v scaled by its boxes.
+    gain (p, m)
+    P (p, p)
+    weights (n_v,): diagonal of Q_v for v scaled by its boxes
     """
 
     gain: FloatArray
@@ -111,13 +90,7 @@ def set_objective(
 ) -> None:
     """Set one of the size criteria of section 5 (and the two that serve it better).
 
-    Parameters
-    ----------
-    problem : Problem
-    P : Affine
-        In coordinates scaled by `scale`.
-    objective : {"trace_inverse", "log_det", "lambda_min", "trace"}
-    weights, scale : ndarray of shape (p,)
+    Shapes: weights, scale (p,).
     """
     back = np.diag(1.0 / scale)
     if objective == "trace_inverse":
@@ -142,25 +115,7 @@ def design_problem(
 ) -> Problem:
     """State the design LMI (or, with `gain`, the analysis LMI) at a fixed gamma.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-        Of arrays.
-    gamma : float
-    noise : ndarray of shape (n_v,) or None
-        Weights of Q_v; None makes them variables.
-    objective : {"trace_inverse", "log_det", "lambda_min", "trace"}
-    weights : ndarray of shape (p,)
-        Of ``trace_inverse``.
-    scale : ndarray of shape (p,), optional
-        Typical sizes of the components of xi.
-    gain : ndarray of shape (p, m), optional
-
-    Returns
-    -------
-    Problem
-        With variables ``P`` and ``H`` for ``gamma * S P S`` and ``gamma * S H``, where
-        ``S = diag(1 / scale)``.
+    Shapes: noise (n_v,) or None, weights (p,), scale (p,), gain (p, m).
     """
     p, m, n_v = system.sizes
     scale = np.ones(p) if scale is None else scale
@@ -187,13 +142,7 @@ def synthesise(
     weights: FloatArray,
     gain: FloatArray | None = None,
 ) -> EllipsoidSolution:
-    """Solve the design (or analysis) LMI, once to learn the scales and once in them.
-
-    Raises
-    ------
-    InfeasibleDesign, SolverTrouble
-        As the solver reports; the caller explains.
-    """
+    """Solve the design (or analysis) LMI, once to learn the scales and once in them."""
     scale = np.ones(system.sizes[0])
     problem = design_problem(system, gamma, noise, objective, weights, scale, gain)
     rough = problem.solve(accept_inaccurate=True, tol_gap_abs=1e-5, tol_gap_rel=1e-5)
@@ -229,8 +178,6 @@ def analyse_gain(
 ) -> EllipsoidSolution:
     """Find the best ellipsoid and gamma for a given gain: the least weighted trace of P^-1.
 
-    Notes
-    -----
     With the gain fixed, the LMI at gamma says of X = P^-1, at every vertex i,
 
         X >= A_i X A_i' / (1 - gamma) + W_i Q_v^-1 W_i' / gamma .
@@ -271,11 +218,6 @@ def largest_gamma(system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | No
     """Return the largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``.
 
     Bounds of the noise do not enter: they only scale P.
-
-    Returns
-    -------
-    float
-        A feasible value, within `rtol` of the largest; 0 where nothing is feasible.
     """
     return largest_feasible(lambda gamma: decay_problem(system, gamma, gain), rtol)
 
@@ -283,14 +225,7 @@ def largest_gamma(system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | No
 def decay_problem(
     system: ErrorSystem, gamma: float, gain: FloatArray | None = None
 ) -> tuple[Problem, Affine]:
-    """State ``[(1 - gamma) P, X'P; P X, P] > 0``: quadratic boundedness without noise.
-
-    Returns
-    -------
-    problem : Problem
-    P : Affine
-        To be capped, since the problem is homogeneous.
-    """
+    """State ``[(1 - gamma) P, X'P; P X, P] > 0``: quadratic boundedness without noise."""
     p, m, _ = system.sizes
     problem = Problem(f"decay at gamma = {gamma:.6g}")
     P = symmetric("P", p)
@@ -303,14 +238,7 @@ def decay_problem(
 
 
 def explain_infeasible(system: ErrorSystem, gamma: float) -> tuple[list[str], float | None]:
-    """Say what binds at an infeasible gamma, and how much narrower the Jacobian set has to be.
-
-    Returns
-    -------
-    lines : list of str
-    share : float or None
-        The largest share of the set's width, about its middle, that is feasible.
-    """
+    """Say what binds at an infeasible gamma, and how much narrower the Jacobian set has to be."""
 
     def margin(share: float, explain: bool = False) -> Margin:
         middle = system.Abar.mean(axis=0)
@@ -330,14 +258,7 @@ def explain_infeasible(system: ErrorSystem, gamma: float) -> tuple[list[str], fl
 
 
 def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: float = 1e-3) -> float:
-    """Return the largest gamma with a margin, 0 where there is none.
-
-    Parameters
-    ----------
-    state : callable
-        From gamma to a homogeneous problem and the variable to cap at the identity.
-    rtol : float
-    """
+    """Return the largest gamma with a margin, 0 where there is none."""
 
     def feasible(gamma: float) -> bool:
         problem, P = state(gamma)
@@ -354,16 +275,7 @@ def search_gamma(
     top: float,
     xatol: float = 5e-3,
 ) -> EllipsoidSolution:
-    """Search gamma for the smallest sum of the (weighted) half widths.
-
-    Parameters
-    ----------
-    solve : callable
-        ``gamma -> EllipsoidSolution``; may raise InfeasibleDesign or SolverTrouble.
-    weights : ndarray of shape (p,)
-    top : float
-        Largest gamma to try (exclusive).
-    """
+    """Search gamma for the smallest sum of the (weighted) half widths. Shapes: weights (p,)."""
     found = search_line(
         solve,
         lambda solution: float(np.sqrt(weights * solution.inverse_diagonal).sum()),

@@ -9,8 +9,6 @@ from typing import Any, Literal
 
 from obsynth.designs.core.errors import CertificateError
 
-__all__ = ["LEVELS", "Certificate", "Claim", "Guarantee", "Level"]
-
 Level = Literal["full", "lmi"]
 LEVELS: tuple[Level, ...] = ("full", "lmi")
 

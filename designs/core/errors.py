@@ -5,8 +5,6 @@ from typing import Any
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["CertificateError", "DetectorError", "InfeasibleDesign", "SolverTrouble"]
-
 
 class _Refusal(ObsynthError):
     """A headline, and one indented line per detail."""

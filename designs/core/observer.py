@@ -7,17 +7,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Certificate, Guarantee
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from obsynth.symbolic import Plant
 
-__all__ = ["ALARM_OUTPUT", "STATUS", "STEP_OUTPUTS", "Observer"]
 
 STATUS: Mapping[str, int] = {
     "not_initialised": 1,
@@ -42,8 +40,6 @@ STEP_OUTPUTS = (
 
 ALARM_OUTPUT = "alarm"
 """Name of the output that a fault detector's step has behind them."""
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

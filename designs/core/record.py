@@ -8,26 +8,16 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.registry import FORMAT, VERSION
 from obsynth.symbolic import Plant
-
-__all__ = ["plain", "plain_fields", "read_array", "read_family", "reading", "with_header"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def with_header(method: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with the header that `load` reads.
-
-    Examples
-    --------
-    >>> with_header("hinf_uio", {"K": [[0.0]]})["method"]
-    'hinf_uio'
-    """
+    """Return a record with the header that `load` reads."""
     return {"format": FORMAT, "version": VERSION, "method": method, **record}
 
 
@@ -35,11 +25,6 @@ def plain(value: Any) -> Any:
     """Return a value as JSON-able data: plants, dataclasses, arrays and containers of them.
 
     What has a ``to_record`` of its own is asked for it.
-
-    Examples
-    --------
-    >>> plain({"K": np.eye(2), "names": ("a", "b")})
-    {'K': [[1.0, 0.0], [0.0, 1.0]], 'names': ['a', 'b']}
     """
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
@@ -63,21 +48,7 @@ def plain_fields(value: Any) -> dict[str, Any]:
 
 @contextmanager
 def reading() -> Iterator[None]:
-    """Turn whatever goes wrong while a record is read into one kind of refusal.
-
-    Raises
-    ------
-    CertificateError
-        For missing entries and entries of the wrong kind.
-
-    Examples
-    --------
-    >>> with reading():
-    ...     {}["K"]
-    Traceback (most recent call last):
-        ...
-    obsynth.designs.core.errors.CertificateError: the stored design cannot be read: KeyError('K')
-    """
+    """Turn whatever goes wrong while a record is read into one kind of refusal."""
     try:
         yield
     except CertificateError:
@@ -87,13 +58,7 @@ def reading() -> Iterator[None]:
 
 
 def read_array(values: Any, shape: tuple[int, ...], name: str) -> FloatArray:
-    """Return finite numbers of a given shape.
-
-    Raises
-    ------
-    CertificateError
-        For other shapes, and for numbers that are not finite.
-    """
+    """Return finite numbers of a given shape."""
     array = np.asarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
         array = np.zeros(shape)
@@ -107,13 +72,7 @@ def read_array(values: Any, shape: tuple[int, ...], name: str) -> FloatArray:
 
 
 def read_family(stored: Mapping[str, Any], shape: tuple[int, int]) -> AffineFamily:
-    """Return the family of matrices of a given shape that was stored by `plain`.
-
-    Raises
-    ------
-    CertificateError
-        For arrays that do not fit each other, are not finite or have a negative radius.
-    """
+    """Return the family of matrices of a given shape that was stored by `plain`."""
     directions = np.asarray(stored["directions"], dtype=float).reshape(-1, *shape)
     count = len(directions)
     family = AffineFamily(

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from obsynth.designs.core.certificate import Claim
     from obsynth.designs.core.observer import Observer
 
-__all__ = ["FORMAT", "VERSION", "load", "method_module", "save"]
 
 FORMAT = "obsynth design"
 VERSION = 1
@@ -34,13 +33,7 @@ _METHODS = {
 
 
 def method_module(record: Mapping[str, Any]) -> str:
-    """Return the module that proves and assembles designs of the record's method.
-
-    Raises
-    ------
-    CertificateError
-        If the record is of no known format, version or method.
-    """
+    """Return the module that proves and assembles designs of the record's method."""
     if record.get("format") != FORMAT:
         raise CertificateError(
             f"this is no design: its format is {record.get('format')!r}, not {FORMAT!r}"

@@ -6,22 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
-
-__all__ = [
-    "FINITE",
-    "all_finite",
-    "clip",
-    "finite_or",
-    "inside",
-    "make_step",
-    "select",
-    "status_word",
-]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 FINITE = 1e300
 """What is larger counts as no number: CasADi folds ``y == y`` to 1, so size is what tells."""
@@ -72,13 +59,7 @@ def select(condition: ca.SX, then: ca.SX, otherwise: ca.SX) -> ca.SX:
 
 
 def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:
-    """Return the status from conditions (1 or 0) by the names of `STATUS`.
-
-    Examples
-    --------
-    >>> int(status_word({"not_initialised": ca.SX(0), "outside_domain": ca.SX(1)}))
-    4
-    """
+    """Return the status from conditions (1 or 0) by the names of `STATUS`."""
     word = ca.SX(0)
     for name, condition in bits.items():
         word = word + STATUS[name] * condition
@@ -86,15 +67,7 @@ def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:
 
 
 def make_step(inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) -> ca.Function:
-    """Return `Observer.step` with its inputs (memory, u, y[, theta]) and outputs in their order.
-
-    Parameters
-    ----------
-    inputs : mapping of str to casadi.SX
-        ``memory``, ``u``, ``y`` and, for scheduled observers, ``theta``.
-    outputs : mapping of str to casadi.SX
-        By the names of `STEP_OUTPUTS`.
-    """
+    """Return `Observer.step` with its inputs (memory, u, y[, theta]) and outputs in their order."""
     names = [name for name in ("memory", "u", "y", "theta") if name in inputs]
     return ca.Function(
         "step",

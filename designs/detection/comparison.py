@@ -10,9 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Detection", "FaultEvent", "RunLike", "compare"]
+from obsynth.symbolic.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
@@ -174,27 +173,8 @@ def compare(
 ) -> Detection:
     """Compare alarms with the true faults.
 
-    Parameters
-    ----------
-    alarm : (N + 1, n_f) bool
-        Row k was raised at instant k and speaks of instant k - `fault_delay`.
-    truth : (N + 1, n_f)
-    t : (N + 1,)
-        Seconds.
-    names : sequence of str
-    fault_delay : int
-    threshold : float
-        Magnitude up to which a fault counts as not there.
-    width : (N + 1, n_f), optional
-        Lengths of the intervals that the alarms were decided from; without, nothing is promised.
-    valid : (N + 1,) bool
-        Which samples count.
-    persistence : sequence of int
-        Samples that each alarm takes.
-
-    Returns
-    -------
-    Detection
+    Shapes: alarm (N + 1, n_f) bool, truth (N + 1, n_f), t (N + 1,), width (N + 1, n_f), valid (N +
+    1,) bool.
     """
     there: BoolArray = np.abs(truth) > threshold
     # Row k of `spoken` is about the same instant as row k of the alarms.

@@ -16,14 +16,12 @@ from obsynth.designs.core.certificate import Certificate, Guarantee
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS
 from obsynth.designs.detection.comparison import Detection, RunLike, compare
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer
     from obsynth.symbolic import Plant
 
-__all__ = ["SKIPPED", "FaultDetector"]
-
-FloatArray = NDArray[np.float64]
 
 SKIPPED = ("not_initialised", "non_finite_input", "fault_not_valid")
 """Bits of the status at which a sample never counts, neither for an alarm nor against it."""

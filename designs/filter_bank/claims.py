@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive import StructureError
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
@@ -22,11 +22,8 @@ from obsynth.designs.filter_bank.step import (
 from obsynth.designs.filter_bank.widths import steady_half_widths
 from obsynth.designs.set_adaptive.record import METHOD
 from obsynth.designs.starting import read_box, read_vector
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["assemble_bank", "bank_record", "prove_bank"]
-
-FloatArray = NDArray[np.float64]
 
 
 def bank_record(design: BankDesign) -> dict[str, Any]:
@@ -89,13 +86,7 @@ def _derived(design: BankDesign) -> tuple[Claim, ...]:
 
 
 def assemble_bank(design: BankDesign, level: Level) -> Observer:
-    """Prove a bank and make its observer.
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a bank and make its observer."""
     certificate = Certificate(prove_bank(design, level), bank_record(design)).require()
     return Observer(
         method=METHOD,

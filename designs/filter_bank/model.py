@@ -19,14 +19,13 @@ from obsynth.designs.core.record import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.model import continuous
 from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.symbolic import Plant, Signal
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
-__all__ = ["UNKNOWN", "BankDesign", "design_bank", "read_bank", "unknown_signals"]
 
-FloatArray = NDArray[np.float64]
 Integers = NDArray[np.int64]
 UNKNOWN = ("x", "w", "p", "rho", "f")
 """Kinds of signals that are not known at run time, besides measured scheduling variables."""
@@ -37,25 +36,15 @@ _DEFAULT_TS = 0.01
 class BankDesign:
     """Everything that is deployed and proved of the bank.
 
-    Attributes
-    ----------
-    plant : Plant
-        Continuous.
-    Ts : float
-    region : ndarray of shape (n, 2)
-        Where the equations are monotone, and where the states are assumed to be.
-    outputs : ndarray of shape (m,)
-        Which state each output shows.
-    scale : ndarray of shape (m,)
-    noise : ndarray of shape (m, 2)
-        Range of what is added to scale * state.
-    fault_rows : ndarray of shape (q,)
-        The state that each fault enters.
-    gain : ndarray of shape (q,)
-    signs : dict of str to ndarray of shape (n, number of signals)
-        Signs of the slopes of the equations, by the kinds of `UNKNOWN`.
-    filters : ndarray of shape (l,)
-    options : mapping
+    plant: continuous
+    region (n, 2): where the equations are monotone, and where the states are assumed to be
+    outputs (m,): which state each output shows
+    scale (m,)
+    noise (m, 2): range of what is added to scale * state
+    fault_rows (q,): the state that each fault enters
+    gain (q,)
+    signs (n, number of signals): signs of the slopes of the equations, by the kinds of `UNKNOWN`
+    filters (l,)
     """
 
     plant: Plant
@@ -91,13 +80,7 @@ class BankDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> BankDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             plant = Plant.from_dict(record["plant"])
             n, m, q = len(plant.x), len(plant.output), len(plant.f)
@@ -124,13 +107,7 @@ class BankDesign:
 
 
 def design_bank(model: Plant | Split, method: SetAdaptiveObserver) -> BankDesign:
-    """Read a plant for the bank, or refuse it by name.
-
-    Raises
-    ------
-    StructureError
-        Naming the fault or the equation that does not fit and what to do.
-    """
+    """Read a plant for the bank, or refuse it by name."""
     plant = continuous(model)
     region = plant.box("x") if method.region is None else np.asarray(method.region, dtype=float)
     if region.shape != (len(plant.x), 2) or not np.isfinite(region).all():

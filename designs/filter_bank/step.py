@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.filter_bank.model import UNKNOWN, BankDesign
 from obsynth.designs.set_adaptive.inputs import known_signals
 from obsynth.designs.set_adaptive.rounding import outward
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["bank_layout", "build_bank_ode", "build_bank_step", "first_memory"]
-
-FloatArray = NDArray[np.float64]
 _PASSES = 3
 _WIDER = 1.05
 _EXTRA = 1e-12
@@ -83,14 +80,7 @@ class Corners:
     ) -> ca.SX:
         """Return the least (side 0) or largest (1) derivative of a state over a box of states.
 
-        Parameters
-        ----------
-        row, side : int
-        low, high : casadi.SX of shape (n, 1)
-        own : casadi.SX, optional
-            Value of the state itself, in place of its two ends.
-        faults : bool
-            Over all declared faults, or without fault.
+        Shapes: low, high (n, 1).
         """
         design = self.design
         arguments = {}

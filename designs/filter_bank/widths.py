@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour.numbers import substitute
 from obsynth.designs.filter_bank.model import BankDesign
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["steady_half_widths"]
-
-FloatArray = NDArray[np.float64]
 # far above the rounding of the sums below
 _UP = 1.0 + 1e-9
 
@@ -29,14 +26,6 @@ def steady_half_widths(design: BankDesign) -> FloatArray | None:
     R_i, the envelope of a step is wider than the sets by 2 Ts R_i, so the widths w of the
     unmeasured states settle below (diag(d) - s)^-1 of what the other widths feed in, and the
     interval of a fault below (l (w_y + e_y) + sum_j s_ij e_j) / g with the envelopes e.
-
-    Examples
-    --------
-    >>> from obsynth.designs.set_adaptive import SetAdaptiveObserver
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> bank = SetAdaptiveObserver(robust=True).design(three_tanks())
-    >>> bank.half_widths.round(4).tolist()[:3]
-    [0.0045, 0.0045, 0.0096]
     """
     found = _slopes(design)
     if found is None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Majorant, Split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
@@ -16,11 +16,8 @@ from obsynth.designs.hinf.claims import decoupling_residual, prove_decoupling, p
 from obsynth.designs.hinf.derivation import prove_derivation
 from obsynth.designs.hinf.record import METHOD, HinfDesign
 from obsynth.designs.hinf.step import build_step, memory_layout
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["assemble", "prove", "to_record"]
-
-FloatArray = NDArray[np.float64]
 
 
 def to_record(design: HinfDesign) -> dict[str, Any]:
@@ -29,15 +26,7 @@ def to_record(design: HinfDesign) -> dict[str, Any]:
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
-    """Prove everything that the guarantee of a stored design rests on.
-
-    Parameters
-    ----------
-    record : mapping
-        Of `to_record`.
-    level : {"full", "lmi"}
-        Whether the split, the Jacobian bounds and the majorant are derived again.
-    """
+    """Prove everything that the guarantee of a stored design rests on."""
     return _prove(HinfDesign.from_record(record), level)
 
 
@@ -51,20 +40,7 @@ def assemble(
     level: Level = "lmi",
     derived: tuple[Split, JacobianBounds, Majorant | None] | None = None,
 ) -> Observer:
-    """Prove a design and make its observer.
-
-    Parameters
-    ----------
-    record_or_design : mapping or HinfDesign
-    level : {"full", "lmi"}
-    derived : tuple of Split, JacobianBounds and Majorant, optional
-        What was just derived from the plant; proved too, without deriving it again.
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a design and make its observer."""
     if isinstance(record_or_design, HinfDesign):
         design = record_or_design
     else:

@@ -6,7 +6,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.hinf.lmis import (
@@ -21,9 +20,6 @@ from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
 from obsynth.designs.lmi import ExactMatrix, is_positive_definite, prove_positive_definite
 
-__all__ = ["decoupling_residual", "proof_blocks", "prove_decoupling", "prove_level"]
-
-FloatArray = NDArray[np.float64]
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational elimination at the worst vertex"
 # What rounding F and H may leave of the fault, relative to what they take away.
@@ -33,20 +29,7 @@ RESIDUAL = 1e-12
 def proof_blocks(
     design: HinfDesign, arithmetic: Arithmetic, data: FilterData | None = None
 ) -> dict[str, Any]:
-    """Form every matrix that has to be positive definite, in an arithmetic.
-
-    Parameters
-    ----------
-    design : HinfDesign
-    arithmetic : {"float", "enclosure", "exact"}
-    data : FilterData, optional
-        With one vertex, for exact matrices.
-
-    Returns
-    -------
-    dict of str to matrix
-        ``lmi``, with ``lipschitz`` (37) and ``Q`` for the printed form, and ``decay``.
-    """
+    """Form every matrix that has to be positive definite, in an arithmetic."""
     data = design.data if data is None else data
     bound = design.bound
 
@@ -74,13 +57,7 @@ def proof_blocks(
 
 
 def prove_level(design: HinfDesign) -> tuple[Claim, ...]:
-    """Prove every matrix inequality behind the level.
-
-    Returns
-    -------
-    tuple of Claim
-        ``lmi``, and ``lipschitz``, ``Q``, ``multipliers`` or ``decay`` where there are such.
-    """
+    """Prove every matrix inequality behind the level."""
     data, bound = design.data, design.bound
     count = data.count
     printed = bool(bound.printed.size)

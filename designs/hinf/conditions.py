@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import Split
 from obsynth.derive.errors import StructureError
 from obsynth.symbolic import Plant, Role
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["check_class", "check_decoupling", "check_detectability"]
-
-FloatArray = NDArray[np.float64]
 RANK = 1e-9
 
 
 def check_class(model: Plant) -> None:
-    """Refuse what is outside x+ = A x + B u + g(x, u) + L f + W w, y = C x.
-
-    Raises
-    ------
-    StructureError
-        For continuous time, no faults, no disturbances, sensor faults, uncertain parameters and
-        scheduling variables.
-    """
+    """Refuse what is outside x+ = A x + B u + g(x, u) + L f + W w, y = C x."""
     if model.Ts is None:
         raise StructureError(
             f"{model.name} is in continuous time and the H-infinity unknown input observer works "
@@ -72,13 +62,7 @@ def check_outputs(parts: Split) -> None:
 
 
 def check_decoupling(parts: Split) -> FloatArray:
-    """Check rank(C L) = rank(L) = s of (15) and return L, faults first, then unknown inputs.
-
-    Raises
-    ------
-    StructureError
-        Naming the faults that no output shows within one sample.
-    """
+    """Check rank(C L) = rank(L) = s of (15) and return L, faults first, then unknown inputs."""
     check_outputs(parts)
     model = parts.model
     names = (*model.names("f"), *model.names("d"))
@@ -127,11 +111,6 @@ def check_detectability(parts: Split, L: FloatArray, G: FloatArray, vertices: Fl
 
     Observability of (A, C), which the paper asks for beside (15), is not enough: a zero is a
     motion that the fault hides, however well the state could be seen without it.
-
-    Raises
-    ------
-    StructureError
-        With the mode, the states that move and the vertex.
     """
     n = len(parts.A)
     names = parts.model.names("x")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, majorant, split
 from obsynth.derive.errors import DerivationError
@@ -11,10 +10,8 @@ from obsynth.designs.bounded_error.derivation_proof import covers
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.sector import build_sector, covers_sector, derive_majorant
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["prove_derivation"]
-
-FloatArray = NDArray[np.float64]
 # Magnitude up to which signals without a declared range are covered.
 LARGEST_SIGNAL = 1e6
 # What rounding C and L may move in one step, relative to the sizes of the signals.
@@ -27,14 +24,7 @@ def prove_derivation(
     bounds: JacobianBounds | None = None,
     found: Majorant | None = None,
 ) -> tuple[Claim, ...]:
-    """Derive the split and what bounds g from the stored equations and compare.
-
-    Parameters
-    ----------
-    design : HinfDesign
-    parts, bounds, found : optional
-        What was derived a moment ago, so that it need not be derived twice.
-    """
+    """Derive the split and what bounds g from the stored equations and compare."""
     if parts is None:
         parts = split(design.plant, at=(design.x_at, design.u_at), linear=design.linear)
     L = np.hstack([parts.B_f, parts.D])

@@ -7,18 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.hinf.claims import RESIDUAL, decoupling_residual
 from obsynth.designs.hinf.model import Prepared
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.system import Filter
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["read_diagonal", "read_gains", "unstable_gains"]
-
-FloatArray = NDArray[np.float64]
 
 
 def read_diagonal(value: Any) -> tuple[float, ...]:
@@ -37,13 +34,7 @@ def read_diagonal(value: Any) -> tuple[float, ...]:
 
 
 def read_gains(design: HinfDesign, gains: Mapping[str, ArrayLike]) -> Filter:
-    """Return the filter of given gains; F, H and D as in (18)-(19) where they are not given.
-
-    Raises
-    ------
-    ObsynthError
-        For names, shapes and numbers that are no gains, and if F or H let the fault through.
-    """
+    """Return the filter of given gains; F, H and D as in (18)-(19) where they are not given."""
     data = design.data
     n, m, n_f = len(data.A), len(data.C), data.n_f
     shapes = {"K": (n, m), "F": (n, m), "H": (n_f, m), "D": (n_f, m)}

@@ -10,37 +10,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.hinf.system import Arithmetic, Filter, FilterData, Sector, lift
 from obsynth.designs.lmi import symmetric_block
-
-__all__ = [
-    "Loop",
-    "PrintedLoop",
-    "decay_block",
-    "dissipation_block",
-    "loop_of_filter",
-    "printed_block",
-    "printed_bound",
-]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
     """The error system with P multiplied in, so that it is affine in the unknowns.
 
-    Attributes
-    ----------
-    P : (n, n)
-    PG : (n, n)
-        P (I - F C).
-    PKC : (n, n)
-        P K C.
-    HC, DC : (n_f, n)
-    A, W : (n, n) or a family, (n, n_w)
+    P (n, n)
+    PG (n, n): P (I - F C)
+    PKC (n, n): P K C
+    HC, DC (n_f, n)
+    A, W (n, n) or a family, (n, n_w)
     """
 
     P: Any
@@ -60,15 +44,7 @@ class Loop:
 def loop_of_filter(
     data: FilterData, gains: Filter, P: Any, arithmetic: Arithmetic = "float"
 ) -> Loop:
-    """Form the error system of given gains.
-
-    Parameters
-    ----------
-    data : FilterData
-    gains : Filter
-    P : expression, or matrix in the arithmetic
-    arithmetic : {"float", "enclosure", "exact"}
-    """
+    """Form the error system of given gains."""
     K, F, H, D = (lift(value, arithmetic) for value in (gains.K, gains.F, gains.H, gains.D))
     C = lift(data.C, arithmetic)
     return Loop(
@@ -107,12 +83,7 @@ def dissipation_block(
     sector and P not multiplied by two; at every vertex, without multipliers, where there is no
     sector.
 
-    Parameters
-    ----------
-    loop : Loop
-    mu2 : number or expression of shape (1, 1)
-    sector : Sector, optional
-    tau : sequence of (1, 1), one per group
+    Shapes: mu2 (1, 1).
     """
     n_f, n_w = loop.HC.shape[0], loop.W.shape[1]
     c = loop.HC @ loop.A + loop.DC

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.hinf.claims import prove_level
@@ -32,9 +32,7 @@ if TYPE_CHECKING:
     from obsynth.designs.lmi import Problem
     from obsynth.symbolic import Plant
 
-__all__ = ["HinfUIO"]
 
-FloatArray = NDArray[np.float64]
 METHODS = ("standard", "polytopic", "general")
 FORMS = ("corrected", "printed")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, majorant, split
 from obsynth.designs.hinf.conditions import check_class, check_decoupling, check_detectability
@@ -14,22 +13,12 @@ from obsynth.designs.hinf.sector import Multipliers, build_sector, derive_majora
 from obsynth.designs.hinf.system import Filter
 from obsynth.symbolic import Plant
 
-__all__ = ["Prepared", "prepare"]
-
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A model of the class (1)-(2) with everything derived from it.
 
-    Attributes
-    ----------
-    split : Split
-    bounds : JacobianBounds
-    majorant : Majorant or None
-    design : HinfDesign
-        Complete except for gains and bound, which are zero.
+    design: complete except for gains and bound, which are zero
     """
 
     split: Split
@@ -45,27 +34,7 @@ def prepare(
     given: tuple[float, ...] | None = None,
     bounds: JacobianBounds | None = None,
 ) -> Prepared:
-    """Split, check the structural conditions, bound the nonlinearity.
-
-    Parameters
-    ----------
-    model_or_split : Plant or Split
-        Discrete time; a plant is split with ``linear="terms"``.
-    multipliers : {"single", "per_row", "per_entry"} or None
-        None for the vertices of the Jacobian.
-    drop_zero_rows : bool
-    given : tuple of float, optional
-        Diagonal of M'M.
-    bounds : JacobianBounds, optional
-        Of the split's g, where they are at hand.
-
-    Raises
-    ------
-    StructureError
-        If the model is outside the class, rank(C L) = rank(L) fails, or a zero is not stable.
-    UnboundedError
-        If an entry of the Jacobian is not bounded over the box.
-    """
+    """Split, check the structural conditions, bound the nonlinearity."""
     model = model_or_split if isinstance(model_or_split, Plant) else model_or_split.model
     check_class(model)
     if isinstance(model_or_split, Plant):

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["OperatingPoints", "frozen_gain", "hold_points", "search_points"]
-
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 FREQUENCIES = 48
 REFINEMENTS = 6
@@ -29,11 +27,8 @@ DISTANCE = 1e-3
 class OperatingPoints:
     """Points (x, u, v) with x = f(x, u, v): v are the faults and unknown inputs that hold them.
 
-    Attributes
-    ----------
-    x, u, v : ndarray of shape (N, n), (N, n_u), (N, s)
-    jacobian : ndarray of shape (N, n, n)
-        Of the right-hand side by x.
+    x, u, v (N, n), (N, n_u), (N, s)
+    jacobian (N, n, n): of the right-hand side by x
     """
 
     x: FloatArray
@@ -82,12 +77,7 @@ def hold_points(
     Gauss-Newton on x = f(x, u, v), steps of least norm; what does not converge or ends outside
     the ranges of x and u is left out.
 
-    Parameters
-    ----------
-    model : Plant
-    x, u : ndarray of shape (N, n), (N, n_u)
-    functions : tuple of casadi.Function, optional
-        Right-hand side and slopes, where they are at hand.
+    Shapes: x, u (N, n), (N, n_u).
     """
     rhs, slopes = functions or _functions(model)
     n, n_u = x.shape[1], u.shape[1]
@@ -124,22 +114,7 @@ def frozen_gain(
 ) -> tuple[FloatArray, FloatArray, ComplexArray]:
     """Return the peak gain from w to f - fhat of the error linearised with given Jacobians.
 
-    Parameters
-    ----------
-    design : HinfDesign
-    jacobian : ndarray of shape (N, n, n)
-        A + M, constant in time.
-    refinements : int
-        How often the grid of frequencies is narrowed around its peak.
-
-    Returns
-    -------
-    gain : ndarray of shape (N,)
-        Infinite where the error is unstable.
-    frequency : ndarray of shape (N,)
-        In radians per sample.
-    direction : ndarray of shape (N, n_w)
-        Right singular vector at the peak.
+    Shapes: jacobian (N, n, n), gain (N,), frequency (N,), direction (N, n_w).
     """
     gains, C, W = design.gains, design.C, design.W
     kept = np.eye(len(C.T)) - gains.F @ C
@@ -170,17 +145,7 @@ def frozen_gain(
 def search_points(
     design: HinfDesign, count: int = 256, seed: int = 0, keep: int = 4
 ) -> OperatingPoints:
-    """Find the operating points with the largest frozen gains: samples, then a random ascent.
-
-    Parameters
-    ----------
-    design : HinfDesign
-    count : int
-        Random points to start with.
-    seed : int
-    keep : int
-        How many are returned, best first.
-    """
+    """Find the operating points with the largest frozen gains: samples, then a random ascent."""
     rng = np.random.default_rng(seed)
     model, functions = design.plant, _functions(design.plant)
     boxes = [_finite(model.box(kind)) for kind in ("x", "u")]

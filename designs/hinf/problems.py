@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.hinf.lmis import (
     Loop,
@@ -23,9 +22,6 @@ from obsynth.designs.hinf.lmis import (
 from obsynth.designs.hinf.system import Filter, FilterData
 from obsynth.designs.lmi import Problem, full, scalar, symmetric, trace
 
-__all__ = ["CAP", "MARGIN", "Structure", "multipliers", "open_loop", "state_problem"]
-
-FloatArray = NDArray[np.float64]
 Structure = Literal["standard", "general", "printed"]
 
 # Several infima need one direction of P to go to infinity; within these limits, in units in
@@ -45,30 +41,7 @@ def state_problem(
     margin: float = MARGIN,
     cap: float = CAP,
 ) -> Problem:
-    """State the design LMI, or with `gains` the analysis LMI.
-
-    Parameters
-    ----------
-    data : FilterData
-        In any units.
-    structure : {"standard", "general", "printed"}
-    mu : float or None
-        A level to keep at the smallest trace of P; None minimises ``mu2``, its square.
-    decay : float, optional
-        Also ask for V+ < decay V where w = 0.
-    gains : Filter, optional
-    margin : float
-        Smallest eigenvalue asked of the inequalities.
-    cap : float
-        Largest eigenvalue of P.
-
-    Returns
-    -------
-    Problem
-        With ``P``, ``N`` = P K, ``tau1``, ...; ``N2`` = P Z Pi, ``Y`` = Y Pi in coordinates of
-        the rows of `FilterData.null` and ``D`` for the general filter; ``Q``, ``alpha`` and
-        ``beta`` for (45).
-    """
+    """State the design LMI, or with `gains` the analysis LMI."""
     name = "least mu" if mu is None else f"mu = {mu:.6g}"
     problem = Problem(f"H-infinity {'analysis' if gains else 'design'}, {name}")
     P = symmetric("P", len(data.A))

@@ -9,7 +9,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import AffineFamily
 from obsynth.derive.split import LinearForm
@@ -18,32 +17,23 @@ from obsynth.designs.core.record import plain_fields, read_array, read_family, r
 from obsynth.designs.hinf.system import Filter, FilterData, Sector
 from obsynth.designs.lmi import Enclosure
 from obsynth.symbolic import Plant
-
-__all__ = ["METHOD", "Bound", "HinfDesign", "enclosed_vertices"]
+from obsynth.symbolic.arrays import FloatArray
 
 METHOD = "hinf_uio"
 MOST_VERTICES = 2**12
 LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
     """What proves the attenuation level.
 
-    Attributes
-    ----------
-    mu : float
-        |f - fhat| <= mu |w| in the sense of energies, e_0 = 0.
-    P : ndarray of shape (n, n)
-        V = e'Pe; with the printed form V = e'Pe + s'Qs.
-    tau : ndarray of shape (n_groups,)
-        Multipliers; none with vertices or the printed form.
-    printed : ndarray of shape (0,) or (2 + n n,)
-        alpha, beta and Q of (45), by rows.
-    decay : float or None
-        V+ < decay V where w = 0.
-    tau_decay : ndarray of shape (n_groups,)
+    mu: |f - fhat| <= mu |w| in the sense of energies, e_0 = 0
+    P (n, n): V = e'Pe; with the printed form V = e'Pe + s'Qs
+    tau (n_groups,): multipliers; none with vertices or the printed form
+    printed (0,) or (2 + n n,): alpha, beta and Q of (45), by rows
+    decay: V+ < decay V where w = 0
+    tau_decay (n_groups,)
     """
 
     mu: float
@@ -63,25 +53,14 @@ class Bound:
 class HinfDesign:
     """Everything that is deployed and proved, in doubles.
 
-    Attributes
-    ----------
-    plant : Plant
-        The discrete plant.
-    linear : str
-        How A was chosen, see `obsynth.split`.
-    x_at, u_at : ndarray of shape (n,), (n_u,)
-    A, B, C, L, W : ndarray
-        Shapes (n, n), (n, n_u), (m, n), (n, s), (n, n_w).
-    A_radius, W_radius : ndarray
-        Distance of the plant's own coefficients from these doubles.
-    family : AffineFamily
-        The set of Jacobians of g.
-    sector : Sector or None
-        What the multipliers weigh; None for the vertices of the family.
-    gains : Filter
-    bound : Bound
-    options : mapping
-        The options of the method, as given, and ``least_mu``: what the solver found.
+    plant: the discrete plant
+    linear: how A was chosen, see `obsynth.split`
+    x_at, u_at (n,), (n_u,)
+    A, B, C, L, W: shapes (n, n), (n, n_u), (m, n), (n, s), (n, n_w)
+    A_radius, W_radius: distance of the plant's own coefficients from these doubles
+    family: the set of Jacobians of g
+    sector: what the multipliers weigh; None for the vertices of the family
+    options: the options of the method, as given, and ``least_mu``: what the solver found
     """
 
     plant: Plant
@@ -131,13 +110,7 @@ class HinfDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> HinfDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, of the wrong shape or out of range.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             design = _read(record)
         radii = (design.A_radius, design.W_radius)
@@ -152,20 +125,7 @@ class HinfDesign:
 
 
 def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
-    """Enclose the matrices ``constant + sum_k s_k direction_k`` at the corners of the ranges.
-
-    Parameters
-    ----------
-    family : AffineFamily
-    every : bool
-        False: above `MOST_VERTICES` corners, take the middle and the ends of one range at a time
-        instead, which lie in the family too.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If there are more vertices than a design can use.
-    """
+    """Enclose the matrices ``constant + sum_k s_k direction_k`` at the corners of the ranges."""
     ends = [sorted(set(pair)) for pair in family.ranges.tolist()]
     if family.vertex_count <= MOST_VERTICES:
         corners = list(product(*ends))

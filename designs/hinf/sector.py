@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import Majorant, Split, majorant
 from obsynth.derive.errors import DerivationError
 from obsynth.designs.hinf.system import Sector
 
-__all__ = ["MULTIPLIERS", "Multipliers", "build_sector", "covers_sector", "derive_majorant"]
-
-FloatArray = NDArray[np.float64]
 Multipliers = Literal["single", "per_row", "per_entry"]
 MULTIPLIERS: tuple[Multipliers, ...] = ("single", "per_row", "per_entry")
 # Covers the rounding of one square.
@@ -24,19 +20,7 @@ ROOM = 1.0 + 2.0**-28
 
 
 def derive_majorant(parts: Split, given: tuple[float, ...] | None = None) -> Majorant:
-    """Derive M'M, or prove that a given diagonal is one.
-
-    Parameters
-    ----------
-    parts : Split
-    given : tuple of float, optional
-        Diagonal of M'M, one number per state; counted as 4e-9 of itself larger.
-
-    Raises
-    ------
-    DerivationError
-        If the given diagonal is no majorant; with the factor that is missing.
-    """
+    """Derive M'M, or prove that a given diagonal is one."""
     if given is None:
         return majorant(parts)
     names = parts.model.names("x")
@@ -63,22 +47,7 @@ def build_sector(
     drop_zero_rows: bool,
     given: tuple[float, ...] | None = None,
 ) -> Sector | None:
-    """Make the sector of a majorant, None where g has no part to bound.
-
-    Parameters
-    ----------
-    found : Majorant
-    multipliers : {"single", "per_row", "per_entry"}
-        One for g as a whole, (35); one per row of g; one per entry of its Jacobian.
-    drop_zero_rows : bool
-        Leave out the rows of s that are zero, so that nothing is assumed to come from there.
-    given : tuple of float, optional
-        Diagonal that takes the place of the majorant's own.
-
-    Returns
-    -------
-    Sector or None
-    """
+    """Make the sector of a majorant, None where g has no part to bound."""
     n = len(found.diagonal)
     eye = np.eye(n)
     if multipliers == "single":

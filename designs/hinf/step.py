@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.stepping import (
     all_finite,
@@ -18,13 +17,10 @@ from obsynth.designs.core.stepping import (
     status_word,
 )
 from obsynth.designs.hinf.system import Filter
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.symbolic import Plant
-
-__all__ = ["build_step", "memory_layout", "output_box", "predict"]
-
-FloatArray = NDArray[np.float64]
 
 
 def memory_layout(n: int, m: int) -> dict[str, slice]:
@@ -78,16 +74,7 @@ def build_step(model: Plant, A: FloatArray, C: FloatArray, gains: Filter) -> ca.
 
     The first sample has no prediction behind it: xhat_0 is the guess.
 
-    Parameters
-    ----------
-    model : Plant
-        Discrete; states (n,), outputs (m,), faults (n_f,).
-    A, C : ndarray of shape (n, n), (m, n)
-    gains : Filter
-
-    Returns
-    -------
-    casadi.Function
+    Shapes: A, C (n, n), (m, n).
     """
     n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), len(C)
     layout = memory_layout(n, m)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.hinf.lmis import decay_block
@@ -22,10 +21,8 @@ from obsynth.designs.lmi import (
     solve_with_retries,
     symmetric,
 )
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Found", "find_filter", "find_level", "find_storage", "unstable_vertex"]
-
-FloatArray = NDArray[np.float64]
 Values = Mapping[str, FloatArray]
 
 # Asked for in turn where the solver does not cope with the one before.
@@ -44,12 +41,9 @@ GAP = 1e-6
 class Found:
     """A storage function that shows a level, in the plant's units.
 
-    Attributes
-    ----------
-    P : ndarray of shape (n, n)
-    tau, tau_decay : ndarray of shape (n_groups,)
-    printed : ndarray of shape (0,) or (2 + n n,)
-        alpha, beta and Q of (45).
+    P (n, n)
+    tau, tau_decay (n_groups,)
+    printed (0,) or (2 + n n,): alpha, beta and Q of (45)
     """
 
     P: FloatArray
@@ -83,13 +77,7 @@ def find_level(
     decay: float | None = None,
     gains: Filter | None = None,
 ) -> float:
-    """Find the least mu, to the solver's accuracy, not below what `LEAST_LEVEL` stands for.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no mu is feasible.
-    """
+    """Find the least mu, to the solver's accuracy, not below what `LEAST_LEVEL` stands for."""
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
     given = None if gains is None else units.filter_from_plant(gains)
@@ -140,15 +128,7 @@ def _bisected(
 
 
 def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] = CAPS) -> Solution:
-    """Solve under the first cap of P that the solver copes with.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If there is no room under the largest cap.
-    SolverTrouble
-        If there is, but no problem is solved.
-    """
+    """Solve under the first cap of P that the solver copes with."""
     troubles: list[SolverTrouble] = []
     for cap in caps:
         try:
@@ -167,13 +147,7 @@ def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] 
 def find_filter(
     data: FilterData, structure: Structure, mu: float, decay: float | None = None
 ) -> tuple[Filter, Found]:
-    """Find the gains with the smallest trace of P at a level.
-
-    Raises
-    ------
-    InfeasibleDesign
-        As the solver reports; the caller explains.
-    """
+    """Find the gains with the smallest trace of P at a level."""
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
 
@@ -225,13 +199,7 @@ def find_storage(
     gains: Filter,
     decay: float | None = None,
 ) -> Found:
-    """Find the storage function of given gains with the most room at a level.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If there is no room.
-    """
+    """Find the storage function of given gains with the most room at a level."""
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
     given = units.filter_from_plant(gains)

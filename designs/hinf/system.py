@@ -14,13 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.lmi import Enclosure, ExactMatrix
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Arithmetic", "Filter", "FilterData", "Sector", "Units", "find_units", "lift"]
-
-FloatArray = NDArray[np.float64]
 Arithmetic = Literal["float", "enclosure", "exact"]
 # Smallest unit of a coordinate, as a share of the largest: a state that no disturbance reaches
 # within a few steps keeps a unit that is not zero.
@@ -39,13 +36,9 @@ def lift(value: FloatArray, arithmetic: Arithmetic, radius: FloatArray | float =
 class Sector:
     """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
 
-    Attributes
-    ----------
-    E : ndarray of shape (n, k)
-        Where every phi enters.
-    group : tuple of int
-        Group of every phi, k of them; one multiplier per group.
-    R : ndarray of shape (n_groups, n)
+    E (n, k): where every phi enters
+    group: group of every phi, k of them; one multiplier per group
+    R (n_groups, n)
     """
 
     E: FloatArray
@@ -76,23 +69,15 @@ class Filter:
 class FilterData:
     """Matrices of the plant and what bounds its nonlinearity.
 
-    Attributes
-    ----------
-    A, C, L, W : ndarray
-        Shapes (n, n), (m, n), (n, s), (n, n_w); L stacks faults and unknown inputs.
-    H : ndarray of shape (s, m)
-        (C L)^+ in doubles.
-    n_f : int
-        The first n_f columns of L are faults; only their estimates count.
-    null : ndarray of shape (m - s, m)
-        Rows that see no fault: null C L = 0.
-    A_radius, W_radius : ndarray
-        How far the plant's own coefficients may be from the doubles.
-    vertices : ndarray of shape (N, n, n)
-        Of the Jacobian of g; with multipliers and too many vertices, some matrices of the set.
-    vertex_radius : ndarray of shape (N, n, n)
-    sector : Sector or None
-        Used in place of the vertices where it is there.
+    A, C, L, W: shapes (n, n), (m, n), (n, s), (n, n_w); L stacks faults and unknown inputs
+    H (s, m): (C L)^+ in doubles
+    n_f: the first n_f columns of L are faults; only their estimates count
+    null (m - s, m): rows that see no fault: null C L = 0
+    A_radius, W_radius: how far the plant's own coefficients may be from the doubles
+    vertices (N, n, n): of the Jacobian of g; with multipliers and too many vertices, some matrices
+        of the set
+    vertex_radius (N, n, n)
+    sector: used in place of the vertices where it is there
     """
 
     A: FloatArray
@@ -148,11 +133,8 @@ class FilterData:
 class Units:
     """Sizes of one unit of x, y, f and phi, powers of two, in which all numbers are about one.
 
-    Attributes
-    ----------
-    x, y : ndarray of shape (n,), (m,)
-    f : float
-    phi : ndarray of shape (n_groups,)
+    x, y (n,), (m,)
+    phi (n_groups,)
     """
 
     x: FloatArray
@@ -205,19 +187,7 @@ class Units:
 
 
 def find_units(data: FilterData, uniform: bool = False) -> Units:
-    """Find typical sizes: the covariance of the error under white w of unit intensity.
-
-    Parameters
-    ----------
-    data : FilterData
-    uniform : bool
-        One unit for all states and for phi: the identities in (45) stand for |s|^2, which other
-        units of the states would weigh.
-
-    Returns
-    -------
-    Units
-    """
+    """Find typical sizes: the covariance of the error under white w of unit intensity."""
     A = data.A + data.vertices.mean(axis=0)
     A = A * min(1.0, 0.9 / max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9))
     noise = data.W @ data.W.T

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.hinf.operating_points import OperatingPoints, frozen_gain, search_points
 from obsynth.designs.hinf.record import METHOD, HinfDesign
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["WorstCase", "worst_case"]
-
-FloatArray = NDArray[np.float64]
 CHUNK = 500
 # A longer disturbance is tried until the gain is this close to that of the linearisation.
 CLOSE = 1.0 - 1e-6

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, nearest
+from obsynth.derive.rigour.exact_arrays import Exact, exact, nearest
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import with_header
@@ -16,8 +16,7 @@ from obsynth.designs.interval.model import LARGEST_SIGNAL, IntervalModel
 from obsynth.designs.interval.record import METHOD, IntervalDesign
 from obsynth.designs.interval.start import make_start
 from obsynth.designs.interval.step import build_step, memory_layout
-
-__all__ = ["assemble", "prove", "to_record"]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def to_record(design: IntervalDesign) -> dict[str, Any]:
@@ -26,15 +25,7 @@ def to_record(design: IntervalDesign) -> dict[str, Any]:
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
-    """Prove everything that the guarantee of a stored design rests on.
-
-    Parameters
-    ----------
-    record : mapping
-        Of `to_record`.
-    level : {"full", "lmi"}
-        Whether the quasi-LPV form is derived again from the stored equations.
-    """
+    """Prove everything that the guarantee of a stored design rests on."""
     return _prove(IntervalDesign.from_record(record), level)
 
 
@@ -48,20 +39,7 @@ def assemble(
     level: Level = "lmi",
     derived: IntervalModel | None = None,
 ) -> Observer:
-    """Prove a design and make its observer.
-
-    Parameters
-    ----------
-    record_or_design : mapping or IntervalDesign
-    level : {"full", "lmi"}
-    derived : IntervalModel, optional
-        What was just derived from the plant; compared, without deriving it again.
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a design and make its observer."""
     if isinstance(record_or_design, IntervalDesign):
         design = record_or_design
     else:

@@ -16,8 +16,6 @@ from obsynth.designs.interval.rows import UNIT, Rows
 from obsynth.designs.interval.theorem import NEGATIVE
 from obsynth.designs.interval.widths import steady_holds
 
-__all__ = ["derive_again", "prove_design", "prove_model"]
-
 EXACT = "exact rational arithmetic on the stored numbers"
 
 
@@ -113,14 +111,7 @@ def derive_again(design: IntervalDesign) -> IntervalModel:
 
 
 def prove_model(design: IntervalDesign, fresh: IntervalModel | None = None) -> tuple[Claim, ...]:
-    """Compare the stored matrices with those derived from the stored equations.
-
-    Parameters
-    ----------
-    design : IntervalDesign
-    fresh : IntervalModel, optional
-        What was derived a moment ago.
-    """
+    """Compare the stored matrices with those derived from the stored equations."""
     if fresh is None:
         fresh = derive_again(design)
     stored = design.model

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, inverse, nearest
+from obsynth.derive.rigour.exact_arrays import Exact, exact, inverse, nearest
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic import ObsynthError
-
-__all__ = ["Decoupled", "Transformation", "decouple_exactly", "transformation"]
+from obsynth.symbolic.arrays import FloatArray
 
 RANK = 1e-9
 ORTHOGONAL = 1e-9
@@ -31,11 +30,7 @@ ORTHOGONAL = 1e-9
 class Transformation:
     """F = H [R0; 0] K0' and C H1 = N [R1; 0] K1', Section 4 of the paper.
 
-    Attributes
-    ----------
-    H, N : ndarray, shapes (n, n), (m, m)
-        Orthogonal.
-    R0, K0, R1, K1 : ndarray, shape (q, q)
+    H, N: orthogonal
     """
 
     H: FloatArray
@@ -50,17 +45,10 @@ class Transformation:
 class Decoupled:
     """The plant after the faults are taken away, exact.
 
-    Attributes
-    ----------
-    T2 : shape (n - q, n)
-        z2 = T2 x is free of the faults.
-    N12 : shape (m - q, m)
-        N12 y = C2 z2 + N12 W2 w.
-    Phi, W : shapes (n, m), (n, n - q)
-        x = Phi (y - W2 w) + W z2.
-    F_left : shape (q, n)
-        Left inverse of F.
-    C2 : shape (m - q, n - q)
+    T2: z2 = T2 x is free of the faults
+    N12: N12 y = C2 z2 + N12 W2 w
+    Phi, W: x = Phi (y - W2 w) + W z2
+    F_left: left inverse of F
     """
 
     T2: Exact
@@ -74,22 +62,7 @@ class Decoupled:
 def transformation(
     model: IntervalModel, given: Mapping[str, FloatArray | None] | None = None
 ) -> Transformation:
-    """Return the transformation: singular value decompositions, or what was given.
-
-    Parameters
-    ----------
-    model : IntervalModel
-    given : mapping, optional
-        ``H`` with ``R0`` and ``K0`` (R0 = H1'F and K0 = I where they are not given), and ``N``
-        with ``R1`` and ``K1`` (likewise).
-
-    Raises
-    ------
-    StructureError
-        If rank(F) < q or rank(C F) < q; faults, states and ranks are named.
-    ObsynthError
-        If a given matrix is not what it has to be.
-    """
+    """Return the transformation: singular value decompositions, or what was given."""
     given = dict(given or {})
     F, C = nearest(model.F), nearest(model.C)
     _check_ranks(model, F, C)
@@ -200,13 +173,7 @@ def _rank(matrix: FloatArray) -> int:
 
 
 def decouple_exactly(model: IntervalModel, chosen: Transformation) -> Decoupled:
-    """Project the transformation onto matrices that decouple exactly.
-
-    Raises
-    ------
-    ObsynthError
-        If the stored matrices are so far from a transformation that an inverse does not exist.
-    """
+    """Project the transformation onto matrices that decouple exactly."""
     F, C, q = model.F, model.C, model.q
     H, N = exact(chosen.H), exact(chosen.N)
     T2 = _free_of(H[:, q:].T, F)

@@ -8,23 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour.exact_arrays import FloatArray, nearest
+from obsynth.derive.rigour.exact_arrays import nearest
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel, columns_of
 from obsynth.designs.lmi import Problem, diagonal, full
 from obsynth.symbolic import ObsynthError
-
-__all__ = [
-    "Reduced",
-    "check_detectable",
-    "lp_gain",
-    "lp_problem",
-    "placed_gains",
-    "predicted_size",
-    "refined",
-    "sylvester_gain",
-]
+from obsynth.symbolic.arrays import FloatArray
 
 MODE = 1e-9
 MOST_SKEW = 1e7
@@ -35,24 +25,13 @@ UNBOUNDED = 1e6
 class Reduced:
     """The plant without its faults, in doubles, one matrix per vertex.
 
-    Attributes
-    ----------
-    A : ndarray, shape (N, n - q, n - q)
-        T2 A_i W.
-    D : ndarray, shape (N, n - q, m)
-        T2 A_i Phi.
-    C2, N12 : ndarray, shapes (m - q, n - q), (m - q, m)
-    W1, W2 : ndarray, shapes (n - q, n_w), (m, n_w)
-        T2 W1, and W2.
-    w_width : ndarray, shape (n_w,)
-    y_size : ndarray, shape (m,)
-        Largest |y| over the declared boxes.
-    W : ndarray, shape (n, n - q)
-        x = W z2 and a share that the measurement gives.
-    changes : ndarray, shape (K, n - q, n + n_u + 1)
-        T2 times what every scheduling scalar changes over its range in [A B o].
-    signals : ndarray, shape (n + n_u + 1,)
-        Largest |x|, |u| and 1.
+    A: T2 A_i W
+    D: T2 A_i Phi
+    W1, W2: T2 W1, and W2
+    y_size: largest |y| over the declared boxes
+    W: x = W z2 and a share that the measurement gives
+    changes: T2 times what every scheduling scalar changes over its range in [A B o]
+    signals: largest |x|, |u| and 1
     """
 
     A: FloatArray
@@ -95,13 +74,7 @@ class Reduced:
 
 
 def check_detectable(model: IntervalModel, plant: Decoupled) -> None:
-    """Refuse a pair (A2, C2) with a mode that does not decay and is not seen, Assumption 4.
-
-    Raises
-    ------
-    StructureError
-        With the mode, the states that move and the vertex.
-    """
+    """Refuse a pair (A2, C2) with a mode that does not decay and is not seen, Assumption 4."""
     data = Reduced.of(model, plant)
     names = model.plant.names("x")
     for number, A in enumerate(data.A):
@@ -139,22 +112,6 @@ def lp_problem(data: Reduced, P: FloatArray) -> Problem:
     U >= |Lambda P W1 - (Lambda P D_i + Y N12) W2| at every vertex, lambda >= 0 and
     1'T <= lambda' - 1'|S|; minimise 1'U (w_upper - w_lower) + 1'|Lambda P (D_i - D_j)| |y|, an
     upper bound of the sum of the steady widths of z2.
-
-    Parameters
-    ----------
-    data : Reduced
-    P : ndarray, shape (n - q, n - q)
-        Regular.
-
-    Returns
-    -------
-    Problem
-        With the variables ``lambda``, ``Y``, ``T`` and ``U``.
-
-    Raises
-    ------
-    ObsynthError
-        If n = q, where no state is left to be bounded by a recursion.
     """
     n2, m2 = len(P), len(data.C2)
     if not n2:
@@ -186,13 +143,7 @@ def lp_problem(data: Reduced, P: FloatArray) -> Problem:
 
 
 def lp_gain(data: Reduced, P: FloatArray) -> FloatArray:
-    """Solve `lp_problem` and return L.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no L makes the errors of this P decay at all vertices in common.
-    """
+    """Solve `lp_problem` and return L."""
     if not len(data.C2) or not len(P):
         return np.zeros((len(P), len(data.C2)))
     try:
@@ -209,29 +160,7 @@ def lp_gain(data: Reduced, P: FloatArray) -> FloatArray:
 def sylvester_gain(
     A2: FloatArray, C2: FloatArray, R: FloatArray, Q: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve P A2 - R P = Q C2 and return P and L = P^-1 Q, so that P (A2 - L C2) P^-1 = R.
-
-    Parameters
-    ----------
-    A2, C2 : ndarray, shapes (n2, n2), (m2, n2)
-    R : ndarray, shape (n2, n2)
-        Nonnegative, without a common eigenvalue with A2.
-    Q : ndarray, shape (n2, m2)
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the equation has no regular solution.
-
-    Examples
-    --------
-    The paper's P and L:
-
-    >>> A2, C2 = np.array([[0.0, 0.0], [-1.0, -1.0]]), np.array([[0.0, 1.0]])
-    >>> P, L = sylvester_gain(A2, C2, np.diag([0.5, 0.6]), np.array([[7.5], [-9.6]]))
-    >>> P.round(9).tolist(), L.round(9).ravel().tolist()
-    ([[10.0, -5.0], [-10.0, 6.0]], [-0.3, -2.1])
-    """
+    """Solve P A2 - R P = Q C2 and return P and L = P^-1 Q, so that P (A2 - L C2) P^-1 = R."""
     from scipy.linalg import solve_sylvester
 
     n2, m2 = len(A2), len(C2)

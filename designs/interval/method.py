@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
-from obsynth.derive.rigour.exact_arrays import FloatArray
 from obsynth.designs.interval.decoupling import decouple_exactly, transformation
 from obsynth.designs.interval.gains import Reduced, check_detectable, lp_problem
 from obsynth.designs.interval.model import IntervalModel, model_of
@@ -26,6 +25,7 @@ from obsynth.designs.interval.synthesis import (
     with_gains,
 )
 from obsynth.symbolic import ObsynthError, Plant
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
 
-__all__ = ["IntervalObserver"]
 
 TRANSFORMATION = ("H", "R0", "K0", "N", "R1", "K1")
 Matrix = tuple[tuple[float, ...], ...]

@@ -13,11 +13,10 @@ import numpy as np
 from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, from_text, to_text
+from obsynth.derive.rigour.exact_arrays import Exact, exact, from_text, to_text
 from obsynth.designs.core.record import plain, read_family, reading
 from obsynth.symbolic import Plant, Role
-
-__all__ = ["LARGEST_SIGNAL", "IntervalModel", "columns_of", "model_of"]
+from obsynth.symbolic.arrays import FloatArray
 
 MOST_VERTICES = 1024
 LARGEST_SIGNAL = 1e6
@@ -28,17 +27,10 @@ LARGEST_SIGNAL = 1e6
 class IntervalModel:
     """x+ = A(rho) x + B(rho) u + o(rho) + F (f, d) + W1 w and y = C x + W2 w.
 
-    Attributes
-    ----------
-    plant : Plant
-        Discrete.
-    family : AffineFamily
-        The stacked matrix [A B o], shape (n, n + n_u + 1), affine in independent scalars.
-    F : array of fmpq, shape (n, q)
-        Columns of the faults, then of the unknown inputs.
-    C, W1, W2 : array of fmpq, shapes (m, n), (n, n_w), (m, n_w)
-    scheduled : tuple of str
-        States and inputs on whose declared range the family rests.
+    plant: discrete
+    family: the stacked matrix [A B o], shape (n, n + n_u + 1), affine in independent scalars
+    F: columns of the faults, then of the unknown inputs
+    scheduled: states and inputs on whose declared range the family rests
     """
 
     plant: Plant
@@ -101,13 +93,7 @@ class IntervalModel:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> IntervalModel:
-        """Read the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read the data of `to_record`."""
         with reading():
             plant = Plant.from_dict(record["plant"])
             n, m, n_w = len(plant.x), len(plant.output), len(plant.w)
@@ -126,22 +112,7 @@ class IntervalModel:
 
 
 def model_of(form: QuasiLPV) -> IntervalModel:
-    """Read the matrices of a quasi-LPV form, refusing what is outside the class.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        Of a discrete plant, about the origin.
-
-    Raises
-    ------
-    StructureError
-        For continuous time, sensor faults, outputs that are not C x + W2 w with constant rational
-        C and W2, faults, unknown inputs or disturbances that enter with varying or irrational
-        coefficients, disturbances without a bound, too many vertices; the symbols are named.
-    UnboundedError
-        If a matrix entry is unbounded over the declared ranges.
-    """
+    """Read the matrices of a quasi-LPV form, refusing what is outside the class."""
     plant = form.model
     _check_class(form)
     polytope = form.vertices()

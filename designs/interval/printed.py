@@ -6,21 +6,13 @@ from collections.abc import Collection
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import (
-    FloatArray,
-    exact,
-    inverse,
-    nearest,
-    negative,
-    positive,
-)
+from obsynth.derive.rigour.exact_arrays import exact, inverse, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.model import columns_of
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Part
 from obsynth.symbolic import ObsynthError
-
-__all__ = ["FLAWS", "printed_faults", "refuse_printed"]
+from obsynth.symbolic.arrays import FloatArray
 
 FLAWS = ("y", "theta", "product")
 """Of (32): y_{k+1} in place of y_k; the upper theta_1 in the lower bound; K0 R0^-1 times bounds."""
@@ -34,27 +26,7 @@ def printed_faults(
     u: FloatArray,
     flaws: Collection[str] = FLAWS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Evaluate (32) for logged bounds of r, with all or some of its flaws.
-
-    Parameters
-    ----------
-    design : IntervalDesign
-        With a constant input matrix.
-    r_lower, r_upper : ndarray, shape (..., N + 1, n - q)
-    y, u : ndarray, shapes (..., N + 1, m), (..., N + 1, n_u)
-    flaws : collection of str
-        Of `FLAWS`; none gives the corrected bound.
-
-    Returns
-    -------
-    tuple of ndarray, shape (..., N, q)
-        Lower and upper bounds of f_0 .. f_{N-1}.
-
-    Raises
-    ------
-    ObsynthError
-        For a flaw that is not known.
-    """
+    """Evaluate (32) for logged bounds of r, with all or some of its flaws."""
     unknown = set(flaws) - set(FLAWS)
     if unknown:
         raise ObsynthError(f"flaws {sorted(unknown)} are not among {FLAWS}", option="flaws")

@@ -9,15 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import (
-    Exact,
-    FloatArray,
-    above,
-    exact,
-    inverse,
-    magnitude,
-    nearest,
-)
+from obsynth.derive.rigour.exact_arrays import Exact, above, exact, inverse, magnitude, nearest
 from obsynth.designs.core.record import read_array, reading
 from obsynth.designs.interval.decoupling import Decoupled, Transformation, decouple_exactly
 from obsynth.designs.interval.model import IntervalModel
@@ -37,8 +29,7 @@ from obsynth.designs.interval.widths import (
     part_width,
     row_widths,
 )
-
-__all__ = ["METHOD", "Bound", "IntervalDesign"]
+from obsynth.symbolic.arrays import FloatArray
 
 METHOD = "interval_observer"
 Bound = Literal["vertex", "paper"]
@@ -50,22 +41,12 @@ SMALL = 1e-12
 class IntervalDesign:
     """Everything that is deployed and proved.
 
-    Attributes
-    ----------
-    model : IntervalModel
-    chosen : Transformation
-        H, R0, K0, N, R1, K1 as stored.
-    nominal : ndarray, shape (n, n)
-        The A around which the paper's bound is taken.
-    P, L : ndarray, shapes (n - q, n - q), (n - q, m - q)
-    bound : {"vertex", "paper"}
-    contraction : bool
-    precision : {"double", "single"}
-        In which the step may be evaluated.
-    error, width : ndarray, shape (n - q,)
-        e* and w*: steady bounds of the errors and widths of r; empty before they are known.
-    options : mapping
-        The options of the method, as given.
+    chosen: H, R0, K0, N, R1, K1 as stored
+    nominal: the A around which the paper's bound is taken
+    precision: in which the step may be evaluated
+    error, width: e* and w*: steady bounds of the errors and widths of r; empty before they are
+        known
+    options: the options of the method, as given
     """
 
     model: IntervalModel
@@ -213,13 +194,7 @@ class IntervalDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> IntervalDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             model = IntervalModel.from_record(record["model"])
             n, q, m = model.n, model.q, len(model.C)

@@ -16,7 +16,6 @@ import numpy as np
 
 from obsynth.derive.rigour.exact_arrays import (
     Exact,
-    FloatArray,
     above,
     exact,
     hull,
@@ -26,17 +25,7 @@ from obsynth.derive.rigour.exact_arrays import (
 )
 from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel, columns_of
-
-__all__ = [
-    "UNIT",
-    "Part",
-    "Precision",
-    "Remainder",
-    "Rows",
-    "estimate_rows",
-    "measured_rows",
-    "state_rows",
-]
+from obsynth.symbolic.arrays import FloatArray
 
 Precision = Literal["double", "single"]
 UNIT: Mapping[Precision, float] = {"double": 2.0**-53, "single": 2.0**-24}
@@ -48,13 +37,8 @@ SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120
 class Rows:
     """upper = max_i U_i s and lower = min_i L_i s.
 
-    Attributes
-    ----------
-    sizes : mapping of str to int
-        The parts of s in their order; ``"one"`` is the constant 1.
-    upper, lower : tuple of exact arrays, shape (rows, len(s))
-    radius : exact array, shape (rows, len(s))
-        What the matrices may be off, as a coefficient of |s|.
+    sizes: the parts of s in their order; ``"one"`` is the constant 1
+    radius: what the matrices may be off, as a coefficient of |s|
     """
 
     sizes: Mapping[str, int]
@@ -106,13 +90,7 @@ class Part:
     With X = P T2 and Y = P L it is r of the next instant, with X = -F_left and Y = 0 the share of
     the fault that is known one instant before the rest.
 
-    Attributes
-    ----------
-    model : IntervalModel
-    plant : Decoupled
-    S : exact array, shape (n - q, n - q)
-        z2 = S r.
-    X, Y : exact arrays, shapes (rows, n), (rows, m - q)
+    S: z2 = S r
     """
 
     model: IntervalModel
@@ -231,13 +209,7 @@ class Part:
 class Remainder:
     """Nominal coefficients of a `Part` and elementwise bounds of what varies, (14)-(15).
 
-    Attributes
-    ----------
-    R : coefficients of r for the nominal A
-    sigma_lower, sigma_upper : bounds of the rest of the coefficients of r
-    M_lower, M_upper : bounds of the coefficients of y
-    noise : tuple of two exact arrays
-        Box of everything that the disturbances add.
+    noise: box of everything that the disturbances add
     """
 
     R: Exact

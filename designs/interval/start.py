@@ -7,13 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.exact_arrays import FloatArray
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.step import first_box, memory_layout
 from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic import ObsynthError
-
-__all__ = ["make_start"]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def make_start(design: IntervalDesign) -> Callable[..., FloatArray]:

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import Exact, FloatArray, exact, hull, nearest
+from obsynth.derive.rigour.exact_arrays import Exact, exact, hull, nearest
 from obsynth.designs.core.stepping import (
     all_finite,
     finite_or,
@@ -20,8 +20,7 @@ from obsynth.designs.core.stepping import (
 )
 from obsynth.designs.interval.record import SWEEPS, IntervalDesign
 from obsynth.designs.interval.rows import Rows
-
-__all__ = ["build_step", "first_box", "memory_layout"]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def memory_layout(n: int, n2: int, n_f: int) -> dict[str, slice]:
@@ -111,14 +110,7 @@ def _known(r_lower: ca.SX, r_upper: ca.SX, y: ca.SX, u: ca.SX) -> dict[str, ca.S
 
 
 def first_box(design: IntervalDesign, x_range: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of r for a box of states, rounded outwards in the precision of the step.
-
-    Parameters
-    ----------
-    design : IntervalDesign
-    x_range : ndarray, shape (n, 2)
-        Finite.
-    """
+    """Return bounds of r for a box of states, rounded outwards in the precision of the step."""
     low, high = exact(np.asarray(x_range, dtype=float)).T
     lower, upper = hull(exact(design.P) @ design.plant.T2, low, high)
     kind = np.float64 if design.precision == "double" else np.float32
@@ -150,18 +142,7 @@ def _contract(
 
 
 def build_step(design: IntervalDesign) -> ca.Function:
-    """Build `Observer.step`: contraction, sets of x_k and f_{k-1}, prediction.
-
-    Parameters
-    ----------
-    design : IntervalDesign
-
-    Returns
-    -------
-    casadi.Function
-        Every interval it returns is widened by the rounding errors of its own evaluation, in the
-        precision of the design.
-    """
+    """Build `Observer.step`: contraction, sets of x_k and f_{k-1}, prediction."""
     model, plant = design.model, design.model.plant
     n, n2, n_f, m = model.n, len(design.P), design.n_f, len(model.C)
     layout = memory_layout(n, n2, n_f)

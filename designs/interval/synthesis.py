@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import FloatArray, exact, nearest
+from obsynth.derive.rigour.exact_arrays import exact, nearest
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.gains import (
     Reduced,
@@ -20,16 +20,7 @@ from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError
-
-__all__ = [
-    "complete",
-    "given_gains",
-    "lp_design",
-    "read_gains",
-    "search_design",
-    "sylvester_design",
-    "with_gains",
-]
+from obsynth.symbolic.arrays import FloatArray
 
 STARTS = 3
 
@@ -54,13 +45,7 @@ def complete(design: IntervalDesign) -> IntervalDesign | None:
 def read_gains(
     design: IntervalDesign, P: FloatArray, L: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Check given gains.
-
-    Raises
-    ------
-    ObsynthError
-        If a shape is wrong or P singular.
-    """
+    """Check given gains."""
     m2, n2 = design.plant.C2.shape
     P, L = np.asarray(P, dtype=float), np.asarray(L, dtype=float)
     if P.shape != (n2, n2) or not np.isfinite(P).all() or np.linalg.matrix_rank(P) < n2:
@@ -73,15 +58,7 @@ def read_gains(
 
 
 def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign:
-    """Complete a design with given P and L; for L = None the linear programme chooses it.
-
-    Raises
-    ------
-    ObsynthError
-        If a shape is wrong or P singular.
-    InfeasibleDesign
-        If the bounds diverge.
-    """
+    """Complete a design with given P and L; for L = None the linear programme chooses it."""
     if L is None:
         zero = np.zeros((design.plant.C2.shape[1], design.plant.C2.shape[0]))
         P, _ = read_gains(design, P, zero)
@@ -94,13 +71,7 @@ def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> 
 
 
 def lp_design(design: IntervalDesign) -> IntervalDesign:
-    """Gains by the linear programme for P = I; where that has no solution, by `search_design`.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no P that was tried gives bounds that stay bounded.
-    """
+    """Gains by the linear programme for P = I; where that has no solution, by `search_design`."""
     data = Reduced.of(design.model, design.plant)
     identity = np.eye(data.A.shape[1])
     first = _try(design, identity, _programme(data, identity))
@@ -112,11 +83,6 @@ def search_design(design: IntervalDesign) -> IntervalDesign:
 
     Starts at the linear programme's gain for P = I and at gains that place real poles; what has
     the smallest steady widths is taken.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no P that was tried gives bounds that stay bounded.
     """
     data = Reduced.of(design.model, design.plant)
     identity = np.eye(data.A.shape[1])
@@ -149,13 +115,7 @@ def _try(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> Interva
 def sylvester_design(
     design: IntervalDesign, R: FloatArray | None, Q: FloatArray | None
 ) -> IntervalDesign:
-    """Gains by P A2 - R P = Q C2 for a nonnegative R: given, or the best of several diagonal ones.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the equation has no regular solution, or the bounds diverge.
-    """
+    """Gains by P A2 - R P = Q C2, R nonnegative: given, or the best of several diagonal ones."""
     data = Reduced.of(design.model, design.plant)
     A2 = nearest(design.plant.T2 @ exact(design.nominal) @ design.plant.W)
     n2, m2 = len(A2), len(data.C2)

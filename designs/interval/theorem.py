@@ -4,37 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import FloatArray, exact, nearest, negative, positive
+from obsynth.derive.rigour.exact_arrays import exact, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.record import IntervalDesign
-
-__all__ = ["NEGATIVE", "comparison_radius", "divergence", "largest_alpha", "lipschitz_alpha"]
+from obsynth.symbolic.arrays import FloatArray
 
 NEGATIVE = 1e-9
 """How far below zero rounded gains may leave an entry of R that is meant to be zero."""
 
 
 def lipschitz_alpha(sigma_lower: FloatArray, sigma_upper: FloatArray) -> float:
-    """Return alpha = 2 max{a1 + b1, a2 + b2} of Theorem 1, with the constants of (14).
-
-    Examples
-    --------
-    >>> lipschitz_alpha(np.array([[-0.05]]), np.array([[0.05]]))
-    0.2
-    """
+    """Return alpha = 2 max{a1 + b1, a2 + b2} of Theorem 1, with the constants of (14)."""
     up = float(np.linalg.norm(positive(sigma_upper), 2))
     down = float(np.linalg.norm(negative(sigma_lower), 2))
     return 2.0 * (up + down)
 
 
 def largest_alpha(R: FloatArray) -> float:
-    """Return the largest alpha for which (20) is feasible: 1 / ||(z I - R)^-1||_inf, 0 if unstable.
-
-    Examples
-    --------
-    >>> round(largest_alpha(np.diag([0.5, 0.6])), 6)
-    0.4
-    """
+    """Return the largest alpha of (20): 1 / ||(z I - R)^-1||_inf, 0 if unstable."""
     if np.abs(np.linalg.eigvals(R)).max(initial=0.0) >= 1.0:
         return 0.0
     eye = np.eye(len(R))

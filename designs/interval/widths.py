@@ -17,7 +17,6 @@ import numpy as np
 
 from obsynth.derive.rigour.exact_arrays import (
     Exact,
-    FloatArray,
     above,
     exact,
     inverse,
@@ -28,17 +27,7 @@ from obsynth.derive.rigour.exact_arrays import (
 )
 from obsynth.designs.interval.model import columns_of
 from obsynth.designs.interval.rows import Part, Rows
-
-__all__ = [
-    "Contraction",
-    "PartWidth",
-    "WidthMap",
-    "contraction_width",
-    "part_width",
-    "row_widths",
-    "steady",
-    "steady_holds",
-]
+from obsynth.symbolic.arrays import FloatArray
 
 DELTA = exact([2.0**-40])[0]
 INFLATION = 1.0 + 1e-6
@@ -76,12 +65,8 @@ class Contraction:
 class WidthMap:
     """One step of the error and of the width of r, in exact numbers or in doubles.
 
-    Attributes
-    ----------
-    part : PartWidth
-        Of the prediction.
-    contractions : tuple of Contraction
-        In the order in which the step makes them, both sweeps.
+    part: of the prediction
+    contractions: in the order in which the step makes them, both sweeps
     """
 
     part: PartWidth
@@ -112,15 +97,7 @@ class WidthMap:
 
 
 def part_width(part: Part, rows: Rows, slack: FloatArray, nominal: Exact | None) -> PartWidth:
-    """Return the recursion of a part, for the vertex form or, with a nominal A, for the paper's.
-
-    Parameters
-    ----------
-    part : Part
-    rows, slack
-        The bounds that run, and by how much they are widened.
-    nominal : exact array, shape (n, n), optional
-    """
+    """Return the recursion of a part, for the vertex form or, with a nominal A, for the paper's."""
     size_r, size_y, size_u = _sizes_of_signals(part)
     widening = _widening(rows, slack, size_r, size_y, size_u)
     if nominal is None:
@@ -279,13 +256,7 @@ def _ascend(size: int, step: Callable[[FloatArray], FloatArray]) -> FloatArray |
 
 
 def steady_holds(step: WidthMap, e: FloatArray, w: FloatArray) -> tuple[bool, float]:
-    """Check f(e*) <= (1 - delta) e* and the same for the widths, exactly.
-
-    Returns
-    -------
-    (bool, float)
-        Whether both hold, and the smallest relative room.
-    """
+    """Check f(e*) <= (1 - delta) e* and the same for the widths, exactly."""
     exact_e, exact_w = exact(e), exact(w)
     room = 1.0
     for value, moved in (

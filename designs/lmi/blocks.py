@@ -14,33 +14,9 @@ from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix
 from obsynth.designs.lmi.expression import Affine, ExpressionError, constant
 
-__all__ = ["block", "he", "symmetric_block"]
-
 
 def block(rows: Sequence[Sequence[Any]]) -> Any:
-    """Matrix of blocks.
-
-    Parameters
-    ----------
-    rows : sequence of sequences
-        Expressions, enclosures, exact matrices or arrays; the number 0 is a zero block of
-        whatever size fits. Families (leading axis) broadcast.
-
-    Returns
-    -------
-    Affine, Enclosure, ExactMatrix or ndarray
-        The arithmetic of the blocks; arrays are lifted to it.
-
-    Raises
-    ------
-    ExpressionError
-        If sizes do not fit, or a row or column has only zeros so that its size is unknown.
-
-    Examples
-    --------
-    >>> block([[np.eye(2), 0], [0, np.ones((1, 1))]]).shape
-    (3, 3)
-    """
+    """Matrix of blocks."""
     grid = [[None if _is_zero(cell) else _as_cell(cell) for cell in row] for row in rows]
     if len({len(row) for row in grid}) != 1:
         raise ExpressionError(f"rows of {[len(row) for row in grid]} blocks")
@@ -69,19 +45,7 @@ def block(rows: Sequence[Sequence[Any]]) -> Any:
 
 
 def symmetric_block(rows: Sequence[Sequence[Any]]) -> Any:
-    """Symmetric block matrix from its lower triangle: row i holds the blocks 0 to i.
-
-    Parameters
-    ----------
-    rows : sequence of sequences
-        Row i with i + 1 blocks; 0 is a zero block.
-
-    Examples
-    --------
-    >>> P, X = 2 * np.eye(2), np.ones((1, 2))
-    >>> symmetric_block([[P], [X, np.eye(1)]]).tolist()
-    [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [1.0, 1.0, 1.0]]
-    """
+    """Symmetric block matrix from its lower triangle: row i holds the blocks 0 to i."""
     for i, row in enumerate(rows):
         if len(row) != i + 1:
             raise ExpressionError(
@@ -94,13 +58,7 @@ def symmetric_block(rows: Sequence[Sequence[Any]]) -> Any:
 
 
 def he(matrix: Any) -> Any:
-    """X + X' of a square matrix in any arithmetic.
-
-    Examples
-    --------
-    >>> he(np.array([[0.0, 1.0], [0.0, 0.0]])).tolist()
-    [[0.0, 1.0], [1.0, 0.0]]
-    """
+    """X + X' of a square matrix in any arithmetic."""
     return matrix + _transpose(matrix)
 
 

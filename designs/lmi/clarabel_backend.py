@@ -11,31 +11,9 @@ from obsynth.designs.lmi.cones import Cone, ConicForm, conic_form, unstack_trian
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution
 
-__all__ = ["solve", "solve_form"]
-
 
 def solve(problem: Problem, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:
-    """Solve a problem; see :meth:`Problem.solve`.
-
-    Parameters
-    ----------
-    problem : Problem
-        What to solve.
-    accept_inaccurate : bool
-        Return any outcome flagged instead of raising.
-    **settings
-        Fields of Clarabel's settings.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Problem, scalar
-    >>> problem = Problem("smallest number above two")
-    >>> t = scalar("t")
-    >>> problem.add("floor", t >= 2.0)
-    >>> problem.minimise(t)
-    >>> round(solve(problem).objective, 6)
-    2.0
-    """
+    """Solve a problem; see :meth:`Problem.solve`."""
     solution = solve_form(conic_form(problem), problem, settings)
     if solution.solved or accept_inaccurate:
         return solution
@@ -66,24 +44,7 @@ def solve_form(
     columns: NDArray[np.float64] | None = None,
     rows: NDArray[np.float64] | None = None,
 ) -> Solution:
-    """Run Clarabel on a conic form and name the results.
-
-    Parameters
-    ----------
-    form : ConicForm
-        Stacked from the problem, scaled or not.
-    problem : Problem
-        Gives names and shapes.
-    settings : mapping
-        Fields of Clarabel's settings.
-    columns, rows : ndarray, optional
-        Factors by which unknowns and rows of the form were scaled.
-
-    Returns
-    -------
-    Solution
-        Whatever the outcome.
-    """
+    """Run Clarabel on a conic form and name the results."""
     raw = _run(form, settings)
     x, z = np.asarray(raw.x), np.asarray(raw.z)
     status = str(raw.status)

@@ -10,8 +10,6 @@ from obsynth.designs.lmi.expression import Affine, ExpressionError
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.variables import upper_triangle
 
-__all__ = ["Cone", "ConicForm", "conic_form", "unstack_triangles"]
-
 # Relative difference of mirrored coefficients that rounding explains.
 _ASYMMETRY = 1e-9
 
@@ -31,16 +29,10 @@ class Cone:
 class ConicForm:
     """Data for a conic solver; matrices as upper triangles by columns, sqrt(2) off the diagonal.
 
-    Parameters
-    ----------
-    c, A, b : ndarray, sparse array, ndarray
-        Minimise c'x subject to b - A x in the cones.
-    cones : tuple of Cone
-        In the order of the rows.
-    offsets : dict of str to slice
-        Where each variable's free entries stand in x.
-    constant, sign : float
-        The objective typed is sign (c'x) + constant.
+    c, A, b: minimise c'x subject to b - A x in the cones
+    cones: in the order of the rows
+    offsets: where each variable's free entries stand in x
+    constant, sign: the objective typed is sign (c'x) + constant
     """
 
     c: NDArray[np.float64]
@@ -60,26 +52,7 @@ class ConicForm:
 
 
 def conic_form(problem: Problem) -> ConicForm:
-    """Stack the blocks of a problem.
-
-    Parameters
-    ----------
-    problem : Problem
-        At least one variable and one block.
-
-    Raises
-    ------
-    ExpressionError
-        If a matrix block is not symmetric; the message names block and entry.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Problem, symmetric
-    >>> problem = Problem()
-    >>> problem.add("P", symmetric("P", 2) >> 0)
-    >>> conic_form(problem).A.toarray().diagonal().round(3).tolist()
-    [-1.0, -1.414, -1.0]
-    """
+    """Stack the blocks of a problem."""
     offsets, start = {}, 0
     for name, variable in problem.variables.items():
         offsets[name] = slice(start, start + variable.size)
@@ -126,13 +99,7 @@ def conic_form(problem: Problem) -> ConicForm:
 
 
 def unstack_triangles(stacked: NDArray[np.float64], n: int, count: int) -> NDArray[np.float64]:
-    """Symmetric matrices (count, n, n) from their scaled upper triangles.
-
-    Examples
-    --------
-    >>> unstack_triangles(np.array([1.0, 2.0**0.5, 3.0]), 2, 1).round(12).tolist()
-    [[[1.0, 1.0], [1.0, 3.0]]]
-    """
+    """Symmetric matrices (count, n, n) from their scaled upper triangles."""
     rows, columns = upper_triangle(n)
     scale = np.where(rows == columns, 1.0, 1.0 / np.sqrt(2.0))
     matrices = np.zeros((count, n, n))

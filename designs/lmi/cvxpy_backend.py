@@ -12,8 +12,6 @@ from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution
 from obsynth.designs.lmi.variables import Structure, Variable
 
-__all__ = ["solve_with_cvxpy", "to_cvxpy"]
-
 # SDPA often stops a little short of its default of 1e-7 and then calls itself inaccurate.
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "SDPA": {"epsilonStar": 1e-6, "epsilonDash": 1e-6, "lambdaStar": 1e4},
@@ -21,28 +19,7 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 
 
 def to_cvxpy(problem: Problem) -> Any:
-    """Translate; see :meth:`Problem.to_cvxpy`.
-
-    Parameters
-    ----------
-    problem : Problem
-        What to translate.
-
-    Returns
-    -------
-    cvxpy.Problem
-        One constraint per vertex, variables with the names of the problem.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Problem, symmetric, trace
-    >>> problem = Problem()
-    >>> P = symmetric("P", 2)
-    >>> problem.add("floor", P >> np.eye(2))
-    >>> problem.minimise(trace(P))
-    >>> round(float(to_cvxpy(problem).solve(solver="CLARABEL")), 5)
-    2.0
-    """
+    """Translate; see :meth:`Problem.to_cvxpy`."""
     import cvxpy as cp
 
     unknowns = {v: _variable(v) for v in problem.variables.values()}
@@ -65,24 +42,7 @@ def to_cvxpy(problem: Problem) -> Any:
 def solve_with_cvxpy(
     problem: Problem, solver: str, *, accept_inaccurate: bool = False, **options: Any
 ) -> Solution:
-    """Solve by any solver cvxpy knows.
-
-    Parameters
-    ----------
-    problem : Problem
-        What to solve.
-    solver : str
-        cvxpy's name, as ``"SCS"`` or ``"SDPA"``.
-    accept_inaccurate : bool
-        Return any outcome flagged instead of raising.
-    **options
-        Passed to the solver.
-
-    Raises
-    ------
-    InfeasibleDesign, SolverTrouble
-        As :meth:`Problem.solve`.
-    """
+    """Solve by any solver cvxpy knows."""
     import cvxpy as cp
 
     translated = to_cvxpy(problem)

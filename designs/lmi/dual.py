@@ -22,8 +22,6 @@ from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution
 
-__all__ = ["Binding", "MarginBound", "binding_blocks", "bound_margin"]
-
 # Blocks with less than this share of the dual weight get the multiplier zero.
 _NEGLIGIBLE = 1e-10
 
@@ -45,13 +43,9 @@ class Binding:
 class MarginBound:
     """An upper bound of the margin, checked in exact rational arithmetic.
 
-    Parameters
-    ----------
-    multipliers : mapping of str to ndarray
-        Z_i by block, exactly positive definite or zero (psd), or not negative; doubles.
-    offset, slope : Fraction
-        Every design whose free entries are below s in size has a margin of at most
-        ``offset + slope s``.
+    multipliers: Z_i by block, exactly positive definite or zero (psd), or not negative; doubles
+    offset, slope: every design whose free entries are below s in size has a margin of at most
+        ``offset + slope s``
     """
 
     multipliers: Mapping[str, NDArray[np.float64]]
@@ -76,19 +70,7 @@ def binding_blocks(
     chosen: Mapping[str, NDArray[np.intp]] | None = None,
     count: int = 5,
 ) -> tuple[Binding, ...]:
-    """List the strict blocks with the largest dual weight.
-
-    Parameters
-    ----------
-    problem : Problem
-        As solved for the largest margin.
-    solution : Solution
-        With its duals.
-    chosen : mapping of str to ndarray of int, optional
-        Numbers of the vertices that were stated, by family.
-    count : int
-        How many at most.
-    """
+    """List the strict blocks with the largest dual weight."""
     found = []
     for name, item in problem.blocks.items():
         if item.cone != "psd" or not item.strict or name not in solution.duals:
@@ -110,23 +92,6 @@ def binding_blocks(
 def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBound | None:
     """Bound the margin that any values of the variables can reach.
 
-    Parameters
-    ----------
-    problem : Problem
-        Maximises the 1 x 1 variable ``margin``.
-    solution : Solution
-        Any outcome with duals; their accuracy decides how sharp the bound is, not whether
-        it is true.
-    margin : str
-        Name of that variable.
-
-    Returns
-    -------
-    MarginBound or None
-        None where the duals do not give a bound (none returned, exponential cones).
-
-    Notes
-    -----
     The coefficients are those of the problem as assembled from doubles.
     """
     multipliers = {}

@@ -13,18 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.designs.lmi.variables import Structure, Variable
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = [
-    "Affine",
-    "ExpressionError",
-    "Inequality",
-    "constant",
-    "diagonal",
-    "full",
-    "scalar",
-    "symmetric",
-    "trace",
-]
-
 Matrix = NDArray[np.float64]
 
 
@@ -40,20 +28,9 @@ class Affine:
     axis, (N, r, c), makes a family: one member per vertex, and arithmetic broadcasts over it
     as ``numpy.matmul`` does.
 
-    Parameters
-    ----------
-    constant : ndarray, shape (r, c) or (N, r, c)
-        Value where every variable is zero.
-    terms : mapping of Variable to sparse array
-        Operators from the free entries of the variable to the entries of the expression,
-        vertex after vertex, each stacked by columns.
-
-    Examples
-    --------
-    >>> P = symmetric("P", 2)
-    >>> decay = np.array([[0.5, 0.0], [0.1, 0.2]])
-    >>> (decay.T @ P @ decay - P).shape
-    (2, 2)
+    constant: value where every variable is zero
+    terms: operators from the free entries of the variable to the entries of the expression, vertex
+        after vertex, each stacked by columns
     """
 
     constant: Matrix
@@ -107,18 +84,7 @@ class Affine:
         return cls(np.concatenate([_stack(part.constant) for part in parts])[:, None], terms)
 
     def value(self, values: Mapping[str, ArrayLike]) -> Matrix:
-        """Insert values by name.
-
-        Parameters
-        ----------
-        values : mapping of str to array_like
-            One matrix (or number) for every variable of the expression.
-
-        Returns
-        -------
-        ndarray, shape (r, c) or (N, r, c)
-            Rounded to nearest; for a proof use an enclosure of the same formula.
-        """
+        """Insert values by name."""
         stacked = _stack(self.constant)
         for variable, operator in self.terms.items():
             stacked = stacked + operator @ variable.pack(values[variable.name])
@@ -249,68 +215,32 @@ class Inequality:
 
 
 def symmetric(name: str, n: int) -> Affine:
-    """Symmetric n x n variable.
-
-    Examples
-    --------
-    >>> symmetric("P", 3).shape
-    (3, 3)
-    """
+    """Symmetric n x n variable."""
     return _variable(Variable(name, (n, n), Structure.SYMMETRIC))
 
 
 def full(name: str, rows: int, columns: int) -> Affine:
-    """Rows x columns variable without structure.
-
-    Examples
-    --------
-    >>> full("H", 3, 2).shape
-    (3, 2)
-    """
+    """Rows x columns variable without structure."""
     return _variable(Variable(name, (rows, columns), Structure.FULL))
 
 
 def diagonal(name: str, n: int) -> Affine:
-    """Diagonal n x n variable.
-
-    Examples
-    --------
-    >>> diagonal("T", 2).value({"T": np.diag([1.0, 2.0])}).tolist()
-    [[1.0, 0.0], [0.0, 2.0]]
-    """
+    """Diagonal n x n variable."""
     return _variable(Variable(name, (n, n), Structure.DIAGONAL))
 
 
 def scalar(name: str) -> Affine:
-    """One number, as a 1 x 1 expression that multiplies constant matrices with ``*``.
-
-    Examples
-    --------
-    >>> (scalar("t") * np.eye(3)).shape
-    (3, 3)
-    """
+    """One number, as a 1 x 1 expression that multiplies constant matrices with ``*``."""
     return _variable(Variable(name, (1, 1), Structure.SCALAR))
 
 
 def constant(value: Any) -> Affine:
-    """Make an expression without variables; expressions pass unchanged.
-
-    Examples
-    --------
-    >>> constant([[1.0, 2.0]]).shape
-    (1, 2)
-    """
+    """Make an expression without variables; expressions pass unchanged."""
     return value if isinstance(value, Affine) else Affine(_as_matrix(value), {})
 
 
 def trace(expression: Affine) -> Affine:
-    """Sum of the diagonal of every member, as a 1 x 1 expression.
-
-    Examples
-    --------
-    >>> float(trace(symmetric("P", 2)).value({"P": [[1.0, 5.0], [5.0, 2.0]]})[0, 0])
-    3.0
-    """
+    """Sum of the diagonal of every member, as a 1 x 1 expression."""
     n = expression.shape[0]
     numbers = np.diagonal(expression._numbers(), axis1=-2, axis2=-1)[..., None, :]
     return expression._take(numbers) @ np.ones((n, 1))

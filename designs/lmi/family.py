@@ -13,8 +13,6 @@ from obsynth.derive.rigour.definite import prove_positive_definite
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Block
 
-__all__ = ["Family", "Violations"]
-
 IntArray = NDArray[np.intp]
 
 # Entries of the matrices formed at a time.
@@ -32,14 +30,9 @@ _MARGIN = "taken_margin"
 class Violations:
     """Vertices of a family where a matrix is not positive definite enough.
 
-    Parameters
-    ----------
-    vertices : ndarray of int
-        Worst first.
-    eigenvalues : ndarray
-        Smallest eigenvalue at each of them.
-    directions : ndarray, shape (k, n)
-        Eigenvectors to these.
+    vertices: worst first
+    eigenvalues: smallest eigenvalue at each of them
+    directions: eigenvectors to these
     """
 
     vertices: IntArray
@@ -62,27 +55,12 @@ class Violations:
 class Family:
     """A symmetric matrix per vertex that has to be positive definite.
 
-    Parameters
-    ----------
-    name : str
-        Name of the block in problems and messages.
-    count : int
-        Number of vertices.
-    formula : callable
-        ``formula(vertices, **unknowns)`` with an integer array: the matrices at these
-        vertices, in the arithmetic of the unknowns.
-    unknowns : mapping of str to Affine
-        The expressions to insert when the solver asks.
-    strict : bool
-        Whether the margin of a design is asked of it.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import symmetric
-    >>> A = np.array([[[0.5]], [[-0.8]]])
-    >>> decay = Family("decay", 2, lambda k, P: P - A[k] @ P @ A[k], {"P": symmetric("P", 1)})
-    >>> decay.value([0, 1], {"P": np.ones((1, 1))}).ravel().round(2).tolist()
-    [0.75, 0.36]
+    name: name of the block in problems and messages
+    count: number of vertices
+    formula: ``formula(vertices, **unknowns)`` with an integer array: the matrices at these
+        vertices, in the arithmetic of the unknowns
+    unknowns: the expressions to insert when the solver asks
+    strict: whether the margin of a design is asked of it
     """
 
     name: str
@@ -141,17 +119,7 @@ class Family:
         floor: float = 0.0,
         among: IntArray | None = None,
     ) -> Violations:
-        """Vertices where the smallest eigenvalue is not above a floor.
-
-        Parameters
-        ----------
-        values : mapping of str to array_like
-            Of the variables.
-        floor : float
-            Eigenvalue asked for.
-        among : ndarray of int, optional
-            Look at these vertices only.
-        """
+        """Vertices where the smallest eigenvalue is not above a floor."""
         first = self.value([0], values)
         size = first.shape[-1]
         lift = floor * np.eye(size)

@@ -14,8 +14,6 @@ from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.retry import solve_with_retries
 from obsynth.designs.lmi.solution import Solution
 
-__all__ = ["LazySolution", "solve_lazily"]
-
 IntArray = NDArray[np.intp]
 
 # A family with no more vertices is stated whole.
@@ -31,16 +29,10 @@ _ROUNDS = 60
 class LazySolution:
     """A solution found with some vertices and checked at all.
 
-    Parameters
-    ----------
-    solution : Solution
-        Of the last round.
-    problem : Problem
-        As it was stated in the last round.
-    chosen : mapping of str to ndarray of int
-        Vertices that were stated, by family; start from them when solving a similar problem.
-    rounds : int
-        Number of solves.
+    solution: of the last round
+    problem: as it was stated in the last round
+    chosen: vertices that were stated, by family; start from them when solving a similar problem
+    rounds: number of solves
     """
 
     solution: Solution
@@ -58,48 +50,7 @@ def solve_lazily(
     floor: float | Callable[[Problem, Solution], float] = 0.0,
     solve: Callable[[Problem], Solution] = solve_with_retries,
 ) -> LazySolution:
-    """Solve a problem whose families have many vertices.
-
-    Parameters
-    ----------
-    problem : Problem
-        Families among its blocks with many vertices are treated lazily too.
-    families : sequence of Family
-        Further families, never formed whole.
-    start : mapping of str to ndarray of int, optional
-        Vertices to begin with.
-    add : int
-        Vertices added per family and round.
-    floor : float, or callable that takes the problem as stated and its solution
-        Smallest eigenvalue accepted at a vertex; a little below zero where the problem asks
-        for no margin, since solvers end on the boundary.
-    solve : callable
-        How a problem is solved.
-
-    Returns
-    -------
-    LazySolution
-        The check is in floating point; prove the result.
-
-    Raises
-    ------
-    SolverTrouble
-        If the worst vertices are stated already and still violated: the solver's accuracy is
-        the limit, so a wider margin is needed.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import symmetric, trace
-    >>> A = np.linspace(-0.9, 0.9, 500).reshape(-1, 1, 1)
-    >>> P = symmetric("P", 1)
-    >>> decay = Family("decay", 500, lambda k, P: P - A[k] @ P @ A[k] - np.eye(1), {"P": P})
-    >>> problem = Problem("interval")
-    >>> problem.add("floor", P >> 0)
-    >>> problem.minimise(trace(P))
-    >>> found = solve_lazily(problem, [decay], floor=-1e-6)
-    >>> round(found.solution.objective, 4), len(found.chosen["decay"]) < 20
-    (5.2632, True)
-    """
+    """Solve a problem whose families have many vertices."""
     every = {family.name: family for family in (*_large_blocks(problem), *families)}
     chosen = {
         name: _first_choice(family, None if start is None else start.get(name))

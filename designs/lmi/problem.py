@@ -23,24 +23,16 @@ from obsynth.designs.lmi.expression import (
 from obsynth.designs.lmi.solution import Solution
 from obsynth.designs.lmi.variables import Variable
 
-__all__ = ["Block", "Problem"]
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
     """A named constraint: an expression and the cone it lies in.
 
-    Parameters
-    ----------
-    name : str
-        Name in reports and in the duals of the solution.
-    cone : str
-        ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three).
-    expression : Affine
-        For ``"psd"`` with sense ``<<`` the negative of what was typed, margin included.
-    strict : bool
-        Whether a margin is asked of the block; helpers that only define an auxiliary
-        variable are not strict.
+    name: name in reports and in the duals of the solution
+    cone: ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three)
+    expression: for ``"psd"`` with sense ``<<`` the negative of what was typed, margin included
+    strict: whether a margin is asked of the block; helpers that only define an auxiliary variable
+        are not strict
     """
 
     name: str
@@ -52,22 +44,7 @@ class Block:
 class Problem:
     """Linear objective, named matrix inequalities.
 
-    Parameters
-    ----------
-    name : str
-        Used in messages.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A = np.array([[0.9, 0.5], [0.0, 0.8]])
-    >>> problem = Problem("Lyapunov")
-    >>> P = symmetric("P", 2)
-    >>> problem.add_lmi("decay", A.T @ P @ A - P, "<<", margin=1.0)
-    >>> problem.minimise(trace(P))
-    >>> solution = problem.solve()
-    >>> solution.status, round(float(np.trace(solution["P"])), 3)
-    ('Solved', 30.493)
+    name: used in messages
     """
 
     def __init__(self, name: str = "problem") -> None:
@@ -102,21 +79,7 @@ class Problem:
         *,
         strict: bool = True,
     ) -> None:
-        """Matrix inequality ``expression >> margin I`` or ``expression << -margin I``.
-
-        Parameters
-        ----------
-        name : str
-            Name of the block.
-        expression : Affine, shape (n, n) or a family (N, n, n)
-            Symmetric; a family makes one inequality per vertex.
-        sense : str
-            ``">>"`` or ``"<<"``.
-        margin : float
-            Smallest eigenvalue asked for.
-        strict : bool
-            Whether :func:`solve_with_margin` asks for a margin in this block.
-        """
+        """Matrix inequality ``expression >> margin I`` or ``expression << -margin I``."""
         if sense not in (">>", "<<"):
             raise ExpressionError(f"{name}: sense {sense!r}; write '>>' or '<<'", block=name)
         positive = expression if sense == ">>" else -expression
@@ -147,15 +110,7 @@ class Problem:
         self._set_objective(objective, maximising=True)
 
     def minimise_trace_inverse(self, P: Affine, weight: Any = None) -> None:
-        """Minimise trace(W P^-1) of a symmetric expression, by a Schur complement.
-
-        Parameters
-        ----------
-        P : Affine, shape (n, n)
-            Positive definite at the solution.
-        weight : array_like, shape (n, k), optional
-            R with W = R R'; the identity without it.
-        """
+        """Minimise trace(W P^-1) of a symmetric expression, by a Schur complement."""
         n = P.shape[0]
         factor = np.eye(n) if weight is None else np.asarray(weight, dtype=float).reshape(n, -1)
         Z = symmetric("inverse.Z", factor.shape[1])
@@ -211,13 +166,7 @@ class Problem:
         return copy
 
     def tightened(self, margin: Affine | float) -> Problem:
-        """Copy the problem with ``margin`` times the identity taken from every strict block.
-
-        Parameters
-        ----------
-        margin : number or 1 x 1 expression
-            An expression becomes a further unknown.
-        """
+        """Copy the problem with ``margin`` times the identity taken from every strict block."""
         copy = self.members({})
         for name, item in self._blocks.items():
             if item.cone == "psd" and item.strict:
@@ -227,40 +176,13 @@ class Problem:
         return copy
 
     def solve(self, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:
-        """Solve with Clarabel.
-
-        Parameters
-        ----------
-        accept_inaccurate : bool
-            Return whatever the solver ended with, flagged by ``Solution.solved``, instead of
-            raising.
-        **settings
-            Fields of Clarabel's settings, as ``tol_feas=1e-9``.
-
-        Returns
-        -------
-        Solution
-            With ``solved`` True, unless asked otherwise.
-
-        Raises
-        ------
-        InfeasibleDesign
-            The solver reports infeasibility (with its dual ray as ``duals``).
-        SolverTrouble
-            Any other status than Solved.
-        """
+        """Solve with Clarabel."""
         from obsynth.designs.lmi.clarabel_backend import solve
 
         return solve(self, accept_inaccurate=accept_inaccurate, **settings)
 
     def to_cvxpy(self) -> Any:
-        """Translate for cvxpy; variables have the same names.
-
-        Returns
-        -------
-        cvxpy.Problem
-            ``problem.var_dict[name].value`` after any cvxpy solver.
-        """
+        """Translate for cvxpy; variables have the same names."""
         from obsynth.designs.lmi.cvxpy_backend import to_cvxpy
 
         return to_cvxpy(self)

@@ -13,8 +13,6 @@ from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.core.errors import CertificateError
 
-__all__ = ["FamilyProof", "prove_family"]
-
 IntArray = NDArray[np.intp]
 
 # Entries of the blocks formed at a time, so that the work arrays stay in the cache.
@@ -28,20 +26,12 @@ _SAMPLE = 256
 class FamilyProof:
     """What was proved of a matrix inequality at its vertices.
 
-    Parameters
-    ----------
-    name : str
-        Name of the inequality.
-    count : int
-        Number of vertices.
-    failed : tuple of int
-        Vertices without proof (at most ten are listed).
-    margin : float
-        Guaranteed lower bound of the smallest eigenvalue over all vertices; -inf if one failed.
-    worst : tuple of int
-        Vertices with the smallest margins, worst first.
-    exact : tuple of int
-        Those of them confirmed in exact rational arithmetic.
+    name: name of the inequality
+    count: number of vertices
+    failed: vertices without proof (at most ten are listed)
+    margin: guaranteed lower bound of the smallest eigenvalue over all vertices; -inf if one failed
+    worst: vertices with the smallest margins, worst first
+    exact: those of them confirmed in exact rational arithmetic
     """
 
     name: str
@@ -82,35 +72,7 @@ def prove_family(
     exact: Callable[[int], ExactMatrix] | None = None,
     exact_count: int = 3,
 ) -> FamilyProof:
-    """Prove that the matrices at all vertices are positive definite.
-
-    Parameters
-    ----------
-    name : str
-        For messages.
-    count : int
-        Number of vertices.
-    enclosed : callable
-        Takes an array of vertex numbers, returns the enclosed matrices there, (k, n, n).
-    exact : callable, optional
-        Takes one vertex number, returns the exact matrix: the worst vertices are decided a
-        second time in rational arithmetic.
-    exact_count : int
-        How many of the worst.
-
-    Examples
-    --------
-    >>> A = np.linspace(-0.9, 0.9, 5).reshape(-1, 1, 1)
-    >>> def decay(k, P, A):
-    ...     return P - A @ P @ A
-    >>> proof = prove_family(
-    ...     "decay", 5,
-    ...     lambda k: decay(k, Enclosure.of([[2.0]]), Enclosure.of(A[k])),
-    ...     lambda k: decay(k, ExactMatrix.of(2), ExactMatrix.of(A[k])),
-    ... )
-    >>> print(proof)
-    decay: proved at 5 vertices, margin 0.38, 3 of them exactly
-    """
+    """Prove that the matrices at all vertices are positive definite."""
     size = enclosed(np.zeros(1, dtype=np.intp)).shape[-1]
     step = max(1, _CHUNK_ENTRIES // (size * size))
     sample = np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(np.intp))

@@ -23,8 +23,6 @@ from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.retry import solve_with_retries
 from obsynth.designs.lmi.solution import Solution
 
-__all__ = ["Margin", "MarginSolution", "largest_margin", "solve_with_margin"]
-
 Values = Mapping[str, NDArray[np.float64]]
 Caps = Mapping[str, Inequality]
 
@@ -48,16 +46,10 @@ _REPAIRABLE = 1e-2
 class Margin:
     """The largest margin of a set of inequalities.
 
-    Parameters
-    ----------
-    value : float
-        Largest t with every strict block >= t I, within the caps (at most 1).
-    binding : tuple of Binding
-        Blocks and vertices that limit it.
-    bound : MarginBound or None
-        What exact arithmetic says about it.
-    found : LazySolution
-        Where it was found.
+    value: largest t with every strict block >= t I, within the caps (at most 1)
+    binding: blocks and vertices that limit it
+    bound: what exact arithmetic says about it
+    found: where it was found
     """
 
     value: float
@@ -93,24 +85,14 @@ class Margin:
 class MarginSolution:
     """Values that passed the proof, and how they came about.
 
-    Parameters
-    ----------
-    values : mapping of str to ndarray
-        By variable name.
-    objective : float
-        Of these values.
-    margin : Margin
-        Of phase 1.
-    kept : float
-        Margin asked for in phase 2.
-    back_off : float
-        Share of the phase 1 point mixed in.
-    solution : Solution
-        Of phase 2 as the solver returned it.
-    chosen : mapping of str to ndarray of int
-        Vertices stated, to start from when solving a similar problem.
-    proof : object
-        What ``prove`` returned for the values.
+    values: by variable name
+    objective: of these values
+    margin: of phase 1
+    kept: margin asked for in phase 2
+    back_off: share of the phase 1 point mixed in
+    solution: of phase 2 as the solver returned it
+    chosen: vertices stated, to start from when solving a similar problem
+    proof: what ``prove`` returned for the values
     """
 
     values: Values
@@ -136,36 +118,8 @@ def largest_margin(
 ) -> Margin:
     """Phase 1: the largest t with every strict block >= t I.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its objective does not matter.
-    families : sequence of Family
-        Further families, treated lazily.
-    caps : mapping of str to Inequality, optional
-        Constraints of phase 1 only, such as ``{"size": trace(P) <= n}``: without one a
-        homogeneous problem grows until t reaches its limit of 1.
-    start : mapping of str to ndarray of int, optional
-        Vertices to begin with.
-    explain : bool
-        Also find the binding blocks and the exact bound where there is no margin.
-
-    Notes
-    -----
     The margin is measured at the point found, so an inaccurate answer of the solver serves as
     long as it shows a margin; that there is none is believed of a solved problem only.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Problem, symmetric, trace
-    >>> A = np.diag([1.2, 0.5])
-    >>> P = symmetric("P", 2)
-    >>> problem = Problem("unstable")
-    >>> problem.add_lmi("decay", A.T @ P @ A - P, "<<")
-    >>> problem.add("floor", P >> np.eye(2))
-    >>> margin = largest_margin(problem)
-    >>> margin.feasible, margin.binding[0].block, margin.bound.size_excluded > 1e3
-    (False, 'decay', True)
     """
     t = scalar(_MARGIN)
     first = problem.tightened(t)
@@ -193,55 +147,7 @@ def solve_with_margin(
     fraction: float = 1e-4,
     start: Mapping[str, NDArray[np.intp]] | None = None,
 ) -> MarginSolution:
-    """Phase 1, phase 2, back-off and proof.
-
-    Parameters
-    ----------
-    problem : Problem
-        With its objective.
-    families : sequence of Family
-        Families with many vertices, treated lazily.
-    prove : callable
-        Takes the values by variable name and returns an object with ``all_proved``, for the
-        gains as they will be stored: a :class:`ProofResult` or a :class:`FamilyProof`.
-    caps : mapping of str to Inequality, optional
-        See :func:`largest_margin`.
-    fraction : float
-        Part of the largest margin that is kept in phase 2.
-    start : mapping of str to ndarray of int, optional
-        Vertices to begin with.
-
-    Returns
-    -------
-    MarginSolution
-        Proved.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If there is no margin; with ``margin``, ``binding`` and ``bound``.
-    CertificateError
-        If no back-off makes the proof go through.
-    SolverTrouble
-        From the solvers.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Enclosure, Problem, prove_positive_definite
-    >>> from obsynth.designs.lmi import symmetric, trace
-    >>> A = np.array([[0.9, 0.5], [0.0, 0.8]])
-    >>> P = symmetric("P", 2)
-    >>> problem = Problem("Lyapunov")
-    >>> problem.add("floor", P >> np.eye(2))
-    >>> problem.add("decay", P - A.T @ P @ A >> 0)
-    >>> problem.minimise(trace(P))
-    >>> def prove(values):
-    ...     P, F = Enclosure.of(values["P"]), Enclosure.of(A)
-    ...     return prove_positive_definite(P - F.T @ P @ F)
-    >>> found = solve_with_margin(problem, prove=prove)
-    >>> bool(found.proof.all_proved), round(found.objective, 1)
-    (True, 4.5)
-    """
+    """Phase 1, phase 2, back-off and proof."""
     margin = largest_margin(problem, families, caps=caps, start=start)
     if not margin.feasible:
         raise InfeasibleDesign(

@@ -19,15 +19,6 @@ from obsynth.designs.lmi.blocks import block
 from obsynth.designs.lmi.expression import Affine, symmetric
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = [
-    "Extremes",
-    "SplitFamily",
-    "distinct_members",
-    "extreme_points",
-    "present_entries",
-    "split_common",
-]
-
 IntArray = NDArray[np.intp]
 
 
@@ -35,13 +26,9 @@ IntArray = NDArray[np.intp]
 class Extremes:
     """The extreme points among given points, and how the others follow from them.
 
-    Parameters
-    ----------
-    kept : ndarray of int
-        Row numbers of the extreme points.
-    weights : mapping of int to mapping of int to Fraction
-        For every other row, weights of kept rows that sum to one and give the row exactly;
-        a repeated row refers to its first occurrence with weight one.
+    kept: row numbers of the extreme points
+    weights: for every other row, weights of kept rows that sum to one and give the row exactly; a
+        repeated row refers to its first occurrence with weight one
     """
 
     kept: IntArray
@@ -64,21 +51,6 @@ def extreme_points(points: ArrayLike) -> Extremes:
     An inequality that is affine in a parameter holds at all points if it holds at the
     extreme ones. What stands twice is dropped too. Merge what enters only through a
     difference by passing the differences.
-
-    Parameters
-    ----------
-    points : array_like, shape (N, k)
-        Doubles, taken exactly.
-
-    Returns
-    -------
-    Extremes
-        A point is dropped only if exact rational weights prove that it may.
-
-    Examples
-    --------
-    >>> extreme_points([[0.0], [1.0], [0.5], [1.0]]).kept.tolist()
-    [0, 1]
     """
     # Adding zero makes one zero of the two, so that equal rows have equal bytes.
     array = np.asarray(points, dtype=float) + 0.0
@@ -101,19 +73,7 @@ def extreme_points(points: ArrayLike) -> Extremes:
 
 
 def distinct_members(family: Affine) -> IntArray:
-    """Find the first member of every set of equal members of a family.
-
-    Parameters
-    ----------
-    family : Affine, shape (N, r, c)
-        Compared entry by entry, without tolerance.
-
-    Examples
-    --------
-    >>> M = np.array([[[1.0]], [[2.0]], [[1.0]]])
-    >>> distinct_members(symmetric("P", 1) @ M).tolist()
-    [0, 1]
-    """
+    """Find the first member of every set of equal members of a family."""
     count = family.members or 1
     rows = [family.constant.reshape(count, -1)]
     rows += [
@@ -128,16 +88,10 @@ def distinct_members(family: Affine) -> IntArray:
 class SplitFamily:
     """A family written as one common inequality and a small one per vertex.
 
-    Parameters
-    ----------
-    common : Affine or None
-        One inequality >= 0; None if nothing is common.
-    members : Affine
-        The part that depends on the vertex, >= 0 at each.
-    rows : ndarray of int
-        Rows of the family that ``members`` has.
-    shared : ndarray of int
-        Rows that both have, with the slack variable between them.
+    common: one inequality >= 0; None if nothing is common
+    members: the part that depends on the vertex, >= 0 at each
+    rows: rows of the family that ``members`` has
+    shared: rows that both have, with the slack variable between them
     """
 
     common: Affine | None
@@ -153,21 +107,6 @@ def split_common(family: Affine, slack: str) -> SplitFamily:
     others K couple with, all F_i >= 0 if and only if some symmetric Z satisfies
     ``[Z, F_SK; F_KS, F_KK] >= 0`` and ``F_i[J, J] - Z >= 0`` for all i (Z in the rows S): the
     first forces Z above the Schur complement F_SK F_KK^+ F_KS, and this value serves all i.
-
-    Parameters
-    ----------
-    family : Affine, shape (N, n, n)
-        Symmetric.
-    slack : str
-        Name of the new variable Z.
-
-    Examples
-    --------
-    >>> P = symmetric("P", 2)
-    >>> M = np.diag([1.0, 0.0]) * np.arange(3.0).reshape(3, 1, 1)
-    >>> split = split_common(P - M, "Z")
-    >>> split.members.shape, split.common.shape, split.shared.tolist()
-    ((1, 1), (2, 2), [0])
     """
     n = family.shape[0]
     varies, present = _varying_entries(family), present_entries(family)
@@ -208,13 +147,7 @@ def _varying_entries(family: Affine) -> NDArray[np.bool_]:
 
 
 def present_entries(family: Affine) -> NDArray[np.bool_]:
-    """Find the entries of a symmetric family that are not zero at all vertices.
-
-    Parameters
-    ----------
-    family : Affine, shape (n, n) or (N, n, n)
-        Explicit zeros of the operators do not count.
-    """
+    """Find the entries of a symmetric family that are not zero at all vertices."""
     n = family.shape[0]
     present = (family.constant.reshape(-1, n, n) != 0).any(axis=0)
     for operator in family.terms.values():

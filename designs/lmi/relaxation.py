@@ -25,8 +25,6 @@ from obsynth.designs.lmi.expression import (
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.reductions import present_entries
 
-__all__ = ["RowMultipliers", "UncertainRow", "corner_block", "relax_sum", "row_multipliers"]
-
 Matrix = NDArray[np.float64]
 
 
@@ -34,14 +32,9 @@ Matrix = NDArray[np.float64]
 class UncertainRow:
     """One row of an uncertain matrix: which of its entries are uncertain, and their corners.
 
-    Parameters
-    ----------
-    row : int
-        Its number.
-    columns : tuple of int
-        Columns of the uncertain entries.
-    corners : ndarray, shape (N, len(columns))
-        Their values at the vertices of this row alone.
+    row: its number
+    columns: columns of the uncertain entries
+    corners: their values at the vertices of this row alone
     """
 
     row: int
@@ -66,12 +59,8 @@ class RowMultipliers:
 
     For every M with rows between their corners, ``[x; s]' [Q, S; S', -R] [x; s] >= 0``.
 
-    Parameters
-    ----------
-    Q, S, R : matrices of shape (n, n), (n, k), (k, k)
-        In any arithmetic; k is the number of uncertain rows.
-    rows : ndarray, shape (n_rows, k)
-        Puts s into the rows that are uncertain, times the unit of each.
+    Q, S, R (n, n), (n, k), (k, k): in any arithmetic; k is the number of uncertain rows
+    rows: puts s into the rows that are uncertain, times the unit of each
     """
 
     Q: Any
@@ -117,35 +106,6 @@ def row_multipliers(
     ``Q + S m' + m S' - R m m' >= 0`` at the corners m of that row: two to the number of
     uncertain entries *of one row* small inequalities, in place of two to their number in all.
     C. W. Scherer, "LPV control and full block multipliers", Automatica 37 (2001).
-
-    Parameters
-    ----------
-    problem : Problem
-        The conditions at the corners are added, as ``name.r`` for row r.
-    name : str
-        Prefix of blocks and variables.
-    uncertain : sequence of UncertainRow
-        Rows that are known exactly stay away.
-    size : tuple of int
-        Shape of M.
-
-    Returns
-    -------
-    RowMultipliers
-        For ``V+ <= V`` with ``x+ = (A + M) x``, for instance,
-        ``[P - Q, *, *; -S', R, *; P A, P rows, P] >= 0``.
-
-    Examples
-    --------
-    >>> box = [UncertainRow(0, (0,), np.array([[-0.3], [0.3]]))]
-    >>> problem = Problem("x+ = (.5 + m) x")
-    >>> P = symmetric("P", 1)
-    >>> m = row_multipliers(problem, "m", box, (1, 1))
-    >>> rows = [[P - np.eye(1) - m.Q, -m.S, 0.5 * P], [-m.S.T, m.R, (P @ m.rows).T]]
-    >>> problem.add("decay", block([*rows, [0.5 * P, P @ m.rows, P]]) >> 0)
-    >>> problem.minimise(P)
-    >>> round(problem.solve().objective, 4), round(1 / (1 - 0.8**2), 4)
-    (2.7778, 2.7778)
     """
     unknowns: dict[str, Affine] = {}
     for item in uncertain:
@@ -169,11 +129,7 @@ def row_multipliers(
 def corner_block(Q: Any, S: Any, R: Any, vertices: Any) -> Any:
     """Condition on the multipliers of one row at its corners, >= 0, in any arithmetic.
 
-    Parameters
-    ----------
-    Q, S, R : matrices of shape (c, c), (c, 1), (1, 1)
-    vertices : matrix, shape (N, 1, c) or (1, c)
-        :attr:`UncertainRow.vertices`.
+    Shapes: Q, S, R (c, c), (c, 1), (1, 1).
     """
     columns = np.swapaxes(vertices, -1, -2) if isinstance(vertices, np.ndarray) else vertices.T
     return Q + he(S @ vertices) - R * (columns @ vertices)
@@ -190,27 +146,6 @@ def relax_sum(
     nothing. One group per row of an uncertain matrix gives the row relaxation; one group per
     uncertain entry the relaxation of A. Ben-Tal, A. Nemirovski, "On tractable approximations
     of uncertain linear matrix inequalities", SIAM J. Optim. 12 (2002).
-
-    Parameters
-    ----------
-    problem : Problem
-        Blocks ``name`` and ``name.g`` are added, with variables ``name.Yg``.
-    name : str
-        Name of the inequality.
-    centre : Affine, shape (n, n)
-        Part without uncertainty.
-    groups : sequence of Affine or ndarray, each (N_g, n, n)
-        Deviations at the vertices of each group.
-
-    Examples
-    --------
-    >>> t = symmetric("t", 1)
-    >>> signs = np.array([[[1.0]], [[-1.0]]])
-    >>> problem = Problem("interval")
-    >>> relax_sum(problem, "sum", t, [2.0 * signs, 0.5 * signs])
-    >>> problem.minimise(t)
-    >>> round(problem.solve().objective, 5)
-    2.5
     """
     n = centre.shape[0]
     remaining = centre

@@ -18,8 +18,6 @@ from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.solution import Solution
 from obsynth.designs.lmi.variables import upper_triangle
 
-__all__ = ["SECOND_SOLVERS", "rescaled", "solve_with_retries"]
-
 SECOND_SOLVERS = ("SDPA", "SCS")
 
 _SWEEPS = 6
@@ -31,41 +29,7 @@ def solve_with_retries(
     good_enough: Callable[[Solution], bool] | None = None,
     **settings: Any,
 ) -> Solution:
-    """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers.
-
-    Parameters
-    ----------
-    problem : Problem
-        What to solve.
-    second_solvers : sequence of str
-        cvxpy's names; those that are not installed are skipped and named.
-    good_enough : callable, optional
-        Whether an answer that is not solved to full accuracy serves its purpose all the same.
-    **settings
-        Clarabel's settings.
-
-    Returns
-    -------
-    Solution
-        ``attempts`` says how every attempt ended.
-
-    Raises
-    ------
-    InfeasibleDesign
-        As soon as one solver reports infeasibility.
-    SolverTrouble
-        If no attempt solved the problem; ``error.attempts`` has their outcomes.
-
-    Examples
-    --------
-    >>> from obsynth.designs.lmi import Problem, symmetric, trace
-    >>> problem = Problem("floor")
-    >>> P = symmetric("P", 2)
-    >>> problem.add("floor", P >> 1e6 * np.eye(2))
-    >>> problem.minimise(trace(P))
-    >>> solve_with_retries(problem).attempts
-    ('Clarabel: Solved',)
-    """
+    """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers."""
     form = conic_form(problem)
     attempts: list[str] = []
 
@@ -112,22 +76,7 @@ def solve_with_retries(
 
 
 def rescaled(form: ConicForm) -> tuple[ConicForm, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale unknowns and blocks by powers of two; matrix blocks by a congruence D F D.
-
-    Parameters
-    ----------
-    form : ConicForm
-        As stacked.
-
-    Returns
-    -------
-    form : ConicForm
-        The same problem in unknowns x / columns.
-    columns : ndarray
-        Factor of every unknown.
-    rows : ndarray
-        Factor of every row; dual rows are multiplied by it.
-    """
+    """Scale unknowns and blocks by powers of two; matrix blocks by a congruence D F D."""
     columns, rows = np.ones(len(form.c)), np.ones(len(form.b))
     size = sparse.csr_array(abs(form.A))
     offset = np.abs(form.b)

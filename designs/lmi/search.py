@@ -12,16 +12,6 @@ import numpy as np
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = [
-    "Bisection",
-    "Knob",
-    "Search",
-    "bisect_feasible",
-    "search_line",
-    "search_log_convex",
-    "smallest_changes",
-]
-
 Result = TypeVar("Result")
 
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0
@@ -31,14 +21,9 @@ _GOLDEN = (5.0**0.5 - 1.0) / 2.0
 class Bisection:
     """The limit of feasibility along a line.
 
-    Parameters
-    ----------
-    feasible : float
-        Last value found feasible.
-    infeasible : float or None
-        Last value found infeasible; None if the whole line is feasible.
-    evaluations : int
-        Number of problems solved.
+    feasible: last value found feasible
+    infeasible: last value found infeasible; None if the whole line is feasible
+    evaluations: number of problems solved
     """
 
     feasible: float
@@ -54,31 +39,7 @@ def bisect_feasible(
     rtol: float = 1e-3,
     logarithmic: bool = False,
 ) -> Bisection | None:
-    """Find the feasible value closest to ``outside``.
-
-    Parameters
-    ----------
-    feasible : callable
-        Whether a value is feasible; true on one connected side.
-    inside, outside : float
-        Where feasibility is expected, and where it is wanted.
-    rtol : float
-        Width of the final bracket, relative to its larger end (to the line where it
-        contains zero).
-    logarithmic : bool
-        Halve the ratio, not the difference; both ends positive.
-
-    Returns
-    -------
-    Bisection or None
-        None if ``inside`` is infeasible too.
-
-    Examples
-    --------
-    >>> found = bisect_feasible(lambda g: g < 0.3, 0.0, 1.0, rtol=1e-6)
-    >>> round(found.feasible, 5)
-    0.3
-    """
+    """Find the feasible value closest to ``outside``."""
     if logarithmic and min(inside, outside) <= 0:
         raise ObsynthError(
             f"a logarithmic search needs positive ends, not {inside:.4g} and {outside:.4g}"
@@ -102,18 +63,11 @@ def bisect_feasible(
 class Knob:
     """One scalar that could be changed to make a design feasible.
 
-    Parameters
-    ----------
-    name : str
-        In the words of the user, as ``"gamma"`` or ``"half width of the box of h3"``.
-    current : float
-        Value at which the design is infeasible.
-    limit : float
-        As far as it may be changed.
-    feasible : callable
-        Whether the design is feasible at a value, all else being equal.
-    unit : str
-        Printed after values.
+    name: in the words of the user, as ``"gamma"`` or ``"half width of the box of h3"``
+    current: value at which the design is infeasible
+    limit: as far as it may be changed
+    feasible: whether the design is feasible at a value, all else being equal
+    unit: printed after values
     """
 
     name: str
@@ -124,29 +78,7 @@ class Knob:
 
 
 def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
-    """Say for each scalar how far it has to move, or that it does not help.
-
-    Parameters
-    ----------
-    knobs : sequence of Knob
-        Tried one at a time.
-    rtol : float
-        Relative accuracy of the values found.
-
-    Returns
-    -------
-    list of str
-        One sentence each, for the details of an ``InfeasibleDesign``.
-
-    Examples
-    --------
-    >>> gamma = Knob("gamma", 0.01, 0.0, lambda g: g < 0.009)
-    >>> noise = Knob("noise", 0.1, 0.0, lambda w: False)
-    >>> for line in smallest_changes([gamma, noise]):
-    ...     print(line)
-    gamma: 0.01 is infeasible, 0.00898 is feasible
-    noise: does not enter feasibility; infeasible from 0.1 down to 0
-    """
+    """Say for each scalar how far it has to move, or that it does not help."""
     lines = []
     for knob in knobs:
         unit = f" {knob.unit}" if knob.unit else ""
@@ -169,19 +101,12 @@ def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
 class Search(Generic[Result]):
     """The best design along a line.
 
-    Parameters
-    ----------
-    value : float
-        Where the objective is smallest.
-    result : object
-        What the design returned there.
-    objective : float
-        Its objective.
-    tried : tuple of (float, float)
-        Every value tried, in order, with its objective (inf where infeasible).
-    lower_bound : float
-        What no value of the line can be below, where the shape of the objective is known;
-        0 where only a grid speaks.
+    value: where the objective is smallest
+    result: what the design returned there
+    objective: its objective
+    tried: every value tried, in order, with its objective (inf where infeasible)
+    lower_bound: what no value of the line can be below, where the shape of the objective is known;
+        0 where only a grid speaks
     """
 
     value: float
@@ -200,36 +125,7 @@ def search_line(
     name: str = "search",
     jobs: int = 1,
 ) -> Search[Result]:
-    """Design at every value of a grid, then refine around the best by golden sections.
-
-    Parameters
-    ----------
-    design : callable
-        Takes a value; may raise ``InfeasibleDesign`` or ``SolverTrouble``, which count as
-        infinitely bad, as does ``CertificateError``.
-    objective : callable
-        What to minimise, of the result.
-    grid : sequence of float
-        Increasing. The refinement assumes one minimum between the neighbours of the best
-        value, which a grid can only suggest.
-    refine : int
-        Number of further designs (at least two) by golden sections.
-    name : str
-        Shown with the progress bar.
-    jobs : int
-        Processes for the grid.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no value of the grid gives a design; the details say what happened at each.
-
-    Examples
-    --------
-    >>> found = search_line(lambda g: (g - 0.3) ** 2, float, [0.0, 0.25, 0.5, 1.0], refine=20)
-    >>> round(found.value, 3)
-    0.3
-    """
+    """Design at every value of a grid, then refine around the best by golden sections."""
     record = _Record(objective)
     for value, outcome in zip(grid, _design_all(design, list(grid), name, jobs), strict=True):
         record.add(value, outcome)
@@ -261,32 +157,6 @@ def search_log_convex(
 
     Such an objective has one minimum, its feasible values are one interval, and the chords
     through the points tried bound it from below, so that the search knows when to stop.
-
-    Parameters
-    ----------
-    design : callable
-        As in `search_line`.
-    objective : callable
-        Positive, of the result.
-    low, high : float
-        Ends of the line, not tried themselves.
-    rtol : float
-        The search stops as soon as the best value is within this of the lower bound.
-    most : int
-        Largest number of designs.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no value tried gives a design.
-    ObsynthError
-        If the values tried contradict log-convexity by more than `rtol`.
-
-    Examples
-    --------
-    >>> found = search_log_convex(lambda g: 1 / (g * (1 - g) ** 3), float, 0.0, 1.0, rtol=1e-6)
-    >>> round(found.value, 3), found.lower_bound <= found.objective
-    (0.25, True)
     """
     record = _Record(objective)
 

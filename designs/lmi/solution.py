@@ -9,36 +9,22 @@ from numpy.typing import NDArray
 
 from obsynth.designs.lmi.expression import Affine
 
-__all__ = ["Solution"]
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Values by variable name. A status is not a certificate: prove what matters.
 
-    Parameters
-    ----------
-    values : mapping of str to ndarray
-        Every variable as a matrix (numbers are 1 x 1).
-    status : str
-        In the words of the solver.
-    solved : bool
-        True only for the status that means solved to full accuracy.
-    infeasible : bool
-        True only where the solver reports infeasibility to full accuracy.
-    objective : float
-        In the sense of the problem (what was minimised or maximised).
-    gap : float
-        Difference to the dual objective, relative to the objective where that is above one;
-        inf where the solver does not tell.
-    solver : str
-        Name of the solver.
-    solve_time : float
-        Seconds inside the solver.
-    duals : mapping of str to ndarray
-        Dual matrix of every block, (r, c) or (N, r, c); empty when the solver gives none.
-    attempts : tuple of str
-        How earlier attempts and this one ended, when there was more than one way to try.
+    values: every variable as a matrix (numbers are 1 x 1)
+    status: in the words of the solver
+    solved: true only for the status that means solved to full accuracy
+    infeasible: true only where the solver reports infeasibility to full accuracy
+    objective: in the sense of the problem (what was minimised or maximised)
+    gap: difference to the dual objective, relative to the objective where that is above one; inf
+        where the solver does not tell
+    solver: name of the solver
+    solve_time: seconds inside the solver
+    duals: dual matrix of every block, (r, c) or (N, r, c); empty when the solver gives none
+    attempts: how earlier attempts and this one ended, when there was more than one way to try
     """
 
     values: Mapping[str, NDArray[np.float64]]

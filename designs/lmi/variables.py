@@ -7,8 +7,6 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Structure", "Variable", "upper_triangle"]
-
 
 class Structure(StrEnum):
     """Pattern of a matrix variable."""
@@ -20,23 +18,7 @@ class Structure(StrEnum):
 
 
 def upper_triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the upper triangle, stacked by columns.
-
-    Parameters
-    ----------
-    n : int
-        Number of rows.
-
-    Returns
-    -------
-    rows, columns : ndarray, shape (n (n + 1) / 2,)
-        The order of Clarabel's semidefinite cone: (0,0), (0,1), (1,1), (0,2), ...
-
-    Examples
-    --------
-    >>> [a.tolist() for a in upper_triangle(2)]
-    [[0, 0, 1], [0, 1, 1]]
-    """
+    """Rows and columns of the upper triangle, stacked by columns."""
     columns, rows = np.tril_indices(n)
     return rows, columns
 
@@ -45,19 +27,9 @@ def upper_triangle(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 class Variable:
     """A matrix variable: a value compared by name, shape and structure.
 
-    Parameters
-    ----------
-    name : str
-        Name under which the solution returns it.
-    shape : tuple of int
-        Rows and columns.
-    structure : Structure
-        Which entries are free.
-
-    Examples
-    --------
-    >>> Variable("P", (3, 3), Structure.SYMMETRIC).size
-    6
+    name: name under which the solution returns it
+    shape: rows and columns
+    structure: which entries are free
     """
 
     name: str

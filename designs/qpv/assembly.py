@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import QPV
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
@@ -17,11 +16,8 @@ from obsynth.designs.qpv.model import derive_form
 from obsynth.designs.qpv.record import METHOD, QPVDesign
 from obsynth.designs.qpv.schedule import FASTEST, fastest_mode, measured_schedule
 from obsynth.designs.qpv.step import build_ode, build_step, make_start, memory_layout
-from obsynth.symbolic.text import write_text
-
-__all__ = ["assemble", "prove", "to_record"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.text_writer import write_text
 
 
 def to_record(design: QPVDesign) -> dict[str, Any]:
@@ -30,15 +26,7 @@ def to_record(design: QPVDesign) -> dict[str, Any]:
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
-    """Prove everything that the guarantee of a stored design rests on.
-
-    Parameters
-    ----------
-    record : mapping
-        Of `to_record`.
-    level : {"full", "lmi"}
-        Whether the quadratic form is derived again.
-    """
+    """Prove everything that the guarantee of a stored design rests on."""
     return _prove(QPVDesign.from_record(record), level, None)
 
 
@@ -96,20 +84,7 @@ def assemble(
     level: Level = "lmi",
     form: QPV | None = None,
 ) -> Observer:
-    """Prove a design and make its observer.
-
-    Parameters
-    ----------
-    record_or_design : mapping or QPVDesign
-    level : {"full", "lmi"}
-    form : QPV, optional
-        What was just derived from the plant; compared without deriving it again.
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a design and make its observer."""
     if isinstance(record_or_design, QPVDesign):
         design = record_or_design
     else:

@@ -6,7 +6,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.lmi import (
@@ -30,10 +29,8 @@ from obsynth.designs.qpv.lmis import (
 )
 from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import QPVDesign
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["inverse_bounds", "prove_design", "prove_dynamics", "region_factor"]
-
-FloatArray = NDArray[np.float64]
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "the worst ones also by exact rational LDL'"
 
@@ -204,19 +201,7 @@ def _corner(P: FloatArray, row: FloatArray, upper: float) -> Enclosure:
 
 
 def inverse_bounds(P: FloatArray, rows: FloatArray) -> FloatArray:
-    """Doubles just above r P^-1 r' for given rows r, proved.
-
-    Parameters
-    ----------
-    P : ndarray of shape (n, n)
-    rows : ndarray of shape (k, n)
-
-    Examples
-    --------
-    >>> bound = inverse_bounds(np.diag([2.0, 4.0]), np.array([[1.0, 2.0]]))
-    >>> bool(1.5 <= bound[0] < 1.5000001)
-    True
-    """
+    """Doubles just above r P^-1 r' for given rows r, proved. Shapes: P (n, n), rows (k, n)."""
     values = np.empty(len(rows))
     for i, row in enumerate(rows):
         near = float(row @ np.linalg.solve(P, row))

@@ -5,34 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.forms.qpv.form import QPVVertices
 from obsynth.derive.forms.qpv.layout import QPVLayout
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_kept
 from obsynth.designs.qpv.polya import PolyaTerm, collapsed_terms, polya_terms
-
-__all__ = ["VertexData", "read_vertices"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class VertexData:
     """Matrices of the augmented plant at the V vertices of the scheduling variables.
 
-    Attributes
-    ----------
-    A, G, C, H : ndarray
-        Shapes (V, n, n), (V, n, n_v), (V, m, n), (V, m, n_v), n with the faults; disturbances
-        first, then the rates of faults that have one.
-    N : ndarray of shape (V, n, n, n)
-        N[l, i] is N_i.
-    Cz : ndarray of shape (V, n_z, n)
-        Performance output.
-    A_radius, G_radius, C_radius, H_radius, N_radius : ndarray
-        What rounding may add, the same at every vertex.
+    A, G, C, H: shapes (V, n, n), (V, n, n_v), (V, m, n), (V, m, n_v), n with the faults;
+        disturbances first, then the rates of faults that have one
+    N (V, n, n, n): N[l, i] is N_i
+    Cz (V, n_z, n): performance output
+    A_radius, G_radius, C_radius, H_radius, N_radius: what rounding may add, the same at every
+        vertex
     """
 
     A: FloatArray
@@ -94,15 +85,7 @@ class VertexData:
 
 
 def read_vertices(family: AffineFamily, layout: QPVLayout, Cz: FloatArray) -> VertexData:
-    """Take the blocks from a stacked family.
-
-    Parameters
-    ----------
-    family : AffineFamily
-        Columns [c A N M B D B_f G] over the rows of dynamics and outputs.
-    layout : QPVLayout
-    Cz : ndarray of shape (V, n_z, n)
-    """
+    """Take the blocks from a stacked family. Shapes: Cz (V, n_z, n)."""
     corners = QPVVertices(family, layout)
     n = layout.states
 

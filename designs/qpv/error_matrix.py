@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 
 from obsynth.designs.lmi import Enclosure, extreme_points
 from obsynth.designs.qpv.polytopes import Shape
-
-__all__ = ["ErrorSets", "entering", "psi_family", "psi_kept"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # Hulls in more coordinates have too many facets.
 _HULL_DIMENSION = 7
@@ -27,20 +24,13 @@ _HULL_DIMENSION = 7
 class ErrorSets:
     """The sets over which the inequalities are stated.
 
-    Attributes
-    ----------
-    centre : ndarray of shape (n,)
-        c of the region.
-    state : Shape
-        Of x - c, all coordinates; it holds the region.
-    error : Shape
-        Of e in the coordinates `error_coordinates`; it holds {e : e'P e <= 1}.
-    error_coordinates : tuple of int
-        At least those that enter Psi.
-    start : ndarray of shape (r, n)
-        Corners of the polytope of e(0), one of every pair v, -v; it lies in {e : e'P e <= 1}.
-    state_entering, error_entering : tuple of int
-        The coordinates that enter Psi.
+    centre (n,): c of the region
+    state: of x - c, all coordinates; it holds the region
+    error: of e in the coordinates `error_coordinates`; it holds {e : e'P e <= 1}
+    error_coordinates: at least those that enter Psi
+    start (r, n): corners of the polytope of e(0), one of every pair v, -v; it lies in {e : e'P e <=
+        1}
+    state_entering, error_entering: the coordinates that enter Psi
     """
 
     centre: FloatArray
@@ -88,27 +78,7 @@ class ErrorSets:
 
 
 def entering(N: FloatArray) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Find the coordinates of x and of e on which Psi depends.
-
-    Parameters
-    ----------
-    N : ndarray of shape (V, n, n, n)
-        N_i at every vertex of the scheduling variables.
-
-    Returns
-    -------
-    state, error : tuple of int
-
-    Examples
-    --------
-    A fault x[1] that multiplies the state x[0]: with N above the diagonal, e enters through the
-    state's error only.
-
-    >>> N = np.zeros((1, 2, 2, 2))
-    >>> N[0, 0, 0, 1] = 1.0
-    >>> entering(N)
-    ((0, 1), (0,))
-    """
+    """Find the coordinates of x and of e on which Psi depends. Shapes: N (V, n, n, n)."""
     symmetric = N + np.swapaxes(N, -1, -2)
     state = np.flatnonzero(symmetric.any(axis=(0, 1, 3)))
     error = np.flatnonzero(N.any(axis=(0, 1, 3)))
@@ -134,22 +104,7 @@ def _directions(N: FloatArray, sets: ErrorSets, radius: FloatArray) -> tuple[Enc
 def psi_family(
     N: FloatArray, sets: ErrorSets, radius: FloatArray | None = None, rows: FloatArray | None = None
 ) -> Enclosure:
-    """Enclose Psi at pairs of vertices.
-
-    Parameters
-    ----------
-    N : ndarray of shape (n, n, n)
-        At one vertex of the scheduling variables.
-    sets : ErrorSets
-    radius : ndarray of shape (n, n, n), optional
-        Rounding of N.
-    rows : ndarray of shape (k, K), optional
-        Offsets; all pairs of vertices by default.
-
-    Returns
-    -------
-    Enclosure, shape (k, n, n)
-    """
+    """Enclose Psi at pairs of vertices. Shapes: N (n, n, n), radius (n, n, n), rows (k, K)."""
     offsets = sets.pairs if rows is None else rows
     n = N.shape[0]
     if not offsets.shape[1]:
@@ -170,16 +125,7 @@ def psi_kept(N: FloatArray, sets: ErrorSets) -> FloatArray:
     An inequality that is affine in Psi holds at all pairs if it holds at these. What enters only
     through a difference, such as x_j - e_i, is merged, and what enters nowhere disappears.
 
-    Parameters
-    ----------
-    N : ndarray of shape (V, n, n, n)
-    sets : ErrorSets
-
-    Returns
-    -------
-    ndarray of shape (V, kept, n, n)
-        The same pairs at every vertex of the scheduling variables; one matrix of zeros where
-        nothing is quadratic.
+    Shapes: N (V, n, n, n), returns (V, kept, n, n).
     """
     families = np.stack([psi_family(block, sets).mid for block in N], axis=1)
     count = len(families)

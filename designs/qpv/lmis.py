@@ -15,32 +15,15 @@ import numpy as np
 from obsynth.designs.lmi import he, symmetric_block
 from obsynth.designs.qpv.polya import PolyaTerm
 
-__all__ = [
-    "Closed",
-    "close",
-    "decay_block",
-    "h2_block",
-    "hinf_block",
-    "inside_block",
-    "noise_block",
-    "start_block",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Closed:
     """One Polya term of the closed loop, `total` times what belongs to it.
 
-    Attributes
-    ----------
-    total : number
-        Sum of the weights.
-    drift : matrix or family
-        He{P (A + Psi) - Gamma C}.
-    side : matrix
-        P G - Gamma H, or None without disturbances.
-    Cz : matrix
-        Performance output.
+    total: sum of the weights
+    drift: he{P (A + Psi) - Gamma C}
+    side: P G - Gamma H, or None without disturbances
+    Cz: performance output
     """
 
     total: Any
@@ -68,17 +51,7 @@ def close(
     H: Sequence[Any],
     Cz: Sequence[Any],
 ) -> Closed:
-    """Form one term of (49), (50) and (54).
-
-    Parameters
-    ----------
-    P : matrix
-    gains : sequence of matrices
-        Gamma_l = P L_l at every vertex.
-    term : PolyaTerm
-    A, psi, C, G, H, Cz : sequences of matrices
-        At every vertex; `psi` may be families.
-    """
+    """Form one term of (49), (50) and (54)."""
     outer = _weighted(term.single, [P @ (a + p) for a, p in zip(A, psi, strict=True)])
     into = _products(term, gains, C)
     side = None

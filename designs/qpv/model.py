@@ -6,29 +6,21 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import QPV, qpv
 from obsynth.derive.errors import StructureError
 from obsynth.designs.qpv.data import VertexData, read_vertices
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.symbolic import Plant
-
-__all__ = ["Prepared", "check_faults", "derive_form", "prepare"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A plant of the class with its quadratic form.
 
-    Attributes
-    ----------
-    form : QPV
-        Every fault is a state.
-    vertices : int
-        Number of vertices of the scheduling variables.
+    form: every fault is a state
+    vertices: number of vertices of the scheduling variables
     """
 
     form: QPV
@@ -56,20 +48,7 @@ def derive_form(model: Plant, form_of_N: str) -> QPV:
 
 
 def prepare(model_or_form: Any, form_of_N: str) -> Prepared:
-    """Check the class and derive the quadratic form.
-
-    Parameters
-    ----------
-    model_or_form : Plant or QPV
-        Continuous time.
-    form_of_N : {"upper", "symmetric"}
-        Of a plant; a form has its own.
-
-    Raises
-    ------
-    StructureError
-        For what the method does not cover, by the user's names.
-    """
+    """Check the class and derive the quadratic form."""
     form = model_or_form if isinstance(model_or_form, QPV) else None
     model: Plant = model_or_form if form is None else form.model
     _check_signals(model)
@@ -138,11 +117,6 @@ def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> N
 
     A column of (A + Psi, C) that vanishes at a point of the polytopes belongs to an integrator
     that no gain reaches there: the persistency of excitation that Section 3 of the paper asks for.
-
-    Raises
-    ------
-    StructureError
-        Naming the fault and the combination of vertices where it is not seen.
     """
     from scipy.optimize import linprog
 

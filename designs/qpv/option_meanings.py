@@ -6,25 +6,13 @@ import itertools
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.qpv.model import Prepared
 from obsynth.designs.qpv.polytopes import Shape, box, cross, hull
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = [
-    "cover",
-    "noise_centre",
-    "one_of_each_pair",
-    "reach",
-    "read_performance_output",
-    "start_corners",
-    "unit_shape",
-]
-
-FloatArray = NDArray[np.float64]
 
 
 def noise_centre(model: Plant) -> FloatArray:

@@ -17,21 +17,14 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["PolyaTerm", "collapsed_terms", "polya_terms"]
-
 
 @dataclass(frozen=True, eq=False)
 class PolyaTerm:
     """Integer weights of one term.
 
-    Attributes
-    ----------
-    total : int
-        s (s - 1), the sum of either kind of weights; 1 for collapsed terms.
-    single : ndarray of int, shape (N,)
-        Weights of what depends on one index.
-    double : ndarray of int, shape (N, N)
-        Weights of products, [r_1, r_2].
+    total: s (s - 1), the sum of either kind of weights; 1 for collapsed terms
+    single: weights of what depends on one index
+    double: weights of products, [r_1, r_2]
     """
 
     total: int
@@ -40,37 +33,13 @@ class PolyaTerm:
 
 
 def collapsed_terms(vertices: int) -> tuple[PolyaTerm, ...]:
-    """One term per vertex: exact when the second factor of the products does not vary.
-
-    Examples
-    --------
-    >>> len(collapsed_terms(4))
-    4
-    """
+    """One term per vertex: exact when the second factor of the products does not vary."""
     units = np.eye(vertices, dtype=np.int64)
     return tuple(PolyaTerm(1, unit, np.diag(unit)) for unit in units)
 
 
 def polya_terms(vertices: int, order: int) -> tuple[PolyaTerm, ...]:
-    """All terms of order s, C(N + s - 1, s) of them.
-
-    Parameters
-    ----------
-    vertices : int
-        N.
-    order : int
-        s, at least 2.
-
-    Raises
-    ------
-    ObsynthError
-        If s is no integer from 2 on.
-
-    Examples
-    --------
-    >>> [len(polya_terms(4, s)) for s in (2, 3, 4)]
-    [10, 20, 35]
-    """
+    """All terms of order s, C(N + s - 1, s) of them."""
     if isinstance(order, bool) or not isinstance(order, int) or order < 2:
         raise ObsynthError(
             f"polya is {order!r}; the order s of the relaxation is an integer from 2 on",

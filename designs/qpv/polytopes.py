@@ -9,16 +9,13 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive import polytope_from_halfspaces, polytope_from_vertices
 from obsynth.derive.errors import DerivationError
 from obsynth.designs.lmi import Enclosure
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["KINDS", "Shape", "box", "cross", "hull"]
-
-FloatArray = NDArray[np.float64]
 Kind = Literal["box", "cross", "hull"]
 KINDS: tuple[Kind, ...] = ("box", "cross", "hull")
 _MOST = 2**14
@@ -28,12 +25,8 @@ _MOST = 2**14
 class Shape:
     """The polytope {e : a_k' e <= 1}, a_k in the rows of `normals`, which holds the origin.
 
-    Attributes
-    ----------
-    kind : {"box", "cross", "hull"}
-        ``"box"``: |e_i| <= r_i. ``"cross"``: sum |e_i| / r_i <= 1. ``"hull"``: by half-spaces.
-    data : ndarray
-        r of shape (N,), or the half-spaces of shape (K, N) for ``"hull"``.
+    kind: ``"box"``: |e_i| <= r_i. ``"cross"``: sum |e_i| / r_i <= 1. ``"hull"``: by half-spaces
+    data: r of shape (N,), or the half-spaces of shape (K, N) for ``"hull"``
     """
 
     kind: Kind
@@ -117,40 +110,17 @@ class Shape:
 
 
 def box(half_widths: FloatArray) -> Shape:
-    """Return the box |e_i| <= half_widths_i.
-
-    Examples
-    --------
-    >>> box(np.array([1.0, 2.0])).vertices.tolist()
-    [[-1.0, -2.0], [-1.0, 2.0], [1.0, -2.0], [1.0, 2.0]]
-    """
+    """Return the box |e_i| <= half_widths_i."""
     return Shape("box", np.asarray(half_widths, dtype=float))
 
 
 def cross(semi_axes: FloatArray) -> Shape:
-    """Return the cross-polytope sum |e_i| / semi_axes_i <= 1.
-
-    Examples
-    --------
-    >>> len(cross(np.ones(3)).normals.mid), len(cross(np.ones(3)).vertices)
-    (4, 6)
-    """
+    """Return the cross-polytope sum |e_i| / semi_axes_i <= 1."""
     return Shape("cross", np.asarray(semi_axes, dtype=float))
 
 
 def hull(vertices: FloatArray) -> Shape:
-    """Return a polytope that holds given points, the origin inside.
-
-    Raises
-    ------
-    ObsynthError
-        If the points are flat, or the origin is not in the interior.
-
-    Examples
-    --------
-    >>> hull(np.array([[-1.0, -1.0], [2.0, 0.0], [0.0, 2.0]])).data.shape
-    (3, 2)
-    """
+    """Return a polytope that holds given points, the origin inside."""
     try:
         found = polytope_from_vertices(vertices)
     except DerivationError as error:

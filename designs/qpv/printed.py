@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["printed_gains"]
-
 _FIRST = [
     """71.0525 -30.1291 -11.5840 103.3840 -24.6506 -19.2940 -120.2296 22.5926 42.0515
     110.9573 -96.8190 -33.2168 -27.9764 74.9819 21.2993 -97.3858 53.6423 44.2481""",
@@ -34,23 +32,7 @@ _LISTS = {"first": [*_FIRST, _FIRST[2]], "H2": _H2}
 
 
 def printed_gains(name: Literal["first", "H2"]) -> dict[str, NDArray[np.float64]]:
-    """Return L1, ..., L4 of Rotondo, Buciakowski and Witczak, Section 5.
-
-    Parameters
-    ----------
-    name : {"first", "H2"}
-        Without and with the conditions (39)-(41). L4 of the first list repeats L3.
-
-    Raises
-    ------
-    ObsynthError
-        Another name.
-
-    Examples
-    --------
-    >>> printed_gains("H2")["L1"][5].tolist()
-    [0.1198, 0.1033, 31.6956]
-    """
+    """Return L1, ..., L4 of Rotondo, Buciakowski and Witczak, Section 5."""
     if name not in _LISTS:
         raise ObsynthError(f"there are gains 'first' and 'H2', not {name!r}", name=name)
     return {

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.forms.qpv.layout import QPVLayout
 from obsynth.derive.jacobian.family import AffineFamily
@@ -20,27 +19,19 @@ from obsynth.designs.qpv.polytopes import Shape
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.synthesis import Norm
 from obsynth.symbolic import Plant
-
-__all__ = ["METHOD", "NoiseBound", "QPVDesign"]
+from obsynth.symbolic.arrays import FloatArray
 
 METHOD = "qpv_observer"
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseBound:
     """Bounded disturbances of a design by quadratic boundedness.
 
-    Attributes
-    ----------
-    rate : float
-        alpha_q: V' <= alpha_q (1 - V).
-    weights : ndarray of shape (n_v,)
-        Diagonal of W; every admissible v has v'W v <= 1.
-    radius : ndarray of shape (n_v,)
-        Largest |v_i|: disturbances about their centre, then rates of faults.
-    faults : tuple of int
-        Positions among the augmented states of the faults whose rates are in v.
+    rate: alpha_q: V' <= alpha_q (1 - V)
+    weights (n_v,): diagonal of W; every admissible v has v'W v <= 1
+    radius (n_v,): largest |v_i|: disturbances about their centre, then rates of faults
+    faults: positions among the augmented states of the faults whose rates are in v
     """
 
     rate: float
@@ -53,45 +44,24 @@ class NoiseBound:
 class QPVDesign:
     """Everything that is deployed and proved, in doubles.
 
-    Attributes
-    ----------
-    plant : Plant
-        The continuous plant.
-    form_of_N : str
-        See `obsynth.qpv`.
-    family : AffineFamily
-        The stacked matrices of the quadratic form, affine in the scheduling variables.
-    scheduling : tuple of str
-        The scheduling variables as expressions of inputs and scheduling signals.
-    region : Ellipsoid
-        X, in which the augmented state is assumed to stay.
-    state, error : Shape
-        Polytopes of x - c and of e, see `ErrorSets`.
-    error_coordinates : tuple of int
-    start : ndarray of shape (r, n)
-        Corners of the polytope of e(0).
-    norm : {"h2", "hinf"}
-    alpha : float
-        Decay of V without disturbances.
-    noise : NoiseBound or None
-    polya : int or None
-    Cz : ndarray of shape (V, n_z, n)
-    w_centre : ndarray of shape (n_w,)
-        Middle of the declared disturbances.
-    P : ndarray of shape (n, n)
-    L : ndarray of shape (V, n, m)
-    gamma : float
-        Proved bound of the squared L2 gain; infinite where it is not claimed.
-    rows : ndarray of shape (V, n_z)
-        Proved upper bounds of the diagonal of Cz P^-1 Cz'.
-    inverse_diagonal : ndarray of shape (n,)
-        Proved upper bounds of (P^-1)_ii.
-    reset : float
-        X - c lies in {e'P e <= reset^2}, proved.
-    Ts : float
-        Sample time of the step.
-    options : mapping
-        The options of the method, as given.
+    plant: the continuous plant
+    form_of_N: see `obsynth.qpv`
+    family: the stacked matrices of the quadratic form, affine in the scheduling variables
+    scheduling: the scheduling variables as expressions of inputs and scheduling signals
+    region: X, in which the augmented state is assumed to stay
+    state, error: polytopes of x - c and of e, see `ErrorSets`
+    start (r, n): corners of the polytope of e(0)
+    alpha: decay of V without disturbances
+    Cz (V, n_z, n)
+    w_centre (n_w,): middle of the declared disturbances
+    P (n, n)
+    L (V, n, m)
+    gamma: proved bound of the squared L2 gain; infinite where it is not claimed
+    rows (V, n_z): proved upper bounds of the diagonal of Cz P^-1 Cz'
+    inverse_diagonal (n,): proved upper bounds of (P^-1)_ii
+    reset: X - c lies in {e'P e <= reset^2}, proved
+    Ts: sample time of the step
+    options: the options of the method, as given
     """
 
     plant: Plant
@@ -163,13 +133,7 @@ class QPVDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> QPVDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             design = cls._read(record)
         design._check()

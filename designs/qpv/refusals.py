@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.qpv.synthesis import Setting, solve
-
-__all__ = ["Accepted", "printed_refusal"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import math
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
@@ -15,10 +14,6 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.signals import Signal
 from obsynth.symbolic.text import read_text
-
-__all__ = ["FASTEST", "choose_sample_time", "fastest_mode", "measured_schedule", "vertex_weights"]
-
-FloatArray = NDArray[np.float64]
 
 FASTEST = 1.0
 """Largest product of sample time and modulus of a mode.
@@ -36,19 +31,7 @@ def measured_schedule(plant: Plant) -> tuple[Signal, ...]:
 def vertex_weights(design: QPVDesign, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the weights of the vertices, and whether the scheduling lies in its range.
 
-    Parameters
-    ----------
-    design : QPVDesign
-    u, theta : casadi.SX
-        Inputs and measured scheduling signals.
-
-    Returns
-    -------
-    weights : casadi.SX of shape (V, 1)
-        Products of the relative positions in the ranges (the bilinear mix for two variables), the
-        last variable fastest; at least 0 and of sum 1.
-    inside : casadi.SX
-        1 where every variable lies in its range.
+    Shapes: weights (V, 1).
     """
     values = _values(design, u, theta)
     weights, inside = [ca.SX(1)], ca.SX(1)
@@ -84,18 +67,7 @@ def fastest_mode(design: QPVDesign) -> float:
 
 
 def choose_sample_time(fastest: float, given: float | None) -> float:
-    """Check a sample time against the fastest mode, or choose one (1, 2 or 5 times 10^k).
-
-    Raises
-    ------
-    ObsynthError
-        If it is too long, with the largest that serves.
-
-    Examples
-    --------
-    >>> choose_sample_time(30.0, None)
-    0.02
-    """
+    """Check a sample time against the fastest mode, or choose one (1, 2 or 5 times 10^k)."""
     longest = FASTEST / max(fastest, 1e-6)
     if given is None:
         power = 10.0 ** math.floor(math.log10(longest))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.runtime import largest_level
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
@@ -15,10 +15,7 @@ from obsynth.designs.qpv.record import QPVDesign
 from obsynth.designs.qpv.schedule import measured_schedule, vertex_weights
 from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic import Plant
-
-__all__ = ["build_ode", "build_step", "make_start", "memory_layout"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # Above the rounding of the few dozen operations behind every returned number.
 _UP = 1.0 + 2.0**-40

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.lmi import (
     Affine,
@@ -37,10 +36,8 @@ from obsynth.designs.qpv.lmis import (
     start_block,
 )
 from obsynth.designs.qpv.polya import PolyaTerm
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Norm", "Setting", "Unknowns", "rough_objective", "solve", "state_problem"]
-
-FloatArray = NDArray[np.float64]
 Norm = Literal["h2", "hinf"]
 
 # Part of the largest margin that phase 2 keeps; the objective loses about as much, relatively.
@@ -54,24 +51,12 @@ _ROUGH = -1e-5
 class Setting:
     """Everything that the inequalities depend on besides the unknowns.
 
-    Attributes
-    ----------
-    data : VertexData
-    sets : ErrorSets
-    norm : {"h2", "hinf"}
-    alpha : float
-        Decay rate of V = e'P e.
-    alpha_q : float or None
-        Rate of quadratic boundedness.
-    noise : ndarray of shape (n_v,) or None
-        Weights of the disturbances, w'W w <= 1.
-    polya : int or None
-    gain_cap : float or None
-        Largest singular value of every L_l.
-    printed : bool
-        Whether (19) and (20) are taken as printed.
-    half : ndarray of shape (n,)
-        Units of the error.
+    alpha: decay rate of V = e'P e
+    alpha_q: rate of quadratic boundedness
+    noise (n_v,) or None: weights of the disturbances, w'W w <= 1
+    gain_cap: largest singular value of every L_l
+    printed: whether (19) and (20) are taken as printed
+    half (n,): units of the error
     """
 
     data: VertexData
@@ -117,16 +102,7 @@ class Unknowns:
 def state_problem(setting: Setting, gains: FloatArray | None = None) -> Problem:
     """State the design problem, or with gains L_l given the analysis problem.
 
-    Parameters
-    ----------
-    setting : Setting
-    gains : ndarray of shape (V, n, m), optional
-
-    Returns
-    -------
-    Problem
-        With unknowns ``P``, ``Gamma0``, ..., and ``Z`` or ``gamma``, errors in units of
-        `Setting.half`.
+    Shapes: gains (V, n, m).
     """
     half, n = setting.half, setting.data.sizes[0]
     data = setting.data.scaled(half)
@@ -202,13 +178,7 @@ def _distinct(matrices: FloatArray) -> FloatArray:
 
 
 def rough_objective(setting: Setting, gains: FloatArray | None = None) -> float:
-    """Return the optimum without margin and proof, for searches.
-
-    Raises
-    ------
-    InfeasibleDesign, SolverTrouble
-        As the solver reports.
-    """
+    """Return the optimum without margin and proof, for searches."""
     found = solve_lazily(
         state_problem(setting, gains),
         floor=_ROUGH,
@@ -226,18 +196,7 @@ def solve(
 ) -> tuple[Unknowns, MarginSolution]:
     """Solve with a margin and back off until `prove` accepts the numbers as stored.
 
-    Parameters
-    ----------
-    setting : Setting
-    prove : callable
-        From the unknowns in the plant's coordinates to an object with ``all_proved``.
-    gains : ndarray of shape (V, n, m), optional
-        Given gains.
-
-    Raises
-    ------
-    InfeasibleDesign, CertificateError, SolverTrouble
-        As the LMI layer reports.
+    Shapes: gains (V, n, m).
     """
     problem = state_problem(setting, gains)
     found = solve_with_margin(

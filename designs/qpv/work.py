@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import Knob, largest_margin, search_line, smallest_changes
@@ -35,16 +35,14 @@ from obsynth.designs.qpv.synthesis import (
     solve,
     state_problem,
 )
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-from obsynth.symbolic.text import write_text
+from obsynth.symbolic.text_writer import write_text
 
 if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer
     from obsynth.designs.qpv.method import QPVObserver
 
-__all__ = ["Workspace"]
-
-FloatArray = NDArray[np.float64]
 
 # Outwards, so that inclusions that hold with equality can be proved in floating point.
 _OUTWARDS = 1.0 + 2.0**-40
@@ -60,14 +58,8 @@ _REFINE = 3
 class Workspace:
     """Options and plant, checked against each other.
 
-    Attributes
-    ----------
-    options : QPVObserver
-    prepared : Prepared
-    Cz : ndarray of shape (V, n_z, n)
-    unit : Shape
-        The polytope for kappa = 1.
-    kappa : float
+    Cz (V, n_z, n)
+    unit: the polytope for kappa = 1
     """
 
     options: QPVObserver

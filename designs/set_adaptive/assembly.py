@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.observer import Observer
@@ -21,11 +21,8 @@ from obsynth.designs.set_adaptive.record import METHOD, SetDesign
 from obsynth.designs.set_adaptive.step import build_step, initial_memory
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 from obsynth.designs.starting import read_box, read_vector
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["assemble", "prove", "to_record"]
-
-FloatArray = NDArray[np.float64]
 
 
 def to_record(design: SetDesign) -> dict[str, Any]:
@@ -34,15 +31,7 @@ def to_record(design: SetDesign) -> dict[str, Any]:
 
 
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
-    """Prove everything that the guarantee of a stored design rests on.
-
-    Parameters
-    ----------
-    record : mapping
-        Of `to_record`.
-    level : {"full", "lmi"}
-        Whether the form and its elementwise bounds are derived again.
-    """
+    """Prove everything that the guarantee of a stored design rests on."""
     if record.get("kind") == "bank":
         return prove_bank(BankDesign.from_record(record), level)
     return prove_design(SetDesign.from_record(record), level)
@@ -53,20 +42,7 @@ def assemble(
     derived: Structure | None = None,
     level: Level = "lmi",
 ) -> Observer:
-    """Prove a design and make its observer.
-
-    Parameters
-    ----------
-    record_or_design : mapping, SetDesign or BankDesign
-    derived : Structure, optional
-        What was just derived from the plant; proved too, without deriving it again.
-    level : {"full", "lmi"}
-
-    Raises
-    ------
-    CertificateError
-        If a claim does not hold.
-    """
+    """Prove a design and make its observer."""
     if isinstance(record_or_design, BankDesign):
         return assemble_bank(record_or_design, level)
     if isinstance(record_or_design, SetDesign):

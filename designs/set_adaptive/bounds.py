@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
@@ -23,10 +23,8 @@ from obsynth.derive.forms.quasi_lpv.measured import readings
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.rigour.numbers import substitute
 from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["BLOCKS", "EndBounds", "derive_bounds", "end_symbols"]
-
-FloatArray = NDArray[np.float64]
 BLOCKS = ("A", "B", "offset")
 _SIDES = ("lower", "upper")
 
@@ -35,15 +33,10 @@ _SIDES = ("lower", "upper")
 class EndBounds:
     """Bounds of A, B and the offset as functions of ends of the measured states.
 
-    Attributes
-    ----------
-    states : tuple of Signal
-        The measured states.
-    exact : tuple of Signal
-        Inputs and measured scheduling variables, known exactly.
-    lower, upper : dict of str to sympy.Matrix
-        Bounds of the blocks ``"A"`` (n, n), ``"B"`` (n, n_u) and ``"offset"`` (n, 1), for states
-        that lie between their ends and inside their declared ranges.
+    states: the measured states
+    exact: inputs and measured scheduling variables, known exactly
+    lower, upper: bounds of the blocks ``"A"`` (n, n), ``"B"`` (n, n_u) and ``"offset"`` (n, 1), for
+        states that lie between their ends and inside their declared ranges
     """
 
     states: tuple[Signal, ...]
@@ -72,16 +65,7 @@ class EndBounds:
     def extremes(self, reach: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the least A_lower and the largest A_upper over the declared ranges.
 
-        Parameters
-        ----------
-        reach : array_like of shape (number of measured states,)
-            How far the ends lie from the middle of their interval at most; infinite for ends
-            anywhere in the range.
-
-        Returns
-        -------
-        (ndarray, ndarray)
-            Shape (n, n) each, guaranteed for ends clipped to the ranges of the states.
+        Shapes: reach (number of measured states,).
         """
         width = np.broadcast_to(np.asarray(reach, dtype=float), (len(self.states),))
         known = _columns(len(self.exact))
@@ -157,31 +141,7 @@ def end_symbols(state: Signal) -> tuple[sp.Symbol, sp.Symbol]:
 
 
 def derive_bounds(form: QuasiLPV) -> EndBounds:
-    """Bound the blocks of a quasi-LPV form elementwise between ends of the measured states.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        Of a plant whose outputs show states.
-
-    Returns
-    -------
-    EndBounds
-
-    Raises
-    ------
-    UnboundedError
-        An entry has no finite bound; entry and signal are named.
-
-    Examples
-    --------
-    >>> from obsynth.derive import quasi_lpv
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> bounds = derive_bounds(quasi_lpv(three_tanks()))
-    >>> low, high = bounds.function()([0.5, 0.1], [0.5, 0.1], [])[:2]
-    >>> round(float(low[0, 0]), 8), round(float(high[0, 0]), 8)
-    (-0.0230643, -0.01692457)
-    """
+    """Bound the blocks of a quasi-LPV form elementwise between ends of the measured states."""
     plant = form.model
     shown = {r.state for r in readings(plant)}
     states = tuple(s for s in plant.x if s.symbol in shown)

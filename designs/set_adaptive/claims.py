@@ -13,8 +13,6 @@ from obsynth.designs.set_adaptive.model import Structure, read_structure
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 
-__all__ = ["decay_conditions", "metzler_conditions", "prove_design"]
-
 _EXACT = "exact rational arithmetic on the stored numbers"
 
 
@@ -31,16 +29,7 @@ def decay_conditions(A_upper: Any, L: Any, C: Any, p: Any, alpha: float) -> Any:
 def prove_design(
     design: SetDesign, level: Level, derived: Structure | None = None
 ) -> tuple[Claim, ...]:
-    """Prove everything from the stored design.
-
-    Parameters
-    ----------
-    design : SetDesign
-    level : {"full", "lmi"}
-        Whether the form, the elementwise bounds and the speeds are derived again.
-    derived : Structure, optional
-        What was just derived, proved too without deriving it again.
-    """
+    """Prove everything from the stored design."""
     claims = [_signs(design), _boxes(design), _metzler(design)]
     claims += [
         _decay(design, "decay", design.A_upper, design.alpha, "the continuous form"),

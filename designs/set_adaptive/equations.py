@@ -6,13 +6,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.set_adaptive.record import SetDesign
 
-__all__ = ["Drive", "Memory", "drives", "ends", "memory_layout", "residuals", "theta_rates"]
-
-FloatArray = NDArray[np.float64]
 _PARTS = (
     ("zeta_m", "n"),
     ("zeta_M", "n"),
@@ -80,14 +76,9 @@ class Memory:
 class Drive:
     """What drives one of the two bounding systems.
 
-    Attributes
-    ----------
-    M : casadi.SX of shape (n, n)
-        A_o - L C.
-    c : casadi.SX of shape (n, 1)
-        Inputs, offset, disturbances and outputs.
-    size : casadi.SX of shape (n, 1)
-        Sum of the magnitudes of what c is made of.
+    M (n, n): A_o - L C
+    c (n, 1): inputs, offset, disturbances and outputs
+    size (n, 1): sum of the magnitudes of what c is made of
     """
 
     M: ca.SX
@@ -119,18 +110,7 @@ def drives(
     u: ca.SX,
     exact: ca.SX,
 ) -> tuple[Drive, Drive]:
-    """Return the lower and the upper bounding system.
-
-    Parameters
-    ----------
-    design : SetDesign
-    states : tuple of casadi.SX
-        Lower and upper ends of the measured states, which the bounds are functions of.
-    outputs : tuple of casadi.SX
-        Lower and upper ends of C x, which the gain is fed with.
-    u, exact : casadi.SX
-        Inputs; arguments of the bounds that are known exactly.
-    """
+    """Return the lower and the upper bounding system."""
     values = design.bounds.function()(*states, exact)
     A, B, offset = (values[2 * i : 2 * i + 2] for i in range(3))
     L = design.L

@@ -10,14 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.filter_bank.model import BankDesign
 from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer
 
-__all__ = ["Indicators", "Monitors", "bank_intervals", "fault_indicators", "monitors"]
 
-FloatArray = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
@@ -25,14 +24,9 @@ Flags = NDArray[np.bool_]
 class Indicators:
     """Which outputs and faults raise an alarm.
 
-    Attributes
-    ----------
-    s : ndarray of bool, shape (..., m)
-        (16): the output is outside of what a plant without fault may show.
-    d : ndarray of bool, shape (..., q)
-        (17): zero is outside of the interval of the fault.
-    z : ndarray of bool, shape (..., m)
-        (18): the output is outside of what any constant fault explains.
+    s: (16): the output is outside of what a plant without fault may show
+    d: (17): zero is outside of the interval of the fault
+    z: (18): the output is outside of what any constant fault explains
     """
 
     s: Flags
@@ -59,16 +53,11 @@ class Indicators:
 class Monitors:
     """Means over the window, (13), and what they tell.
 
-    Attributes
-    ----------
-    R_m, R_M : ndarray of shape (q, q)
-    b_m, b_M : ndarray of shape (q,)
-    limit_m, limit_M : ndarray of shape (q,)
-        R^-1 b, where the printed law would settle; NaN while R is singular.
-    excitation : float
-        Smallest eigenvalue of R_m and R_M: persistent excitation keeps it positive.
-    weight : float
-        Length of the window that is filled, in seconds.
+    R_m, R_M (q, q)
+    b_m, b_M (q,)
+    limit_m, limit_M (q,): R^-1 b, where the printed law would settle; NaN while R is singular
+    excitation: smallest eigenvalue of R_m and R_M: persistent excitation keeps it positive
+    weight: length of the window that is filled, in seconds
     """
 
     R_m: FloatArray
@@ -89,33 +78,7 @@ def fault_indicators(
 ) -> Indicators:
     """Evaluate the tests (16)-(18) for one memory or many.
 
-    Parameters
-    ----------
-    observer : Observer
-        Of `SetAdaptiveObserver` (not of the bank).
-    memory : array_like of shape (..., n_memory)
-        At the instants of y.
-    y : array_like of shape (..., m)
-        Measurements.
-    form : {"corrected", "printed"}
-        ``"printed"`` reads (17) literally, theta_m as the lower bound; in case (a) of Theorem 1,
-        which applies, theta_m is the upper one, so the printed test always alarms.
-
-    Raises
-    ------
-    ObsynthError
-        If the observer is of another kind.
-
-    Examples
-    --------
-    >>> from obsynth.designs.set_adaptive import SetAdaptiveObserver
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> observer = SetAdaptiveObserver().design(three_tanks())
-    >>> memory = observer.memory0([0.5, 0.1, 0.3])
-    >>> bool(fault_indicators(observer, memory, [0.5, 0.1]).D)
-    False
-    >>> bool(fault_indicators(observer, memory, [0.5, 0.1], form="printed").D)
-    True
+    Shapes: memory (..., n_memory), y (..., m).
     """
     design = _design(observer)
     parts = np.asarray(memory, dtype=float)
@@ -144,24 +107,7 @@ def bank_intervals(
     Each holds the mean of the fault with the weights exp(-rate age); an alarm of any of them, zero
     outside of it, proves a fault.
 
-    Parameters
-    ----------
-    observer : Observer
-        Of `SetAdaptiveObserver(robust=True)`.
-    memory : array_like of shape (..., n_memory)
-        With which the step is called at the instants of y.
-    y : array_like of shape (..., m)
-        Measurements.
-
-    Returns
-    -------
-    (ndarray, ndarray)
-        Shape (..., number of faults, number of filters); infinite before the first step.
-
-    Raises
-    ------
-    ObsynthError
-        If the observer is of another kind.
+    Shapes: memory (..., n_memory), y (..., m).
     """
     if observer.record.get("kind") != "bank":
         raise ObsynthError(
@@ -185,19 +131,7 @@ def bank_intervals(
 
 
 def monitors(observer: Observer, memory: ArrayLike) -> Monitors:
-    """Return the monitors (13) of a memory.
-
-    Parameters
-    ----------
-    observer : Observer
-        Of `SetAdaptiveObserver` (not of the bank).
-    memory : array_like of shape (n_memory,)
-
-    Raises
-    ------
-    ObsynthError
-        If the observer is of another kind, or nothing has been measured yet.
-    """
+    """Return the monitors (13) of a memory. Shapes: memory (n_memory,)."""
     design = _design(observer)
     q = len(design.Gamma)
     parts = np.asarray(memory, dtype=float)

@@ -8,8 +8,6 @@ import sympy as sp
 from obsynth.designs.core.stepping import all_finite, finite_or
 from obsynth.symbolic import Plant
 
-__all__ = ["known_signals"]
-
 
 def known_signals(plant: Plant, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     """Return inputs and scheduling made finite, whether they were, and whether they are covered.

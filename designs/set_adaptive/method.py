@@ -7,10 +7,11 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.set_adaptive.rounding import PRECISIONS
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
@@ -22,9 +23,7 @@ if TYPE_CHECKING:
     from obsynth.designs.set_adaptive.record import SetDesign
     from obsynth.symbolic import Plant
 
-__all__ = ["SetAdaptiveObserver"]
 
-FloatArray = NDArray[np.float64]
 _LAWS = ("cooperative", "printed")
 _FORMS = ("corrected", "printed")
 _DECADE = (5.0, 2.0, 1.0)
@@ -342,13 +341,7 @@ def _positive(given: Any) -> bool:
 
 
 def round_down(value: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that is not above a positive number.
-
-    Examples
-    --------
-    >>> round_down(0.0101)
-    0.01
-    """
+    """Return the largest 1, 2 or 5 times a power of ten that is not above a positive number."""
     exponent = int(np.floor(np.log10(value)))
     for digit in _DECADE:
         candidate = float(f"{digit:g}e{exponent}")

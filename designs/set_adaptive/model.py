@@ -6,37 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import round_number, substitute
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
 from obsynth.symbolic import Plant
-
-__all__ = ["Structure", "output_of_fault", "read_structure"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
     """The plant in the form (3) of the paper, with bounds.
 
-    Attributes
-    ----------
-    form : QuasiLPV
-        With the proof that it is the plant.
-    bounds : EndBounds
-    C, G, W1, W2 : ndarray
-        Shapes (m, n), (n, q), (n, n_w), (m, n_w).
-    w_centre, w_radius : ndarray of shape (n_w,)
-        Box of the disturbances, zero where the noise is left out.
-    rate : ndarray of shape (m, 2)
-        Range of the derivative of C x over the declared ranges, inputs left out where they
-        enter with a constant factor.
-    input_rate : ndarray of shape (m, n_u)
-        These factors.
+    form: with the proof that it is the plant
+    C, G, W1, W2: shapes (m, n), (n, q), (n, n_w), (m, n_w)
+    w_centre, w_radius (n_w,): box of the disturbances, zero where the noise is left out
+    rate (m, 2): range of the derivative of C x over the declared ranges, inputs left out where they
+        enter with a constant factor
+    input_rate (m, n_u): these factors
     """
 
     form: QuasiLPV
@@ -73,29 +61,7 @@ class Structure:
 
 
 def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
-    """Read a continuous plant, or refuse it by name.
-
-    Parameters
-    ----------
-    plant : Plant or Split
-        Continuous, with nonnegative states.
-    noise : bool
-        Whether the declared disturbances are included in the bounds.
-
-    Raises
-    ------
-    StructureError
-        Naming the signal that does not fit and what to do.
-    UnboundedError
-        If an entry of A, or the speed of an output, has no bound over the declared ranges.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> structure = read_structure(three_tanks())
-    >>> structure.noise.round(6).tolist(), structure.G[0].round(4).tolist()
-    ([0.0045, 0.0045], [64.9351, 0.0])
-    """
+    """Read a continuous plant, or refuse it by name."""
     plant = continuous(plant)
     _check_signals(plant)
     form = quasi_lpv(plant)
@@ -142,13 +108,7 @@ def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
 
 
 def continuous(plant: Plant | Split) -> Plant:
-    """Return the continuous plant of a split or behind a discretisation made by the package.
-
-    Raises
-    ------
-    StructureError
-        The plant is discrete from the start.
-    """
+    """Return the continuous plant of a split or behind a discretisation made by the package."""
     if isinstance(plant, Split):
         plant = plant.model
     if plant.Ts is None:
@@ -167,25 +127,7 @@ def continuous(plant: Plant | Split) -> Plant:
 def output_of_fault(
     C: FloatArray, A_lower: FloatArray, G: FloatArray, names: tuple[str, ...]
 ) -> list[int]:
-    """Return for every fault the output that shows it first, by derivatives, then by size.
-
-    Parameters
-    ----------
-    C, A_lower, G : ndarray
-        Shapes (m, n), (n, n), (n, q); off the diagonal of A_lower only what is positive counts.
-    names : tuple of str
-        Of the faults, for the refusal.
-
-    Raises
-    ------
-    StructureError
-        No output shows the fault for certain.
-
-    Examples
-    --------
-    >>> output_of_fault(np.eye(2), np.zeros((2, 2)), np.eye(2)[:, ::-1], ("f1", "f2"))
-    [1, 0]
-    """
+    """Return for every fault the output that shows it first, by derivatives, then by size."""
     flow = np.maximum(A_lower, 0.0)
     np.fill_diagonal(flow, 0.0)
     found = []

@@ -14,8 +14,6 @@ from obsynth.designs.set_adaptive.equations import (
 )
 from obsynth.designs.set_adaptive.record import SetDesign
 
-__all__ = ["build_ode"]
-
 
 def build_ode(design: SetDesign) -> ca.Function:
     """Build (memory, u, y[, theta]) -> dmemory of equations (6)-(8), (13), (14).

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, off_diagonal
-
-__all__ = ["printed_gain", "solve_printed"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def solve_printed(
@@ -20,11 +16,6 @@ def solve_printed(
 
     Any p and w that meet the first condition meet the second with a large r, so nothing of the
     Metzler property is asked; and p'(p w') = (p'p) w' is not w'.
-
-    Returns
-    -------
-    (ndarray, ndarray, ndarray)
-        p of shape (n,), w of shape (m,), L = p w' of shape (n, m).
     """
     from scipy.optimize import linprog
 
@@ -45,13 +36,7 @@ def solve_printed(
 
 
 def printed_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray) -> Gain:
-    """Return the printed gain where it happens to work.
-
-    Raises
-    ------
-    InfeasibleDesign
-        With what L = p w' violates.
-    """
+    """Return the printed gain where it happens to work."""
     p, w, L = solve_printed(A_lower, A_upper, C)
     lacking = off_diagonal(A_lower - L @ C)
     decay = -float(np.linalg.eigvals(A_upper - L @ C).real.max())

@@ -14,41 +14,27 @@ from obsynth.designs.core.record import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.bounds import EndBounds
 from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
 from obsynth.symbolic import Plant
-
-__all__ = ["KINDS", "METHOD", "SetDesign"]
+from obsynth.symbolic.arrays import FloatArray
 
 METHOD = "set_adaptive_observer"
 KINDS = ("adaptive", "bank")
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class SetDesign:
     """Everything that is deployed and proved of the set adaptive observer.
 
-    Attributes
-    ----------
-    plant : Plant
-        Continuous.
-    Ts : float
-        Sample time of the step.
-    bounds : EndBounds
-    C, G, W1, W2, w_centre, w_radius, rate, input_rate : ndarray
-        See `Structure`.
-    A_lower, A_upper : ndarray of shape (n, n)
-        Least A_m and largest A_M of the continuous form (noise included).
-    A_upper_step : ndarray of shape (n, n)
-        The same with what the outputs move within a step.
-    A_lower_box : ndarray of shape (n, n)
-        Least A_m for ends anywhere in the declared ranges.
-    L, p : ndarray of shape (n, m), (n,)
-    alpha, alpha_step : float
-        Decay of the continuous form and of the step.
-    Gamma : ndarray of shape (q,)
-    fault_outputs : ndarray of shape (q,)
-        The output that adapts each fault.
-    options : mapping
-        The options of the method, as given.
+    plant: continuous
+    Ts: sample time of the step
+    C, G, W1, W2, w_centre, w_radius, rate, input_rate: see `Structure`
+    A_lower, A_upper (n, n): least A_m and largest A_M of the continuous form (noise included)
+    A_upper_step (n, n): the same with what the outputs move within a step
+    A_lower_box (n, n): least A_m for ends anywhere in the declared ranges
+    L, p (n, m), (n,)
+    alpha, alpha_step: decay of the continuous form and of the step
+    Gamma (q,)
+    fault_outputs (q,): the output that adapts each fault
+    options: the options of the method, as given
     """
 
     plant: Plant
@@ -112,13 +98,7 @@ class SetDesign:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> SetDesign:
-        """Read and check the data of `to_record`.
-
-        Raises
-        ------
-        CertificateError
-            If an entry is missing, not finite, or of the wrong shape.
-        """
+        """Read and check the data of `to_record`."""
         with reading():
             plant = Plant.from_dict(record["plant"])
             sizes = {

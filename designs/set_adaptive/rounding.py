@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["PRECISIONS", "SHOWN", "allowance", "outward", "precision_of"]
+from obsynth.symbolic.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 PRECISIONS = ("double", "single")
 UNIT: Mapping[str, float] = {"double": 2.0**-53, "single": 2.0**-24}
 """Unit roundoff."""
@@ -26,21 +24,6 @@ def allowance(precision: str, n: int, product: float = 0.0) -> float:
     every factor Q of the exponential 16 for its entries and n for the product, and the terms with
     j factors have the weight of a Poisson variable with mean h mu, so that h mu factors count.
     Twice that, and 2^-42 in double precision.
-
-    Parameters
-    ----------
-    precision : {"double", "single"}
-    n : int
-        Number of states.
-    product : float
-        h mu of the exponential.
-
-    Examples
-    --------
-    >>> allowance("double", 3) == 2.0**-42
-    True
-    >>> allowance("single", 3, 0.03) < 2.0**-17
-    True
     """
     count = 2.0 * (24.0 + (16.0 + n) * (1.0 + product))
     return max(count * UNIT[precision], 2.0**-42)
@@ -52,16 +35,7 @@ def precision_of(options: Mapping[str, Any]) -> str:
 
 
 def outward(box: FloatArray, precision: str) -> FloatArray:
-    """Return a box whose ends are numbers of the precision and that holds the given one.
-
-    Examples
-    --------
-    >>> outward(np.array([[0.1, 0.2]]), "double").tolist()
-    [[0.1, 0.2]]
-    >>> wide = outward(np.array([[0.1, 0.2]]), "single")
-    >>> bool(wide[0, 0] < 0.1), bool(wide[0, 1] > 0.2)
-    (True, True)
-    """
+    """Return a box whose ends are numbers of the precision and that holds the given one."""
     if precision == "double":
         return np.array(box, dtype=float)
     single = np.asarray(box, dtype=np.float32)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.set_adaptive.equations import (
@@ -28,10 +27,7 @@ from obsynth.designs.set_adaptive.ode import exact_arguments
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.rounding import SHOWN, outward
 from obsynth.designs.set_adaptive.transition import apply, uniformisation
-
-__all__ = ["build_step", "initial_memory"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def initial_memory(

@@ -7,13 +7,10 @@ from decimal import Decimal, localcontext
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
-__all__ = ["LARGEST_PRODUCT", "Weights", "apply", "uniformisation"]
-
-FloatArray = NDArray[np.float64]
 LARGEST_PRODUCT = 64.0
 """Largest h mu: beyond it the sum has too many terms for one step."""
 # What is left out stays below the rounding of the sum itself.
@@ -24,13 +21,8 @@ _TAIL = 2.0**-64
 class Weights:
     """Weights of the powers of Q = I + M / mu.
 
-    Attributes
-    ----------
-    h, mu : float
-    state : ndarray of shape (J + 1,)
-        Of the terms of e^{hM}: the Poisson probabilities of h mu.
-    drive : ndarray of shape (J + 1,)
-        Of the terms of the integral of e^{sM} from 0 to h: their tails, divided by mu.
+    state (J + 1,): of the terms of e^{hM}: the Poisson probabilities of h mu
+    drive (J + 1,): of the terms of the integral of e^{sM} from 0 to h: their tails, divided by mu
     """
 
     h: float
@@ -43,17 +35,6 @@ def uniformisation(h: float, mu: float) -> Weights:
     """Return the weights for a step h and a mu that no diagonal entry of -M exceeds.
 
     e^{hM} = e^{-h mu} sum (h (M + mu I))^j / j!, all terms nonnegative.
-
-    Raises
-    ------
-    ObsynthError
-        If h mu is above `LARGEST_PRODUCT`.
-
-    Examples
-    --------
-    >>> weights = uniformisation(0.1, 2.0)
-    >>> bool(abs(weights.state.sum() - 1.0) < 1e-15), bool(abs(weights.drive.sum() - 0.1) < 1e-15)
-    (True, True)
     """
     product = h * mu
     if not 0.0 < product <= LARGEST_PRODUCT:
@@ -87,12 +68,7 @@ def _poisson(mean: float) -> tuple[list[float], list[float]]:
 def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
     """Return e^{hM} state + (integral of e^{sM}) drive by Horner's scheme.
 
-    Parameters
-    ----------
-    weights : Weights
-    M : casadi.SX of shape (n, n)
-        Metzler, its diagonal not below -mu.
-    state, drive : casadi.SX of shape (n, c)
+    Shapes: M (n, n), state, drive (n, c).
     """
     Q = M / weights.mu + ca.SX.eye(M.shape[0])
     result = weights.state[-1] * state + weights.drive[-1] * drive

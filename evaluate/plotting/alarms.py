@@ -12,7 +12,6 @@ from obsynth.evaluate.plotting.style import ESTIMATE, SOFT, style
 if TYPE_CHECKING:
     from obsynth.evaluate.run import Run
 
-__all__ = ["plot_alarms", "shade"]
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -7,8 +7,6 @@ import numpy as np
 
 from obsynth.evaluate.errors import ReportError
 
-__all__ = ["grid", "name_lines", "new_figure", "panels"]
-
 _ORDER = {"truth": 0, "estimate": 1, "interval": 2, "alarm": 3}
 
 

@@ -26,8 +26,6 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.thin import thin
 from obsynth.evaluate.trace import Trace
 
-__all__ = ["plot_errors", "plot_run", "plot_signal"]
-
 Array = NDArray[np.float64]
 Window = tuple[float, float]
 

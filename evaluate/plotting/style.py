@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["BARS", "ESTIMATE", "INK", "INTERVAL", "INTERVAL_FILL", "SOFT", "style"]
-
 # The paper draws the truth black, the estimate red and the interval green; these are the black,
 # vermilion and bluish green of Okabe and Ito, which stay apart for every kind of colour vision.
 INK = "#1b1d21"

@@ -10,8 +10,6 @@ from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.layout import new_figure
 from obsynth.evaluate.plotting.style import BARS, INK, style
 
-__all__ = ["plot_widths"]
-
 Array = NDArray[np.float64]
 
 

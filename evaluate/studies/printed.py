@@ -14,19 +14,6 @@ if TYPE_CHECKING:
     from obsynth.codegen import CProject
     from obsynth.derive import JacobianBounds, Split
 
-__all__ = [
-    "PRINTED_BOUNDS",
-    "PRINTED_GAMMA",
-    "PRINTED_Z0",
-    "Refusals",
-    "bounds_table",
-    "code_table",
-    "errata_table",
-    "half_widths",
-    "refusal_table",
-    "vertices_table",
-    "width_table",
-]
 
 # M_min and M_max of Section 6, by row and column from 1.
 PRINTED_BOUNDS: Mapping[tuple[int, int], tuple[float, float]] = {
@@ -150,17 +137,7 @@ def code_table(project: "CProject") -> Table:
 
 
 def errata_table(parts: "Split", bounds: "JacobianBounds", refusals: Refusals, run: Run) -> Table:
-    """List what does not hold as printed, with the numbers found.
-
-    Parameters
-    ----------
-    parts : Split
-    bounds : JacobianBounds
-    refusals : tuple of InfeasibleDesign
-        Of (51) as printed, and of the direct LMI at the printed gamma.
-    run : Run
-        Of one of the paper's scenarios, for its first state and measurement.
-    """
+    """List what does not hold as printed, with the numbers found."""
     E = -parts.D @ np.linalg.pinv(parts.C @ parts.D)
     e0 = ", ".join(f"{v:.1f}".replace("-", "−") for v in run.x[0] - (PRINTED_Z0 - E @ run.y[0]))
     corner = 100 * float(np.sum(parts.model.box("w")[:, 1] ** 2))

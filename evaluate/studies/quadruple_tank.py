@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from obsynth.derive import JacobianBounds, Split
     from obsynth.symbolic import Plant
 
-__all__ = ["QuadrupleTank", "quadruple_tank"]
 
 # The largest round value that leaves room below the largest feasible gamma of all forms.
 GAMMA = 0.005
@@ -60,20 +59,10 @@ Progress = Callable[[str, float], None]
 class QuadrupleTank:
     """What the study found.
 
-    Attributes
-    ----------
-    model : Plant
-        Euler model, Ts = 1 s.
-    split : Split
-    bounds : JacobianBounds
-    refusals : tuple of InfeasibleDesign
-        Of (51) as printed, and of the direct LMI at the printed gamma.
-    designs : dict of str to Observer
-        Widest first; the last one ships.
-    runs : dict of str to tuple of Run
-        Of the certified designs, FS1 and FS2 for each seed.
-    project : CProject
-    folder : Path
+    model: euler model, Ts = 1 s
+    refusals: of (51) as printed, and of the direct LMI at the printed gamma
+    designs: widest first; the last one ships
+    runs: of the certified designs, FS1 and FS2 for each seed
     """
 
     model: "Plant"
@@ -130,27 +119,6 @@ def quadruple_tank(
     The folder holds ``report.html``, ``design.json`` (peak bounds, the design
     that ships), ``design_ellipsoid.json`` and the C project ``c/``. It appears
     only when all of it is complete, and replaces only what an earlier run left.
-
-    Parameters
-    ----------
-    folder : path-like
-    steps : int
-        Simulated samples, at most the scenarios' 5000.
-    seeds : int
-        Noise seeds 0, 1, ... for each scenario.
-    progress : callable, optional
-        Called with a stage and the fraction done so far.
-
-    Returns
-    -------
-    QuadrupleTank
-
-    Raises
-    ------
-    ReportError
-        If the folder holds anything else.
-    ObsynthError
-        If `steps` or `seeds` is out of range.
     """
     from obsynth.codegen import generate_c
 

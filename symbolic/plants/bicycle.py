@@ -7,8 +7,6 @@ import sympy as sp
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["bicycle"]
-
 _TYRES = ("pacejka", "linear")
 
 

@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["exothermic_cstr"]
-
 
 def exothermic_cstr() -> Plant:
     """Return the jacketed reactor with the first-order exothermic reaction A -> B.

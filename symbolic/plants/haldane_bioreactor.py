@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["haldane_bioreactor"]
-
 
 def haldane_bioreactor() -> Plant:
     """Return the chemostat with the growth rate of Haldane (Andrews).

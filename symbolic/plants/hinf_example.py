@@ -7,8 +7,6 @@ import sympy as sp
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["hinf_example"]
-
 _VARIANTS = ("consistent", "as_printed")
 
 

@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["induction_motor"]
-
 
 def induction_motor() -> Plant:
     """Return an induction motor of 2.2 kW by its inverse-Gamma model.

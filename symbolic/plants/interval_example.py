@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["interval_example"]
-
 
 def interval_example() -> Plant:
     """Return the LPV example of Lamouchi, Raissi, Amairi and Aoun, (40).

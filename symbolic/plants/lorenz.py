@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["lorenz"]
-
 
 def lorenz() -> Plant:
     """Return the Lorenz system with its classical parameters 10, 28 and 8/3.

@@ -8,8 +8,6 @@ from sympy.simplify.fu import TR8
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["planar_arm", "planar_arm_bias", "planar_arm_terms"]
-
 
 def planar_arm_terms(q: Any, dq: Any, gravity: Any = 0) -> tuple[sp.Matrix, sp.Matrix, sp.Expr]:
     """Return mass matrix, bias vector and energy of an arm with unit masses and lengths.

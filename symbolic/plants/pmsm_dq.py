@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["pmsm_dq"]
-
 
 def pmsm_dq() -> Plant:
     """Return a salient permanent-magnet synchronous machine of 2.2 kW in dq coordinates.

@@ -6,8 +6,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["qpv_example"]
-
 
 def qpv_example() -> Plant:
     """Return the LPV example of Rotondo, Buciakowski and Witczak, Section 5.

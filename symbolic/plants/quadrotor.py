@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["quadrotor"]
-
 
 def quadrotor() -> Plant:
     """Return a rigid quadrotor with twelve states, driven by thrust and three torques.

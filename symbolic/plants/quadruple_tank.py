@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["quadruple_tank"]
-
 
 def quadruple_tank() -> Plant:
     """Return the quadruple tank of Buciakowski et al., equations (53)-(56).

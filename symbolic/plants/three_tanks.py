@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["three_tanks"]
-
 
 def three_tanks() -> Plant:
     """Return the three-tank system of Efimov, Raissi and Zolghadri, (19).

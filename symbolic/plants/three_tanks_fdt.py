@@ -2,8 +2,6 @@
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["three_tanks_fdt"]
-
 
 def three_tanks_fdt() -> Plant:
     """Return the three-tank system of the Fault Diagnosis Toolbox.

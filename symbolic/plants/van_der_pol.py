@@ -4,8 +4,6 @@ from typing import Any
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["van_der_pol"]
-
 
 def van_der_pol(mu: Any = 1) -> Plant:
     """Return the forced van der Pol oscillator x1' = x2, x2' = mu (1 - x1^2) x2 - x1 + u.

@@ -4,8 +4,6 @@ import sympy as sp
 
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["water_tanks"]
-
 
 def water_tanks() -> Plant:
     """Return the water tanks of the Fault Diagnosis Toolbox (its reduced case).

@@ -7,8 +7,6 @@ import numpy as np
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.scenario import Scenario
 
-__all__ = ["hinf_example"]
-
 _NAMES = ("nominal", "disturbed", "noise")
 
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.scenario import Scenario
 
-__all__ = ["interval_example"]
-
 
 def interval_example(seed: int | None = 0, steps: int = 200) -> Scenario:
     """Return the scenario of Lamouchi et al., Section 5, in closed loop.

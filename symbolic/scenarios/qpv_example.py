@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.scenario import Scenario
 
-__all__ = ["qpv_example"]
-
 Array = NDArray[np.float64]
 Name = Literal["FS0", "FS1", "FS2", "Fig. 7", "SC"]
 

@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.scenario import Scenario
 
-__all__ = ["quadruple_tank"]
-
 _NAMES = ("FS1", "FS2")
 
 

@@ -10,8 +10,6 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.noise import bounded_noise
 from obsynth.symbolic.scenario import Scenario
 
-__all__ = ["three_tanks", "three_tanks_control"]
-
 _NAMES = ("faults", "fault free")
 _BOUND = 4.5e-3
 _GAIN = 1.329e-3
@@ -97,12 +95,6 @@ def three_tanks_control(Ts: float) -> Callable[[float, NDArray[np.float64]], Arr
 
     u1 = max(0, -k rho(y1 - yr1)), u2 = max(0, -k rho(y2 - yr2) + a20 rho(y2)), where the
     reference yr = (.5, .1) rises to (.535, .15) on (100, 200], (300, 400] and so on.
-
-    Examples
-    --------
-    >>> law = three_tanks_control(0.01)
-    >>> [round(1e5 * float(v), 4) for v in law(0, [0.49, 0.1])], law(0, [0.51, 0.1])[0]
-    ([13.29, 5.6036], 0.0)
     """
 
     def law(k: float, y: NDArray[np.float64]) -> ArrayLike:

@@ -13,26 +13,17 @@ from obsynth.derive.rigour.numbers import substitute
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal
 
-__all__ = ["Augmented", "augment_plant"]
-
 
 @dataclass(frozen=True, eq=False)
 class Augmented:
     """A plant whose chosen faults are states that do not change.
 
-    Attributes
-    ----------
-    model : Plant
-        The plant.
-    states : tuple of Signal
-        Its states, then the faults and losses that became states.
-    faults : tuple of Signal
-        Faults that stayed what they were.
-    rows : tuple of sympy.Expr
-        Right-hand sides, constants as numbers; zero (continuous time) or the fault itself
-        (discrete time) for an added state.
-    outputs : tuple of sympy.Expr
-        The outputs, constants as numbers.
+    model: the plant
+    states: its states, then the faults and losses that became states
+    faults: faults that stayed what they were
+    rows: right-hand sides, constants as numbers; zero (continuous time) or the fault itself
+        (discrete time) for an added state
+    outputs: the outputs, constants as numbers
     """
 
     model: Plant
@@ -52,35 +43,6 @@ def augment_plant(model: Plant, augment: Any = "process", effectiveness: Any = (
 
     Equation (4) of Rotondo, Buciakowski and Witczak; a loss phi_j of effectiveness enters as
     B (I - diag(phi)) u.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    augment : {"process", "all", "none"} or sequence of names
-        Which faults become states.
-    effectiveness : True, sequence of input names, or mapping of names to ranges
-        Inputs that may lose effectiveness; every one adds a state ``loss_NAME`` in [0, 1] or in
-        the given range.
-
-    Returns
-    -------
-    Augmented
-        Rows and signals.
-
-    Raises
-    ------
-    DerivationError
-        A name that is no fault or no input of the plant.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import qpv_example
-    >>> found = augment_plant(qpv_example(), effectiveness=["u2"])
-    >>> [s.name for s in found.states]
-    ['x1', 'x2', 'x3', 'f1', 'f2', 'f3', 'loss_u2']
-    >>> found.rows[1].diff(found.states[-1].symbol)
-    -u2/2
     """
     chosen = _faults(model, augment)
     losses, scaled = _losses(model, effectiveness)

@@ -13,8 +13,6 @@ from obsynth.derive.forms.qpv.polynomial import read_coefficients
 from obsynth.derive.forms.quasi_lpv.scheduling import make_schedule
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["prove_quadratic", "qpv"]
-
 
 def qpv(
     model: Plant,
@@ -90,27 +88,7 @@ def qpv(
 
 
 def prove_quadratic(plant: Augmented, layout: QPVLayout, matrix: sp.Matrix) -> FormProof:
-    """Show row by row that a stacked matrix is the augmented plant.
-
-    Parameters
-    ----------
-    plant : Augmented
-        Its rows.
-    layout : QPVLayout
-        Meaning of the columns.
-    matrix : sympy.Matrix
-        The blocks.
-
-    Returns
-    -------
-    FormProof
-        One method per row.
-
-    Raises
-    ------
-    DerivationError
-        A row is not what the plant says; it is named.
-    """
+    """Show row by row that a stacked matrix is the augmented plant."""
     model = plant.model
     x = [s.symbol for s in plant.states]
     u = [s.symbol for s in model.u]

@@ -10,8 +10,6 @@ from obsynth.derive.forms.quasi_lpv.display import short
 if TYPE_CHECKING:
     from obsynth.derive.forms.qpv.form import QPV
 
-__all__ = ["qpv_html", "qpv_latex", "qpv_text"]
-
 
 def _quadratic(form: "QPV", i: int) -> sp.Expr:
     """Quadratic part of a row as an expression."""
@@ -27,18 +25,7 @@ def _bilinear(form: "QPV", i: int) -> sp.Expr:
 
 
 def qpv_text(form: "QPV") -> str:
-    """Return a quadratic form as plain text.
-
-    Parameters
-    ----------
-    form : QPV
-        What to show.
-
-    Returns
-    -------
-    str
-        States, quadratic terms row by row, scheduling, proof.
-    """
+    """Return a quadratic form as plain text."""
     time = "x+" if form.model.Ts is not None else "x'"
     lines = [
         f"{form.model.name}: {time} = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + ...; "
@@ -55,18 +42,7 @@ def qpv_text(form: "QPV") -> str:
 
 
 def qpv_latex(form: "QPV") -> str:
-    r"""Return the matrices of a quadratic form as LaTeX.
-
-    Parameters
-    ----------
-    form : QPV
-        What to show.
-
-    Returns
-    -------
-    str
-        One aligned environment: A, the N_i and M_j that are not zero, B, G, C, H.
-    """
+    r"""Return the matrices of a quadratic form as LaTeX."""
     blocks: list[tuple[str, sp.Matrix]] = [("c", form.c), ("A", form.A)]
     blocks += [(f"N_{{{i + 1}}}", part) for i, part in enumerate(form.N)]
     blocks += [(f"M_{{{j + 1}}}", part) for j, part in enumerate(form.M)]
@@ -82,18 +58,7 @@ def qpv_latex(form: "QPV") -> str:
 
 
 def qpv_html(form: "QPV") -> str:
-    """Return a quadratic form for a notebook.
-
-    Parameters
-    ----------
-    form : QPV
-        What to show.
-
-    Returns
-    -------
-    str
-        HTML with LaTeX between dollar signs, ranges of states and scheduling, the proof.
-    """
+    """Return a quadratic form for a notebook."""
     states = "".join(
         f"<tr><td>{escape(s.name)}</td><td>{escape(str(s.role))}</td>"
         f"<td>{s.lower:.6g}</td><td>{s.upper:.6g}</td></tr>"

@@ -20,8 +20,6 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
-__all__ = ["QPV", "QPVVertices"]
-
 Array = NDArray[np.float64]
 
 

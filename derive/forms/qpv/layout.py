@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.qpv.augment import Augmented
 
-__all__ = ["QPVLayout"]
-
 _ORDER = ("c", "A", "N", "M", "B", "D", "B_f", "G")
 
 
@@ -17,10 +15,8 @@ class QPVLayout:
     A row of N holds the matrix N_i row by row, a row of M the rows of M_1, M_2, ... one after the
     other.
 
-    Attributes
-    ----------
-    states, outputs, inputs, unknown, faults, disturbances : int
-        Numbers of signals, states after augmentation.
+    states, outputs, inputs, unknown, faults, disturbances: numbers of signals, states after
+        augmentation
     """
 
     states: int
@@ -58,28 +54,7 @@ class QPVLayout:
         return self.states + self.outputs, sum(self.widths.values())
 
     def start(self, block: str) -> int:
-        """First column of a block.
-
-        Parameters
-        ----------
-        block : str
-            One of c, A, N, M, B, D, B_f, G.
-
-        Returns
-        -------
-        int
-            The column.
-
-        Raises
-        ------
-        DerivationError
-            No such block.
-
-        Examples
-        --------
-        >>> QPVLayout(2, 1, 1, 0, 0, 0).start("N")
-        3
-        """
+        """First column of a block."""
         if block not in _ORDER:
             raise DerivationError(
                 f"there is no block {block!r}; there are {', '.join(_ORDER)}", block=block

@@ -10,8 +10,6 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.qpv.augment import Augmented
 from obsynth.derive.forms.qpv.layout import QPVLayout
 
-__all__ = ["read_coefficients"]
-
 _KINDS = ("states", "inputs", "unknown inputs", "faults", "disturbances")
 
 
@@ -29,28 +27,7 @@ class _Monomial:
 def read_coefficients(
     plant: Augmented, layout: QPVLayout, form_of_N: str
 ) -> dict[tuple[int, int], sp.Expr]:
-    """Sort the monomials of all rows into the matrices of a quadratic system.
-
-    Parameters
-    ----------
-    plant : Augmented
-        Rows and signals.
-    layout : QPVLayout
-        Where the matrices are.
-    form_of_N : {"upper", "symmetric"}
-        Whether x_a x_b with a < b stands above the diagonal of N_i, or half on either side.
-
-    Returns
-    -------
-    dict of (row, column) to sympy.Expr
-        Entries of the stacked matrix that are not zero, functions of parameters and scheduling.
-
-    Raises
-    ------
-    StructureError
-        A term that is no polynomial, or of a degree that a quadratic system has no place for;
-        row, term and degree are named.
-    """
+    """Sort the monomials of all rows into the matrices of a quadratic system."""
     model = plant.model
     groups = [
         [s.symbol for s in plant.states],

@@ -23,8 +23,6 @@ from obsynth.derive.forms.quasi_lpv.terms import (
 )
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["assemble", "prove_form", "quasi_lpv"]
-
 
 def quasi_lpv(
     model: Plant,
@@ -144,24 +142,7 @@ def assemble(
     terms: Sequence[Term],
     chosen: Sequence[Option],
 ) -> sp.Matrix:
-    """Add the chosen options of all terms up.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    layout : Layout
-        Columns of the result.
-    centre : Centre
-        Where deviations are zero.
-    terms, chosen : sequence of Term, sequence of Option
-        One option per term, in deviations.
-
-    Returns
-    -------
-    sympy.Matrix
-        The stacked matrix in the signals of the plant; lifted secants as their symbols.
-    """
+    """Add the chosen options of all terms up."""
     rows, columns = layout.shape
     total = sp.zeros(rows, columns)
     for term, option in zip(terms, chosen, strict=True):
@@ -175,29 +156,7 @@ def assemble(
 def prove_form(
     model: Plant, matrix: sp.Matrix, centre: Centre, rows: Sequence[sp.Expr]
 ) -> FormProof:
-    """Show row by row that a stacked matrix is the plant.
-
-    Parameters
-    ----------
-    model : Plant
-        Signals and ranges.
-    matrix : sympy.Matrix
-        The blocks.
-    centre : Centre
-        Where deviations are zero.
-    rows : sequence of sympy.Expr
-        What the rows have to be.
-
-    Returns
-    -------
-    FormProof
-        One method per row.
-
-    Raises
-    ------
-    DerivationError
-        A row is not what the plant says; the row is named.
-    """
+    """Show row by row that a stacked matrix is the plant."""
     kinds = ("x", "u", "p", "rho", "d", "f", "w")
     box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
     back = deviations(model, centre)

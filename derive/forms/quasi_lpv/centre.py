@@ -11,17 +11,12 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour.numbers import rational
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Centre", "deviations", "read_centre"]
-
 
 @dataclass(frozen=True, eq=False)
 class Centre:
     """Exact coordinates of the point about which deviations are taken.
 
-    Attributes
-    ----------
-    x, u : tuple of sympy.Expr
-        State and input; zeros for the origin.
+    x, u: state and input; zeros for the origin
     """
 
     x: tuple[sp.Expr, ...]
@@ -34,50 +29,13 @@ class Centre:
 
 
 def deviations(model: Plant, centre: Centre) -> dict[sp.Symbol, sp.Expr]:
-    """Signals whose deviation from the centre is not the signal itself, with that deviation.
-
-    Parameters
-    ----------
-    model : Plant
-        Its states and inputs.
-    centre : Centre
-        The point.
-
-    Returns
-    -------
-    dict of sympy.Symbol to sympy.Expr
-        x to x - c.
-    """
+    """Signals whose deviation from the centre is not the signal itself, with that deviation."""
     symbols = [s.symbol for s in (*model.x, *model.u)]
     return {s: s - c for s, c in zip(symbols, (*centre.x, *centre.u), strict=True) if c != 0}
 
 
 def read_centre(model: Plant, given: Any) -> Centre:
-    """Read the option ``centre=``.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    given : None, "origin", "equilibrium", Equilibrium or (x, u)
-        What the user gave.
-
-    Returns
-    -------
-    Centre
-        Doubles mean the rational number that they are; SymPy numbers stay exact.
-
-    Raises
-    ------
-    DerivationError
-        Anything else, a wrong number of values, a value that is not finite.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import van_der_pol
-    >>> read_centre(van_der_pol(), ([0.5, 0], [0])).x
-    (1/2, 0)
-    """
+    """Read the option ``centre=``."""
     if given is None or (isinstance(given, str) and given == "origin"):
         zero = sp.Integer(0)
         return Centre((zero,) * len(model.x), (zero,) * len(model.u))

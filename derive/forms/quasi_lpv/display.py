@@ -8,7 +8,6 @@ import sympy as sp
 if TYPE_CHECKING:
     from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 
-__all__ = ["form_html", "form_latex", "form_text", "short"]
 
 _DIGITS = 6
 _LONGEST = 60
@@ -16,24 +15,7 @@ _LONG = 10**6
 
 
 def short(expression: sp.Expr) -> sp.Expr:
-    """Write the numbers of an expression with six digits, small integers and fractions as they are.
-
-    Parameters
-    ----------
-    expression : sympy.Expr
-        Exact.
-
-    Returns
-    -------
-    sympy.Expr
-        For display only.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> short(sp.sqrt(2) * x + sp.Rational(1, 3))
-    1.41421*x + 1/3
-    """
+    """Write the numbers of an expression with six digits, small integers and fractions as is."""
     if expression.is_number:
         plain = expression.is_Rational and abs(expression.p) < _LONG and expression.q < 1000
         return expression if plain else sp.Float(expression.evalf(_DIGITS), _DIGITS)
@@ -51,18 +33,7 @@ def short(expression: sp.Expr) -> sp.Expr:
 
 
 def form_text(form: "QuasiLPV") -> str:
-    """Return a form as plain text.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        What to show.
-
-    Returns
-    -------
-    str
-        Scheduling, entries, offset, notes, proof.
-    """
+    """Return a form as plain text."""
     names = form.model.names("x")
     lines = [_title(form)]
     for block, columns in (("A", names), ("B", form.model.names("u"))):
@@ -87,18 +58,7 @@ def form_text(form: "QuasiLPV") -> str:
 
 
 def notes(form: "QuasiLPV") -> list[str]:
-    """List what a user has to know about a form: choices, terms left over, measurement, proof.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        The form.
-
-    Returns
-    -------
-    list of str
-        One sentence or table per item.
-    """
+    """List what a user has to know about a form: choices, terms left over, measurement, proof."""
     from obsynth.derive.forms.quasi_lpv.form import UNMEASURED_NOTE
 
     result = []
@@ -126,18 +86,7 @@ def _title(form: "QuasiLPV") -> str:
 
 
 def form_latex(form: "QuasiLPV") -> str:
-    r"""Return the matrices of a form in their scheduling variables, as LaTeX.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        What to show.
-
-    Returns
-    -------
-    str
-        One aligned environment: A, B, the offset where there is one, the scheduling map.
-    """
+    r"""Return the matrices of a form in their scheduling variables, as LaTeX."""
     rows = []
     for name, label in (("A", "A"), ("B", "B"), ("offset", "r")):
         matrix = form.scheduled[form.layout.place(name)]
@@ -151,18 +100,7 @@ def form_latex(form: "QuasiLPV") -> str:
 
 
 def form_html(form: "QuasiLPV") -> str:
-    """Return a form for a notebook: matrices, scheduling table, ranking, notes.
-
-    Parameters
-    ----------
-    form : QuasiLPV
-        What to show.
-
-    Returns
-    -------
-    str
-        HTML; the matrices are LaTeX between dollar signs.
-    """
+    """Return a form for a notebook: matrices, scheduling table, ranking, notes."""
     cells = "".join(
         f"<tr><td>{escape(str(v.symbol))}</td><td>{escape(sp.sstr(short(v.expression)))}</td>"
         f"<td>{v.lower:.8g}</td><td>{v.upper:.8g}</td><td>{str(v.status).split(':')[0]}</td>"

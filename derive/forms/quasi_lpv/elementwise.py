@@ -20,8 +20,6 @@ from obsynth.derive.rigour.numbers import rational
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
-__all__ = ["ElementBounds", "bound_elements"]
-
 Entry = tuple[int, int]
 Ends = tuple[sp.Expr, sp.Expr]
 _RTOL = 1e-2
@@ -32,13 +30,9 @@ _EFFORT = "fast"
 class ElementBounds:
     """Bounds of entries as functions of what is known.
 
-    Attributes
-    ----------
-    lower, upper : dict of (row, column) to sympy.Expr
-        In the arguments of the known signals only.
-    how : dict of (row, column) to str
-        ``"known"``, ``"monotone"``, ``"termwise"``, or ``"range"`` where a constant range of an
-        unknown factor was needed.
+    lower, upper: in the arguments of the known signals only
+    how: ``"known"``, ``"monotone"``, ``"termwise"``, or ``"range"`` where a constant range of an
+        unknown factor was needed
     """
 
     lower: dict[Entry, sp.Expr]
@@ -52,40 +46,7 @@ def bound_elements(
     known: Sequence[Known],
     more: Sequence[Signal] = (),
 ) -> ElementBounds:
-    """Bound entries over the unknown signals, pointwise in the known ones.
-
-    Parameters
-    ----------
-    entries : mapping of (row, column) to sympy.Expr
-        Exact entries in the signals of the plant.
-    model : Plant
-        Ranges of the signals.
-    known : sequence of Known
-        What may stay in the bounds.
-    more : sequence of Signal
-        Further unknown variables, with ranges of their own.
-
-    Returns
-    -------
-    ElementBounds
-        With lower <= entry <= upper for every value of the unknown signals in their ranges that
-        agrees with the known ones.
-
-    Raises
-    ------
-    UnboundedError
-        An entry without a finite bound; entry and signal are named.
-
-    Examples
-    --------
-    >>> from obsynth.derive.forms.quasi_lpv.known import read_measured
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> plant = quadruple_tank()
-    >>> h1, h4 = plant.x[0].symbol, plant.x[3].symbol
-    >>> found = bound_elements({(0, 0): h1 / h4}, plant, read_measured(plant, ["h1"]))
-    >>> found.lower, found.upper, found.how
-    ({(0, 0): h1/100}, {(0, 0): h1/5}, {(0, 0): 'monotone'})
-    """
+    """Bound entries over the unknown signals, pointwise in the known ones."""
     return _Bounder(model, known, more).bound(entries)
 
 

@@ -29,8 +29,6 @@ from obsynth.derive.rigour.numbers import round_number
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["UNMEASURED_NOTE", "QuasiLPV", "Ranging"]
-
 UNMEASURED_NOTE = (
     "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
     "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
@@ -42,16 +40,10 @@ UNMEASURED_NOTE = (
 class Ranging:
     """How ranges of the entries of a form are found.
 
-    Attributes
-    ----------
-    matrix : sympy.Matrix
-        The stacked matrix with symbols in place of the lifted secants.
-    lifts : tuple of Lift
-        These symbols, with the ranges of the derivatives whose means they are.
-    rtol : float
-        Wanted gap.
-    effort : str
-        Of the interval engine.
+    matrix: the stacked matrix with symbols in place of the lifted secants
+    lifts: these symbols, with the ranges of the derivatives whose means they are
+    rtol: wanted gap
+    effort: of the interval engine
     """
 
     matrix: sp.Matrix

@@ -20,8 +20,6 @@ from obsynth.derive.rigour.numbers import enclose_number, rational
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["IntervalForm", "make_interval_form"]
-
 Array = NDArray[np.float64]
 Bounds = tuple[Array, Array]
 _BLOCKS = ("A", "B", "offset")
@@ -210,28 +208,7 @@ def make_interval_form(
     rtol: float,
     effort: str,
 ) -> IntervalForm:
-    """Bound the blocks of a form elementwise.
-
-    Parameters
-    ----------
-    blocks : dict of str to sympy.Matrix
-        ``"A"``, ``"B"`` and ``"offset"``, exact.
-    model : Plant
-        Signals and ranges.
-    known : tuple of Known
-        Arguments of the bounds; none for constant bounds.
-    lifts : tuple of Lift
-        Secants with ranges of their own.
-    rtol : float
-        Wanted gap of constant bounds.
-    effort : str
-        Of the interval engine.
-
-    Returns
-    -------
-    IntervalForm
-        Bounds and their extremes over the domain.
-    """
+    """Bound the blocks of a form elementwise."""
     if not known:
         return _constant_form(blocks, model, lifts, rtol, effort)
     lower, upper, how = {}, {}, {}

@@ -9,38 +9,12 @@ from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["decide_signs"]
-
 
 def decide_signs(rows: Sequence[sp.Expr], model: Plant, centre: Centre) -> list[sp.Expr]:
     """Write sign(g) and |g| without a kink where g keeps its sign on the box and at the centre.
 
     A secant from the centre to a point of the box exists in closed form only for what is smooth
     between them.
-
-    Parameters
-    ----------
-    rows : sequence of sympy.Expr
-        Right-hand sides and outputs.
-    model : Plant
-        The box.
-    centre : Centre
-        Where secants begin.
-
-    Returns
-    -------
-    list of sympy.Expr
-        Equal to the rows at every point of the box and at the centre.
-
-    Examples
-    --------
-    >>> from obsynth.derive.forms.quasi_lpv.centre import read_centre
-    >>> from obsynth.symbolic.plants import three_tanks
-    >>> plant = three_tanks()
-    >>> x1, _, x3 = (s.symbol for s in plant.x)
-    >>> centre = read_centre(plant, ([0.5, 0.1, 0.3], [0, 0]))
-    >>> decide_signs([sp.sign(x1 - x3) * sp.sqrt(sp.Abs(x3 - x1))], plant, centre)
-    [sqrt(x1 - x3)]
     """
     kinked = sorted(
         {a for row in rows for a in row.atoms(sp.sign, sp.Abs)}, key=sp.default_sort_key

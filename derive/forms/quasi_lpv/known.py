@@ -13,23 +13,15 @@ from obsynth.derive.rigour.numbers import rational
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
-__all__ = ["Known", "read_measured"]
-
 
 @dataclass(frozen=True, eq=False)
 class Known:
     """A signal of the plant that is known at run time, exactly or up to the noise of an output.
 
-    Attributes
-    ----------
-    signal : sympy.Symbol
-        The signal of the plant.
-    argument : sympy.Symbol
-        What is measured: the signal itself, or the output that shows it.
-    ends : tuple of sympy.Expr
-        Lower and upper end of the signal, as functions of the argument; equal without noise.
-    lower, upper : float
-        Range of the argument for which the signal is inside its own range.
+    signal: the signal of the plant
+    argument: what is measured: the signal itself, or the output that shows it
+    ends: lower and upper end of the signal, as functions of the argument; equal without noise
+    lower, upper: range of the argument for which the signal is inside its own range
     """
 
     signal: sp.Symbol
@@ -45,40 +37,7 @@ class Known:
 
 
 def read_measured(model: Plant, measured: Any, margin: float = 0.0) -> tuple[Known, ...]:
-    """Read the option ``measured=``.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-    measured : None, "outputs", or names
-        None: nothing. ``"outputs"``: the states that outputs show, with their noise, the inputs
-        and the measured scheduling variables. Names of outputs: with noise; names of states,
-        inputs and scheduling variables: exactly.
-    margin : float
-        How far the arguments may be off beyond their noise, in their units, for instance what they
-        move between two samples.
-
-    Returns
-    -------
-    tuple of Known
-        In the order asked for.
-
-    Raises
-    ------
-    DerivationError
-        A name that is neither, an output that shows no single state, noise without a bound, a
-        margin that is negative.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> (h3,) = read_measured(quadruple_tank(), ["y3"])
-    >>> h3.signal, h3.argument, h3.exact, h3.lower, h3.upper
-    (h3, y3, False, 4.9, 100.1)
-    >>> h3.ends[0]
-    Max(5, y3 - 3602879701896397/36028797018963968)
-    """
+    """Read the option ``measured=``."""
     if not 0.0 <= margin < math.inf:
         raise DerivationError(
             f"margin= is finite and not negative; given was {margin}", given=margin

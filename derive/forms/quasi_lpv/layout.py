@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["BLOCKS", "Layout"]
-
 BLOCKS: dict[str, tuple[str, str]] = {
     "A": ("dynamics", "x"),
     "B": ("dynamics", "u"),
@@ -28,12 +26,8 @@ BLOCKS: dict[str, tuple[str, str]] = {
 class Layout:
     """Sizes of [A B D B_f W1 offset; C feedthrough D_y D_f W2 output_offset].
 
-    Attributes
-    ----------
-    rows : tuple of int
-        Number of states and of outputs.
-    columns : tuple of int
-        Number of states, inputs, unknown inputs, faults, disturbances, and 1 for the offset.
+    rows: number of states and of outputs
+    columns: number of states, inputs, unknown inputs, faults, disturbances, and 1 for the offset
     """
 
     rows: tuple[int, int]
@@ -51,28 +45,7 @@ class Layout:
         return sum(self.rows), sum(self.columns)
 
     def place(self, block: str) -> tuple[slice, slice]:
-        """Rows and columns of a block.
-
-        Parameters
-        ----------
-        block : str
-            One of `BLOCKS`.
-
-        Returns
-        -------
-        (slice, slice)
-            Into the stacked matrix.
-
-        Raises
-        ------
-        DerivationError
-            No such block.
-
-        Examples
-        --------
-        >>> Layout((2, 1), (2, 1, 0, 0, 0, 1)).place("C")
-        (slice(2, 3, None), slice(0, 2, None))
-        """
+        """Rows and columns of a block."""
         if block not in BLOCKS:
             raise DerivationError(
                 f"there is no block {block!r}; there are {', '.join(BLOCKS)}", block=block

@@ -7,23 +7,15 @@ import sympy as sp
 from obsynth.derive.rigour.numbers import substitute
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Reading", "known_signals", "readings"]
-
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """An output that shows one state: y = scale * state + noise.
 
-    Attributes
-    ----------
-    output : str
-        Name of the output.
-    state : sympy.Symbol
-        The state.
-    scale : sympy.Expr
-        Exact factor, not zero.
-    noise : tuple of (sympy.Symbol, sympy.Expr)
-        Disturbances in the output with their exact factors.
+    output: name of the output
+    state: the state
+    scale: exact factor, not zero
+    noise: disturbances in the output with their exact factors
     """
 
     output: str
@@ -33,24 +25,7 @@ class Reading:
 
 
 def readings(model: Plant) -> tuple[Reading, ...]:
-    """List the outputs that show one state each, free of faults.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-
-    Returns
-    -------
-    tuple of Reading
-        In the order of the outputs, the first one for every state.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> [(r.output, r.state, r.noise) for r in readings(quadruple_tank())]
-    [('y1', h1, ((w1, 1),)), ('y2', h2, ((w2, 1),)), ('y3', h3, ((w3, 1),))]
-    """
+    """List the outputs that show one state each, free of faults."""
     states = {s.symbol for s in model.x}
     disturbances = {s.symbol for s in model.w}
     found: list[Reading] = []
@@ -73,19 +48,7 @@ def readings(model: Plant) -> tuple[Reading, ...]:
 
 
 def known_signals(model: Plant) -> frozenset[str]:
-    """Names of the signals whose values are known on line.
-
-    Parameters
-    ----------
-    model : Plant
-        The plant.
-
-    Returns
-    -------
-    frozenset of str
-        States that an output shows (up to its noise), inputs, measured scheduling variables. A
-        state whose output may carry a sensor fault is not among them.
-    """
+    """Names of the signals whose values are known on line."""
     names = {str(reading.state) for reading in readings(model)}
     names |= set(model.names("u"))
     names |= {s.name for s in model.rho if s.measured}

@@ -9,8 +9,6 @@ import sympy as sp
 from obsynth.derive.algebra.factorise import divisors
 from obsynth.derive.algebra.secants import at_zero, secant
 
-__all__ = ["Option", "Share", "kept", "options"]
-
 Symbols = Sequence[sp.Symbol]
 Weights = tuple[tuple[int, sp.Expr], ...]
 _MOST_ORDERS = 6
@@ -21,20 +19,13 @@ _JUMPS = (sp.Piecewise, sp.atan2, sp.floor, sp.ceiling, sp.Mod, sp.sign, sp.Heav
 class Share:
     """What a term contributes to one column.
 
-    Attributes
-    ----------
-    position : int
-        Of the signal, among states, then inputs.
-    coefficient : sympy.Expr
-        Its coefficient.
-    slope : sympy.Expr or None
-        A derivative of the term. The coefficient is its mean along a way to the centre, so a range
-        of the slope over a box that holds the centre is one of the coefficient; None where the
-        term has no such derivative.
-    moving : tuple of sympy.Symbol
-        Signals that change along this way; the others stay where they are.
-    proxy : sympy.Expr or None
-        What stands for the coefficient in ranges; None for the coefficient itself.
+    position: of the signal, among states, then inputs
+    coefficient: its coefficient
+    slope: A derivative of the term. The coefficient is its mean along a way to the centre, so a
+        range of the slope over a box that holds the centre is one of the coefficient; None where
+        the term has no such derivative
+    moving: signals that change along this way; the others stay where they are
+    proxy: what stands for the coefficient in ranges; None for the coefficient itself
     """
 
     position: int
@@ -53,15 +44,10 @@ class Share:
 class Option:
     """One way to write a term: the sum of coefficient times signal, plus a rest.
 
-    Attributes
-    ----------
-    shares : tuple of Share
-        Coefficients of the signals.
-    rest : sympy.Expr
-        What stays in the offset: the value at the centre, or all of a term without an option.
-    text : str
-        What the term is divided by: ``"x2"``, ``"x1 - x3"``, or signals one after the other,
-        ``"x1, x2"``, for a telescoped secant.
+    shares: coefficients of the signals
+    rest: what stays in the offset: the value at the centre, or all of a term without an option
+    text: what the term is divided by: ``"x2"``, ``"x1 - x3"``, or signals one after the other,
+        ``"x1, x2"``, for a telescoped secant
     """
 
     shares: tuple[Share, ...]
@@ -75,49 +61,12 @@ class Option:
 
 
 def kept(term: sp.Expr) -> Option:
-    """Leave a term in the offset.
-
-    Parameters
-    ----------
-    term : sympy.Expr
-        The term.
-
-    Returns
-    -------
-    Option
-        Without columns.
-    """
+    """Leave a term in the offset."""
     return Option((), term, "offset")
 
 
 def options(term: sp.Expr, own: int, states: Symbols, inputs: Symbols) -> list[Option]:
-    """List the ways to write a term, the structurally preferred one first.
-
-    Parameters
-    ----------
-    term : sympy.Expr
-        One additive term, with the centre at zero.
-    own : int
-        Index of the state whose row it stands in; -1 for none.
-    states, inputs : sequence of sympy.Symbol
-        x and u.
-
-    Returns
-    -------
-    list of Option
-        Quotients by factors, by signals and by linear forms with which the term vanishes, in
-        closed form where there is one; for a term that does not vanish at the centre, telescoped
-        secants in several orders. Empty when there is no way.
-
-    Examples
-    --------
-    >>> x, y, u = sp.symbols("x y u", real=True)
-    >>> [(o.text, o.columns) for o in options(x * sp.sin(y), 0, [x, y], [u])]
-    [('x', ((0, sin(y)),)), ('y', ((1, x*sinc(y)),))]
-    >>> (way,) = options(sp.cos(x), 0, [x, y], [u])
-    >>> way.columns, way.rest
-    (((0, -sin(x/2)*sinc(x/2)),), 1)
-    """
+    """List the ways to write a term, the structurally preferred one first."""
     signals = [*states, *inputs]
     found = [
         _divided(term, divisor.form, divisor.weights, signals)

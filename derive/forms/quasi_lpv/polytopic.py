@@ -12,8 +12,6 @@ from obsynth.derive.forms.quasi_lpv.scheduling import AffineSchedule
 from obsynth.derive.jacobian.dependence import AffineDependence
 from obsynth.derive.jacobian.family import AffineFamily, build_family
 
-__all__ = ["CentredForm", "PolytopicForm", "centre_form", "family_of", "make_polytope"]
-
 Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 
@@ -142,48 +140,12 @@ class CentredForm:
 
 
 def make_polytope(schedule: AffineSchedule, layout: Layout) -> PolytopicForm:
-    """Turn an affine schedule into vertices.
-
-    Parameters
-    ----------
-    schedule : AffineSchedule
-        The stacked matrix.
-    layout : Layout
-        Its blocks.
-
-    Returns
-    -------
-    PolytopicForm
-        Vertices are made when they are asked for.
-
-    Raises
-    ------
-    UnboundedError
-        A scheduling variable without a finite range.
-    """
+    """Turn an affine schedule into vertices."""
     return PolytopicForm(family_of(schedule, layout.shape), layout, dict(schedule.methods))
 
 
 def family_of(schedule: AffineSchedule, shape: tuple[int, int]) -> AffineFamily:
-    """Round an affine schedule to a family of matrices.
-
-    Parameters
-    ----------
-    schedule : AffineSchedule
-        Exact constants and coefficients, ranges of the variables.
-    shape : (int, int)
-        Of the matrices.
-
-    Returns
-    -------
-    AffineFamily
-        Its scalars are the scheduling variables, in their order.
-
-    Raises
-    ------
-    UnboundedError
-        A scheduling variable without a finite range.
-    """
+    """Round an affine schedule to a family of matrices. Shapes: shape (int, int)."""
     for variable in schedule.variables:
         if not (np.isfinite(variable.lower) and np.isfinite(variable.upper)):
             raise UnboundedError(
@@ -227,25 +189,7 @@ def _label(symbol: sp.Symbol, expression: sp.Expr) -> str:
 
 
 def centre_form(polytope: PolytopicForm, nominal: ArrayLike | None = None) -> CentredForm:
-    """Split a polytopic form into nominal matrices and a remainder.
-
-    Parameters
-    ----------
-    polytope : PolytopicForm
-        The vertices.
-    nominal : array_like, shape (n, n), optional
-        A nominal A; by default the middle of the polytope, which makes the remainder symmetric.
-
-    Returns
-    -------
-    CentredForm
-        Nominal plus remainder holds every A(rho) and B(rho).
-
-    Raises
-    ------
-    DerivationError
-        A nominal matrix of another shape.
-    """
+    """Split a polytopic form into nominal matrices and a remainder."""
     family, layout = polytope.family, polytope.layout
     middle = family.midpoint
     place_A, place_B = layout.place("A"), layout.place("B")

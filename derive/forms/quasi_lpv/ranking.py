@@ -20,8 +20,6 @@ from obsynth.derive.forms.quasi_lpv.terms import Term, row_names
 from obsynth.derive.forms.quasi_lpv.widths import Lift, Widths
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Alternative", "RowRanking", "choose"]
-
 Combination = tuple[int, ...]
 _TIE = 0.02
 
@@ -30,16 +28,10 @@ _TIE = 0.02
 class Alternative:
     """One way to write a row.
 
-    Attributes
-    ----------
-    choices : tuple of (str, str)
-        Terms with a choice and what they are divided by.
-    inflation : float
-        Velocity inflation of the row; inf where a range is missing.
-    unmeasured : tuple of str
-        Signals in the coefficients whose values are not known on line.
-    score : float
-        What alternatives are ordered by: the inflation, with a penalty for unmeasured signals.
+    choices: terms with a choice and what they are divided by
+    inflation: velocity inflation of the row; inf where a range is missing
+    unmeasured: signals in the coefficients whose values are not known on line
+    score: what alternatives are ordered by: the inflation, with a penalty for unmeasured signals
     """
 
     choices: tuple[tuple[str, str], ...]
@@ -57,15 +49,10 @@ class Alternative:
 class RowRanking:
     """The ways to write a row, the chosen one first.
 
-    Attributes
-    ----------
-    row : str
-        Name of the state or output.
-    alternatives : tuple of Alternative
-        The chosen one, then the others in order of their scores; scores that differ by no more
-        than 2 % are equal, and the structurally simpler way is taken.
-    total : int
-        How many ways there are; more than listed where there are many.
+    row: name of the state or output
+    alternatives: the chosen one, then the others in order of their scores; scores that differ by no
+        more than 2 % are equal, and the structurally simpler way is taken
+    total: how many ways there are; more than listed where there are many
     """
 
     row: str
@@ -182,36 +169,7 @@ def choose(
     penalty: float,
     effort: str,
 ) -> tuple[list[Term], list[Option], tuple[RowRanking, ...], tuple[Lift, ...]]:
-    """Choose one option for every term.
-
-    Parameters
-    ----------
-    model : Plant
-        Signals and ranges.
-    rows : sequence of sympy.Expr
-        Right-hand sides and outputs.
-    terms : list of Term
-        With their options.
-    centre : Centre
-        Where deviations are zero.
-    alternatives : int
-        How many combinations of a row are bounded and listed.
-    penalty : float
-        Weight of entries that need unmeasured signals.
-    effort : str
-        Of the interval engine.
-
-    Returns
-    -------
-    terms : list of Term
-        In the order of rows, inadmissible options dropped.
-    chosen : list of Option
-        One per term.
-    rankings : tuple of RowRanking
-        One per row.
-    lifts : tuple of Lift
-        Secants of the chosen options that are bounded through their derivatives.
-    """
+    """Choose one option for every term."""
     chooser = _Chooser(model, centre, rows, penalty, effort)
     admissible = chooser.admissible(terms)
     ordered: list[Term] = []

@@ -17,8 +17,6 @@ from obsynth.derive.jacobian.dependence import AffineDependence, find_dependence
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["AffineSchedule", "SchedulingVariable", "make_schedule"]
-
 Entry = tuple[int, int]
 Affine = tuple[sp.Expr, dict[int, sp.Expr]]
 _SAMPLES = 96
@@ -29,22 +27,13 @@ _PREFIXES = ("rho", "sigma", "zeta", "varrho")
 class SchedulingVariable:
     """A function of the signals on which matrices depend affinely, with its range.
 
-    Attributes
-    ----------
-    symbol : sympy.Symbol
-        What it is called; a signal that schedules by itself keeps its name.
-    expression : sympy.Expr
-        The function of the plant's signals.
-    lower, upper : float
-        Guaranteed range over the box, rounded outwards.
-    attained_lower, attained_upper : float
-        Values that are reached.
-    status : Status
-        How good the range is.
-    signals : tuple of str
-        Signals it depends on.
-    unmeasured : tuple of str
-        Those of them whose values are not known on line.
+    symbol: what it is called; a signal that schedules by itself keeps its name
+    expression: the function of the plant's signals
+    lower, upper: guaranteed range over the box, rounded outwards
+    attained_lower, attained_upper: values that are reached
+    status: how good the range is
+    signals: signals it depends on
+    unmeasured: those of them whose values are not known on line
     """
 
     symbol: sp.Symbol
@@ -77,17 +66,11 @@ def _tidy(value: float) -> str:
 class AffineSchedule:
     """A matrix as constant + sum of variables times directions, exactly.
 
-    Attributes
-    ----------
-    variables : tuple of SchedulingVariable
-        The scheduling variables.
-    entries : dict of (row, column) to (constant, {variable: coefficient})
-        Every entry that is not zero, through positions in ``variables``.
-    methods : dict of (row, column) to str
-        How every varying entry was proved to be affine.
-    exact : bool
-        True when the variables depend on disjoint sets of signals, so that they take their values
-        independently of each other.
+    variables: the scheduling variables
+    entries: every entry that is not zero, through positions in ``variables``
+    methods: how every varying entry was proved to be affine
+    exact: true when the variables depend on disjoint sets of signals, so that they take their
+        values independently of each other
     """
 
     variables: tuple[SchedulingVariable, ...]
@@ -116,40 +99,6 @@ def make_schedule(
 
     Entries that share functions are treated together. Where they have as many independent entries
     as functions, the functions are the variables; where they have fewer, the entries are.
-
-    Parameters
-    ----------
-    stacked : mapping of (row, column) to sympy.Expr
-        Exact entries that are not identically zero.
-    model : Plant
-        Signals, ranges, what is measured.
-    rtol : float
-        Wanted gap of the ranges.
-    effort : str
-        Of the interval engine.
-    lifts : sequence of Lift
-        Symbols in the entries that stand for secants, with ranges of their own.
-
-    Returns
-    -------
-    AffineSchedule
-        With ranges and proofs.
-
-    Raises
-    ------
-    DerivationError
-        An entry could not be proved to be affine in the variables; it is named.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> h1, h2 = (s.symbol for s in quadruple_tank().x[:2])
-    >>> entries = {(0, 0): 2 / h1 + 1, (1, 0): 3 / h1, (1, 1): h2}
-    >>> found = make_schedule(entries, quadruple_tank(), 1e-6, "normal")
-    >>> [str(v) for v in found.variables]
-    ['h2 in [60, 280]', 'rho1 = 1/h1 in [0.0035714286, 0.016666667]']
-    >>> found.entries[(0, 0)], found.exact
-    ((1, {1: 2}), True)
     """
     more = [lift.signal for lift in lifts]
     varying = {place: e for place, e in stacked.items() if e.free_symbols}

@@ -14,23 +14,15 @@ from obsynth.derive.rigour.numbers import substitute
 from obsynth.symbolic.equations import read_rows
 from obsynth.symbolic.plant import Plant
 
-__all__ = ["Term", "list_terms", "prefer_options", "row_names", "stacked_rows"]
-
 
 @dataclass(frozen=True, eq=False)
 class Term:
     """An additive term of a row, in deviations from the centre.
 
-    Attributes
-    ----------
-    row : int
-        Row among states, then outputs.
-    expression : sympy.Expr
-        The term; the symbols stand for deviations from the centre.
-    options : tuple of Option
-        How it can be written, the structurally preferred one first; never empty.
-    reason : str
-        Why nothing but the offset is left for it; empty otherwise.
+    row: row among states, then outputs
+    expression: the term; the symbols stand for deviations from the centre
+    options: how it can be written, the structurally preferred one first; never empty
+    reason: why nothing but the offset is left for it; empty otherwise
     """
 
     row: int
@@ -50,22 +42,7 @@ def row_names(model: Plant) -> tuple[str, ...]:
 
 
 def list_terms(model: Plant, rows: Sequence[sp.Expr], centre: Centre) -> list[Term]:
-    """Expand the rows about the centre and list the ways to write every term.
-
-    Parameters
-    ----------
-    model : Plant
-        Its signals.
-    rows : sequence of sympy.Expr
-        Right-hand sides, then outputs.
-    centre : Centre
-        What becomes zero.
-
-    Returns
-    -------
-    list of Term
-        Their sum is the rows at centre + deviation.
-    """
+    """Expand the rows about the centre and list the ways to write every term."""
     states = [s.symbol for s in model.x]
     inputs = [s.symbol for s in model.u]
     noise = [s.symbol for kind in "dfw" for s in getattr(model, kind)]
@@ -103,28 +80,7 @@ def _own_columns(
 
 
 def prefer_options(model: Plant, terms: list[Term], prefer: Any) -> list[Term]:
-    """Restrict the options of the terms to what the user wants.
-
-    Parameters
-    ----------
-    model : Plant
-        Its symbols.
-    terms : list of Term
-        All terms.
-    prefer : None, sequence of names, or mapping
-        Signals to divide by, the most wanted first; or for single terms (without their constant
-        factor, ``{"x1*x2": "x2"}``) what to divide them by.
-
-    Returns
-    -------
-    list of Term
-        With fewer options.
-
-    Raises
-    ------
-    DerivationError
-        A signal, a term or an option that is not there; what is there is listed.
-    """
+    """Restrict the options of the terms to what the user wants."""
     if prefer is None:
         return terms
     if isinstance(prefer, Mapping):

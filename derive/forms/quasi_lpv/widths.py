@@ -13,8 +13,6 @@ from obsynth.symbolic.functions import phi1, tanhc
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal
 
-__all__ = ["Lift", "Widths"]
-
 _RTOL = 1e-2
 _QUOTIENTS = (sp.sinc, phi1, tanhc)
 _LONG = 150
@@ -25,12 +23,8 @@ _MANY = 2
 class Lift:
     """A secant that is bounded through the derivative whose mean it is.
 
-    Attributes
-    ----------
-    signal : Signal
-        A symbol with the range of the derivative.
-    meaning : sympy.Expr
-        The secant, in the signals of the plant.
+    signal: A symbol with the range of the derivative
+    meaning: the secant, in the signals of the plant
     """
 
     signal: Signal
@@ -79,18 +73,7 @@ class Widths:
             self.known.update(zip(varying, widths, strict=True))
 
     def lift(self, shares: Sequence[Share]) -> dict[Share, Share]:
-        """Replace coefficients that are hard to bound by symbols with the range of their slopes.
-
-        Parameters
-        ----------
-        shares : sequence of Share
-            All that may be used.
-
-        Returns
-        -------
-        dict of Share to Share
-            For those without a bound of their own, and for long ones, the same with a proxy.
-        """
+        """Replace coefficients that are hard to bound by symbols with the range of their slopes."""
         able = [s for s in shares if s.slope is not None and self.inside.issuperset(s.moving)]
         lifted = self._lift([s for s in able if _is_hard(s.coefficient)])
         self.prepare([s.coefficient for s in shares if s not in lifted])

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 
 from obsynth.derive.intervals.graph import Graph, Node
 
-__all__ = ["Factors", "cancelled", "factors"]
-
 _MOST = 12
 
 
@@ -18,17 +16,11 @@ _MOST = 12
 class Factors:
     """A node as a product.
 
-    Attributes
-    ----------
-    number : float
-        Sign and power of two.
-    halves : dict of int to int
-        Twice the exponent of every factor.
-    roots : set of int
-        Factors of which a root is taken, so that they may not be negative.
-    constants : list of (int, int)
-        Nodes that do not depend on the box, with 1 above the line and -1 below. They never cancel:
-        equal enclosures may stand for numbers that differ.
+    number: sign and power of two
+    halves: twice the exponent of every factor
+    roots: factors of which a root is taken, so that they may not be negative
+    constants: nodes that do not depend on the box, with 1 above the line and -1 below. They never
+        cancel: equal enclosures may stand for numbers that differ
     """
 
     number: float = 1.0
@@ -50,28 +42,7 @@ class Factors:
 
 
 def factors(graph: Graph, index: int) -> Factors:
-    """Take a node apart into factors; remembered in the graph.
-
-    Parameters
-    ----------
-    graph : Graph
-        The graph.
-    index : int
-        The node.
-
-    Returns
-    -------
-    Factors
-
-    Examples
-    --------
-    >>> graph = Graph()
-    >>> x = graph.append(Node("input", (), 0))
-    >>> root = graph.append(Node("sqrt", (x,)))
-    >>> square = graph.append(Node("power_int", (x,), 2))
-    >>> factors(graph, graph.plain("divide", [square, root])).halves
-    {0: 3}
-    """
+    """Take a node apart into factors; remembered in the graph."""
     known: dict[int, Factors] = graph.memory
     if index not in known:
         found = _apart(graph, index)
@@ -105,30 +76,7 @@ def _apart(graph: Graph, index: int) -> Factors:
 
 
 def cancelled(graph: Graph, a: int, b: int, power: int) -> int | None:
-    """Return a * b or a / b without the factors that cancel.
-
-    Parameters
-    ----------
-    graph : Graph
-        The graph.
-    a, b : int
-        Nodes.
-    power : {1, -1}
-        Product or quotient.
-
-    Returns
-    -------
-    int or None
-        A node, or None where nothing cancels.
-
-    Examples
-    --------
-    >>> graph = Graph()
-    >>> x = graph.append(Node("input", (), 0))
-    >>> root = graph.append(Node("sqrt", (x,)))
-    >>> graph.nodes[cancelled(graph, x, root, -1)].op
-    'sqrt'
-    """
+    """Return a * b or a / b without the factors that cancel."""
     first, second = factors(graph, a), factors(graph, b)
     common = [
         factor

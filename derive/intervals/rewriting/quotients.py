@@ -20,24 +20,16 @@ import casadi as ca
 from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
 
-__all__ = ["Quotient", "Quotients"]
-
 
 @dataclass(frozen=True, eq=False)
 class Quotient:
     """One quotient N(z)/z**m.
 
-    Attributes
-    ----------
-    argument : casadi.SX
-        z, in the variables, the constants and the symbols of earlier quotients.
-    numerator : casadi.SX
-        N, in ``symbol`` and the constants; smooth, with its first m derivatives (counting itself)
-        zero where ``symbol`` is.
-    symbol : casadi.SX
-        What stands for z in the numerator.
-    order : int
-        m, at least 1.
+    argument: z, in the variables, the constants and the symbols of earlier quotients
+    numerator: N, in ``symbol`` and the constants; smooth, with its first m derivatives (counting
+        itself) zero where ``symbol`` is
+    symbol: what stands for z in the numerator
+    order: m, at least 1
     """
 
     argument: ca.SX
@@ -65,18 +57,7 @@ class Quotient:
 class Quotients:
     """Quotients in expressions, their symbols, and what the symbols stand for.
 
-    Attributes
-    ----------
-    members : list of Quotient
-        In an order in which every argument contains symbols of earlier ones only.
-
-    Examples
-    --------
-    >>> x, s = ca.SX.sym("x"), ca.SX.sym("s")
-    >>> found = Quotients()
-    >>> q = found.add(Quotient(2 * x, ca.sin(s), s, 1))
-    >>> found.jacobian(q * q, x)
-    SX((2.*((2.*q0_0)*q0_1)))
+    members: in an order in which every argument contains symbols of earlier ones only
     """
 
     members: list[Quotient] = field(default_factory=list)
@@ -100,20 +81,7 @@ class Quotients:
         return ca.vertcat(*[self._symbols[key] for key in sorted(self._symbols)])
 
     def jacobian(self, column: ca.SX, wrt: ca.SX) -> ca.SX:
-        """Differentiate expressions, through the quotients too.
-
-        Parameters
-        ----------
-        column : casadi.SX, shape (m, 1)
-            In variables, constants and symbols of quotients.
-        wrt : casadi.SX, shape (k, 1)
-            Some of the variables.
-
-        Returns
-        -------
-        casadi.SX, shape (m, k)
-            With new symbols for higher derivatives.
-        """
+        """Differentiate expressions, through the quotients too."""
         inner: dict[int, ca.SX] = {}
         for number, quotient in enumerate(self.members):
             inner[number] = self._total(quotient.argument, wrt, inner)
@@ -147,17 +115,7 @@ class Quotients:
     ) -> list[int]:
         """Put the quotients into an interval program.
 
-        Parameters
-        ----------
-        program : Program
-            What they are added to.
-        variables, extra : (casadi.SX, sequence of int)
-            Symbols of the variables and of the constants, and their nodes.
-
-        Returns
-        -------
-        list of int
-            One node per symbol of ``column``.
+        Shapes: variables, extra (casadi.SX, sequence of int).
         """
         nodes: list[int] = []
         keys = sorted(self._symbols)

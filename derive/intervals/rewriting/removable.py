@@ -25,8 +25,6 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_NAME
 from obsynth.symbolic.tape import from_tape
 
-__all__ = ["remove_singularities"]
-
 # Inside this distance of zero the named functions switch to their Taylor polynomials.
 _PATCH = 1.0 / 8.0
 _HIGHEST_ORDER = 4
@@ -42,34 +40,7 @@ def remove_singularities(
     box: Array,
     constant_box: Sequence[tuple[float, float]],
 ) -> tuple[ca.SX, Quotients] | None:
-    """Replace quotients with removable singularities in the box by symbols.
-
-    Parameters
-    ----------
-    column : casadi.SX, shape (m, 1)
-        Expressions.
-    variables, extra : casadi.SX
-        Symbols of the box and of the constants.
-    box : ndarray, shape (v, 2)
-        Ranges of the variables.
-    constant_box : sequence of (float, float)
-        Enclosures of the constants.
-
-    Returns
-    -------
-    (casadi.SX, Quotients) or None
-        The expressions with symbols in them, and what these stand for; None where there is
-        nothing to replace.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> x = ca.SX.sym("x", 2)
-    >>> f = ca.exp(x[1]) * ca.sin(x[0]) / x[0]
-    >>> found, quotients = remove_singularities(f, x, ca.SX(0, 1), np.array([[-1, 1], [0, 1]]), [])
-    >>> found, quotients.members[0].numerator
-    (SX((q0_0*exp(x_1))), SX(sin(s)))
-    """
+    """Replace quotients with removable singularities in the box by symbols."""
     graph = SxGraph(column, variables, extra)
     if not any(graph.nodes[k][0] in _SUSPECTS for k in range(len(graph.nodes))):
         return None

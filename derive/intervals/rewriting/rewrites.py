@@ -9,8 +9,6 @@ from collections.abc import Callable
 from obsynth.derive.intervals.graph import Graph, Node
 from obsynth.derive.intervals.rewriting.cancelling import cancelled
 
-__all__ = ["REWRITES"]
-
 
 def _split_power(graph: Graph, index: int) -> tuple[int, int]:
     node = graph.nodes[index]

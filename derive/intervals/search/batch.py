@@ -11,18 +11,6 @@ from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.rigour.interval import Array, Mask, up
 
-__all__ = [
-    "Entries",
-    "EntryRanges",
-    "Problem",
-    "RowRanges",
-    "Rows",
-    "Source",
-    "enclose_rows",
-    "mean_value_terms",
-    "shrink",
-]
-
 Indices = NDArray[np.int64]
 
 # Cost of running a program, in microseconds: of the call, per operation, per operation and box. It
@@ -34,14 +22,9 @@ _COST_CALL, _COST_NODE, _COST_BOX = 110.0, 2.0, 0.011
 class Source:
     """CasADi expressions behind a program.
 
-    Attributes
-    ----------
-    column : casadi.SX, shape (m, 1)
-        The expressions.
-    variables, extra : casadi.SX
-        Symbols of the box and of the constants.
-    constant_box : list of (float, float)
-        Enclosures of the constants.
+    column: the expressions
+    variables, extra: symbols of the box and of the constants
+    constant_box: enclosures of the constants
     """
 
     column: ca.SX
@@ -54,12 +37,8 @@ class Source:
 class EntryRanges:
     """Ranges of several outputs per row.
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (k, N)
-        Zero where a row has no such output.
-    rough : ndarray of bool, shape (N,)
-        Where the first output may jump or be undefined in the box.
+    lower, upper: zero where a row has no such output
+    rough: where the first output may jump or be undefined in the box
     """
 
     lower: Array
@@ -70,21 +49,8 @@ class EntryRanges:
 class Entries:
     """Several outputs of a program for every one of many entries.
 
-    Parameters
-    ----------
-    program : Program
-        The outputs.
-    outputs : ndarray of int, shape (m, k)
-        Their positions, one row per entry; -1 for none.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x")
-    >>> program = Program.from_casadi(ca.Function("f", [x], [x * x, x - 1, 2 * x]))
-    >>> entries = Entries(program, np.array([[0, 2], [1, -1]]))
-    >>> which, low, high = np.array([0, 1]), np.array([[1.0, 4.0]]), np.array([[2.0, 5.0]])
-    >>> entries.enclose(which, low, high, judged=True).upper.tolist()
-    [[4.0, 4.0], [4.0, 0.0]]
+    program: the outputs
+    outputs: their positions, one row per entry; -1 for none
     """
 
     def __init__(self, program: Program, outputs: Indices) -> None:
@@ -94,21 +60,7 @@ class Entries:
         self._chosen: dict[tuple[int, ...], tuple[list[int], Indices]] = {}
 
     def enclose(self, entry: Indices, lower: Array, upper: Array, judged: bool) -> EntryRanges:
-        """Enclose, for every box, the outputs that belong to its entry.
-
-        Parameters
-        ----------
-        entry : ndarray of int, shape (N,)
-            Which entry a box belongs to.
-        lower, upper : ndarray, shape (v, N)
-            The boxes.
-        judged : bool
-            Whether it matters that the first output is rough.
-
-        Returns
-        -------
-        EntryRanges
-        """
+        """Enclose, for every box, the outputs that belong to its entry."""
         counts = np.bincount(entry, minlength=len(self._needs))
         some = np.flatnonzero(counts).tolist()
         if self._together(some, counts):
@@ -167,20 +119,12 @@ def _cost(nodes: int, rows: int) -> float:
 class Problem:
     """Expressions with their gradients over one box.
 
-    Attributes
-    ----------
-    program : Program
-        Outputs: first the expressions, then the structurally nonzero partial derivatives.
-    gradient : ndarray of int, shape (m, v)
-        Position of a partial derivative among the outputs; -1 where it is zero.
-    relevant : ndarray of bool, shape (m, v)
-        Whether an expression depends on a variable.
-    affine : ndarray of bool, shape (m, v)
-        Whether an expression is affine in a variable with the others held.
-    lower, upper : ndarray, shape (v,)
-        The box.
-    source : Source or None
-        Where it comes from, for those who need more derivatives or other variables.
+    program: outputs: first the expressions, then the structurally nonzero partial derivatives
+    gradient: position of a partial derivative among the outputs; -1 where it is zero
+    relevant: whether an expression depends on a variable
+    affine: whether an expression is affine in a variable with the others held
+    lower, upper: the box
+    source: where it comes from, for those who need more derivatives or other variables
     """
 
     program: Program
@@ -207,14 +151,9 @@ class Problem:
 class Rows:
     """A batch of boxes.
 
-    Attributes
-    ----------
-    goal : ndarray of int, shape (N,)
-        2 e for the smallest value of the expression e, 2 e + 1 for the largest.
-    lower, upper : ndarray, shape (v, N)
-        The boxes.
-    bound : ndarray, shape (N,)
-        Upper bound of the goal's expression over the box, so far.
+    goal: 2 e for the smallest value of the expression e, 2 e + 1 for the largest
+    lower, upper: the boxes
+    bound: upper bound of the goal's expression over the box, so far
     """
 
     goal: Indices
@@ -251,15 +190,10 @@ class Rows:
 class RowRanges:
     """Value and gradient of every row's goal: of the expression or of its negative.
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (N,)
-        Natural enclosure of the value.
-    slope_lower, slope_upper : ndarray, shape (v, N)
-        Enclosure of the gradient; the whole line where the expression may jump or be undefined
-        in the box, zero where no gradient was asked for.
-    rough : ndarray of bool, shape (N,)
-        Where the expression may jump or be undefined in the box.
+    lower, upper: natural enclosure of the value
+    slope_lower, slope_upper: enclosure of the gradient; the whole line where the expression may
+        jump or be undefined in the box, zero where no gradient was asked for
+    rough: where the expression may jump or be undefined in the box
     """
 
     lower: Array
@@ -280,22 +214,7 @@ class RowRanges:
 
 
 def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
-    """Enclose value and, where asked, gradient for every row.
-
-    Parameters
-    ----------
-    problem : Problem
-        The expressions.
-    rows : Rows
-        Boxes and goals.
-    slopes : bool
-        Whether the gradient is needed.
-
-    Returns
-    -------
-    RowRanges
-        In the sign of the goals, so that every row asks for a largest value.
-    """
+    """Enclose value and, where asked, gradient for every row."""
     entry = rows.goal // 2
     entries = problem.with_slopes if slopes else problem.values
     found = entries.enclose(entry, rows.lower, rows.upper, judged=True)
@@ -314,21 +233,7 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
 
 
 def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, Array]:
-    """Reduce boxes to the facet where a monotone goal has its largest value.
-
-    Parameters
-    ----------
-    rows : Rows
-        Boxes.
-    slope_lower, slope_upper : ndarray, shape (v, N)
-        Enclosure of the gradient over them.
-
-    Returns
-    -------
-    (ndarray, ndarray), shape (v, N)
-        Lower and upper ends: the upper facet in variables in which the goal rises, the lower one
-        where it falls or does not change.
-    """
+    """Reduce boxes to the facet where a monotone goal has its largest value."""
     falls = slope_upper <= 0.0
     rises = (slope_lower >= 0.0) & ~falls
     return np.where(rises, rows.upper, rows.lower), np.where(falls, rows.lower, rows.upper)
@@ -337,20 +242,7 @@ def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, A
 def mean_value_terms(
     lower: Array, upper: Array, centre: Array, slope_lower: Array, slope_upper: Array
 ) -> Array:
-    """Bound |gradient| times distance from the centre, variable by variable.
-
-    Parameters
-    ----------
-    lower, upper, centre : ndarray, shape (v, N)
-        Boxes and a point in each.
-    slope_lower, slope_upper : ndarray, shape (v, N)
-        Enclosure of the gradient over the boxes.
-
-    Returns
-    -------
-    ndarray, shape (v, N)
-        Rounded up; zero for variables without width, infinite where the gradient is unknown.
-    """
+    """Bound |gradient| times distance from the centre, variable by variable."""
     radius = np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
     size = np.maximum(np.abs(slope_lower), np.abs(slope_upper))
     with np.errstate(invalid="ignore", over="ignore"):

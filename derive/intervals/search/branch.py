@@ -36,8 +36,6 @@ from obsynth.derive.intervals.search.progress import Patience
 from obsynth.derive.intervals.summit import concave_bounds
 from obsynth.derive.rigour.interval import Array, Mask, up
 
-__all__ = ["Budget", "Outcome", "Search", "maximise"]
-
 _CHUNK = 8192
 # Second derivatives are worth their price only where the first few sweeps leave something open;
 # their matrices limit the size of a chunk.
@@ -64,22 +62,13 @@ class Budget:
 class Outcome:
     """What was found for every goal (2 e: minus the expression e, 2 e + 1: the expression).
 
-    Attributes
-    ----------
-    bound : ndarray, shape (2 m,)
-        Guaranteed upper bounds.
-    attained : ndarray, shape (2 m,)
-        Guaranteed lower bounds of the value at ``points``.
-    points : ndarray, shape (2 m, v)
-        Where these values are attained.
-    noise : ndarray, shape (2 m,)
-        Largest width of the enclosure of a value at a single point: what rounding alone costs.
-    finished : ndarray of bool, shape (2 m,)
-        False where the budget ran out.
-    singular : dict of int to (ndarray, ndarray)
-        Goals without a finite bound, with a sub-box where that happens.
-    boxes, sweeps : int
-        Work done.
+    bound: guaranteed upper bounds
+    attained: guaranteed lower bounds of the value at ``points``
+    points: where these values are attained
+    noise: largest width of the enclosure of a value at a single point: what rounding alone costs
+    finished: false where the budget ran out
+    singular: goals without a finite bound, with a sub-box where that happens
+    boxes, sweeps: work done
     """
 
     bound: Array
@@ -95,24 +84,8 @@ class Outcome:
 class Search:
     """A search that can be interrupted and taken up again.
 
-    Parameters
-    ----------
-    problem : Problem
-        Expressions, gradients and box.
-    rtol : float
-        Wanted gap between guaranteed and attained range, relative to the attained width.
-
-    Examples
-    --------
-    >>> import casadi as ca
-    >>> from obsynth.derive.intervals.search.problem import make_problem
-    >>> x = ca.SX.sym("x")
-    >>> search = Search(make_problem(ca.sin(x * x) + x, x, [(0, 3)]), 1e-9)
-    >>> bool(search.run(Budget(10, 1)).finished.all())
-    False
-    >>> found = search.run(Budget(4_000, 100))
-    >>> bool(found.finished.all()), round(float(found.bound[1]), 2)
-    (True, 3.82)
+    problem: expressions, gradients and box
+    rtol: wanted gap between guaranteed and attained range, relative to the attained width
     """
 
     def __init__(self, problem: Problem, rtol: float) -> None:
@@ -332,20 +305,7 @@ class Search:
         return now
 
     def run(self, budget: Budget, expressions: Sequence[int] | None = None) -> Outcome:
-        """Go on until all goals are settled or the budget, counted from the beginning, is spent.
-
-        Parameters
-        ----------
-        budget : Budget
-            Where to stop; what is left open then keeps its valid, looser bound.
-        expressions : sequence of int, optional
-            Which expressions; all by default.
-
-        Returns
-        -------
-        Outcome
-            All that is known so far.
-        """
+        """Go on until all goals are settled or the budget, counted from the beginning, is spent."""
         some = range(len(self.problem.gradient)) if expressions is None else list(expressions)
         wanted = np.isin(self.open.goal // 2, some)
         rows, others = self.open.take(wanted), self.open.take(~wanted)
@@ -402,20 +362,5 @@ def _mean_value_bound(at_centre: Array, terms: Array) -> Array:
 
 
 def maximise(problem: Problem, rtol: float, budget: Budget) -> Outcome:
-    """Bound every expression of a problem from both sides.
-
-    Parameters
-    ----------
-    problem : Problem
-        Expressions, gradients and box.
-    rtol : float
-        Wanted gap between guaranteed and attained range, relative to the attained width.
-    budget : Budget
-        Where to stop; what is left open then keeps its valid, looser bound.
-
-    Returns
-    -------
-    Outcome
-        Bounds, attained values and points per goal.
-    """
+    """Bound every expression of a problem from both sides."""
     return Search(problem, rtol).run(budget)

@@ -17,15 +17,6 @@ from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.search.batch import Entries, Source
 from obsynth.derive.rigour.interval import Array, Mask, down, up
 
-__all__ = [
-    "Curvatures",
-    "Hessians",
-    "is_concave",
-    "sharpened_slopes",
-    "tangent_rise",
-    "taylor_spread",
-]
-
 Indices = NDArray[np.int64]
 
 # Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
@@ -60,12 +51,8 @@ _TINY = 1e-300
 class Hessians:
     """Enclosures of second derivatives, in the sign of the goals.
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (N, v, v)
-        Symmetric; zero where nothing is known.
-    usable : ndarray of bool, shape (N,)
-        Rows whose goal is twice differentiable all over the box, with finite bounds.
+    lower, upper: symmetric; zero where nothing is known
+    usable: rows whose goal is twice differentiable all over the box, with finite bounds
     """
 
     lower: Array
@@ -85,25 +72,8 @@ class Hessians:
 class Curvatures:
     """Programs of the second derivatives of expressions, made when they are first asked for.
 
-    Parameters
-    ----------
-    source : Source
-        The expressions.
-    program : Program
-        Interval program of the expressions, which tells what they are made of.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x", 2)
-    >>> f = ca.vertcat(x[0] ** 2 * x[1], ca.fabs(x[0]))
-    >>> none = ca.SX(0, 1)
-    >>> program = Program.from_casadi(ca.Function("f", [x, none], [f]), {1: []})
-    >>> made = Curvatures(Source(f, x, none, []), program)
-    >>> low = np.array([[1.0], [2.0]])
-    >>> made.enclose(np.array([1]), low, low).upper[0].tolist()
-    [[4.0, 2.0], [2.0, 0.0]]
-    >>> made.enclose(np.array([3]), low, low).usable.tolist()
-    [False]
+    source: the expressions
+    program: interval program of the expressions, which tells what they are made of
     """
 
     def __init__(self, source: Source, program: Program) -> None:
@@ -145,20 +115,7 @@ class Curvatures:
         self._made.append(Entries(program, outputs.reshape(m, v * v)))
 
     def enclose(self, goal: Indices, lower: Array, upper: Array) -> Hessians:
-        """Enclose the second derivatives of every row's goal over its box.
-
-        Parameters
-        ----------
-        goal : ndarray of int, shape (N,)
-            2 e for minus the expression e, 2 e + 1 for the expression.
-        lower, upper : ndarray, shape (v, N)
-            The boxes.
-
-        Returns
-        -------
-        Hessians
-            Not usable for expressions with kinks, jumps or choices.
-        """
+        """Enclose the second derivatives of every row's goal over its box."""
         v, n = lower.shape
         low, high = np.zeros((n, v, v)), np.zeros((n, v, v))
         entry = goal // 2
@@ -194,19 +151,7 @@ def sharpened_slopes(
 ) -> tuple[Array, Array]:
     """Intersect gradients with the mean-value form that starts from the centre.
 
-    Parameters
-    ----------
-    lower, upper, centre : ndarray, shape (v, N)
-        Boxes and a point in each.
-    at_centre, slopes : (ndarray, ndarray), shape (v, N)
-        Enclosures of the gradient at the centre and over the box.
-    hessians : Hessians
-        Over the box.
-
-    Returns
-    -------
-    (ndarray, ndarray), shape (v, N)
-        Enclosure of the gradient over the box.
+    Shapes: at_centre, slopes (ndarray, ndarray), shape (v, N).
     """
     reach = np.einsum("nij,jn->in", hessians.size, _radius(lower, upper, centre))
     reach = up(reach * (1.0 + (len(lower) + 4) * _ULP))
@@ -225,19 +170,7 @@ def taylor_spread(
 ) -> Array:
     """Bound the rise above the value at the centre by a quadratic, separately in every variable.
 
-    Parameters
-    ----------
-    lower, upper, centre : ndarray, shape (v, N)
-        Boxes and a point in each.
-    at_centre : (ndarray, ndarray), shape (v, N)
-        Enclosure of the gradient at the centre.
-    hessians : Hessians
-        Over the box or a larger one.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Infinite where the second derivatives are not usable.
+    Shapes: at_centre (ndarray, ndarray), shape (v, N).
     """
     radius = _radius(lower, upper, centre)
     steep = np.maximum(np.abs(at_centre[0]), np.abs(at_centre[1]))
@@ -258,21 +191,7 @@ def taylor_spread(
 
 
 def is_concave(hessians: Hessians, free: Mask) -> Mask:
-    """Prove goals strictly concave in their free variables, by elimination in intervals.
-
-    Parameters
-    ----------
-    hessians : Hessians
-        Over the boxes.
-    free : ndarray of bool, shape (v, N)
-        Variables in which a box has width.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        True where every symmetric matrix between the bounds is negative definite on the free
-        variables: all pivots of its negative are positive.
-    """
+    """Prove goals strictly concave in their free variables, by elimination in intervals."""
     count = int(free.sum(axis=0).max(initial=0))
     order = np.argsort(~free.T, axis=1, kind="stable")[:, :count]
     inside = np.take_along_axis(free.T, order, axis=1)
@@ -313,17 +232,7 @@ def tangent_rise(
 ) -> Array:
     """Bound the rise of tangents above their point of contact, over boxes.
 
-    Parameters
-    ----------
-    lower, upper, centre : ndarray, shape (v, N)
-        Boxes and a point in each.
-    at_centre : (ndarray, ndarray), shape (v, N)
-        Enclosure of the gradient there.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Rounded up; what a concave function rises at most.
+    Shapes: at_centre (ndarray, ndarray), shape (v, N).
     """
     with np.errstate(invalid="ignore", over="ignore"):
         forwards = np.where(upper > centre, up(at_centre[1] * up(upper - centre)), 0.0)

@@ -14,8 +14,6 @@ from obsynth.derive.intervals.rewriting.removable import remove_singularities
 from obsynth.derive.intervals.rules import JUMPS
 from obsynth.derive.intervals.search.batch import Problem, Source
 
-__all__ = ["make_problem"]
-
 
 def make_problem(
     expressions: Any,
@@ -25,34 +23,7 @@ def make_problem(
     constant_box: Sequence[tuple[float, float]] = (),
     quotients: Quotients | None = None,
 ) -> Problem:
-    """Program of expressions and their gradients, ready for `maximise`.
-
-    Parameters
-    ----------
-    expressions : casadi.SX
-        m expressions, as a dense column.
-    variables : casadi.SX
-        v symbols, as a column.
-    box : array_like, shape (v, 2)
-        Their ranges.
-    constants : casadi.SX, optional
-        Further symbols, whose enclosures stand in ``constant_box``.
-    constant_box : sequence of (float, float)
-        One enclosure per constant.
-    quotients : Quotients, optional
-        What further symbols in the expressions stand for. Without it, quotients with removable
-        singularities are looked for.
-
-    Returns
-    -------
-    Problem
-        With the structural sparsity of the gradient.
-
-    Raises
-    ------
-    DerivationError
-        Free symbols, shapes that do not match, bounds out of order.
-    """
+    """Program of expressions and their gradients, ready for `maximise`."""
     box = np.asarray(box, dtype=float)
     column = ca.densify(ca.vec(ca.SX(expressions)))
     variables = ca.vec(ca.SX(variables))

@@ -7,19 +7,12 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from rich.status import Status
 
-__all__ = ["Patience"]
 
 _PATIENCE = 2.0
 
 
 class Patience:
-    """Shows what a long search is doing; silent before two seconds and off a terminal.
-
-    Examples
-    --------
-    >>> with Patience() as patience:
-    ...     patience.tell("3 boxes open")
-    """
+    """Shows what a long search is doing; silent before two seconds and off a terminal."""
 
     def __init__(self) -> None:
         self._since = time.monotonic()

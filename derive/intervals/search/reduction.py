@@ -16,8 +16,6 @@ import casadi as ca
 
 from obsynth.derive.rigour.interval import Array
 
-__all__ = ["Reduction", "SxGraph", "reduce_variables"]
-
 _Key = tuple[int, tuple[int, ...], float | tuple[int, int] | None]
 
 _COMMUTATIVE = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMIN, ca.OP_FMAX, ca.OP_HYPOT})
@@ -30,20 +28,12 @@ _AFFINE = frozenset(
 class Reduction:
     """Expressions in fewer variables.
 
-    Attributes
-    ----------
-    column : casadi.SX, shape (k, 1)
-        The expressions that could be reduced, with quantities as variables.
-    which : list of int
-        Their positions among the original expressions.
-    quantities : casadi.SX, shape (z, 1)
-        What the new variables stand for, in the original variables.
-    symbols : casadi.SX, shape (z, 1)
-        The new variables.
-    used : list of list of int
-        Quantities in each of the reduced expressions.
-    supports : list of list of int
-        Original variables behind each quantity.
+    column: the expressions that could be reduced, with quantities as variables
+    which: their positions among the original expressions
+    quantities: what the new variables stand for, in the original variables
+    symbols: the new variables
+    used: quantities in each of the reduced expressions
+    supports: original variables behind each quantity
     """
 
     column: ca.SX
@@ -57,29 +47,12 @@ class Reduction:
 class SxGraph:
     """Instructions of SX expressions as a graph in which equal operations are one node.
 
-    Parameters
-    ----------
-    column : casadi.SX, shape (m, 1)
-        Expressions.
-    variables, extra : casadi.SX
-        Symbols; only ``variables`` count as variables.
-
-    Attributes
-    ----------
-    nodes : list of (int, tuple of int, number)
-        CasADi's operation, operands (always earlier nodes) and, for constants, the value, for
-        inputs, which input and element.
-    roots : dict of int to int
-        Node of every expression.
-    supports : list of frozenset of int
-        Variables of every node.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x", 3)
-    >>> graph = SxGraph(ca.sin(x[0] + 2 * x[1]) * x[2], x, ca.SX(0, 1))
-    >>> [graph.expression(n) for n in graph.quantities(0)]
-    [SX((x_0+(2.*x_1)))]
+    column: expressions
+    variables, extra: symbols; only ``variables`` count as variables
+    nodes: casADi's operation, operands (always earlier nodes) and, for constants, the value, for
+        inputs, which input and element
+    roots: node of every expression
+    supports: variables of every node
     """
 
     def __init__(self, column: ca.SX, variables: ca.SX, extra: ca.SX) -> None:
@@ -156,18 +129,7 @@ class SxGraph:
         return nearest
 
     def quantities(self, output: int) -> list[int]:
-        """List nodes, free of common variables, that may stand for the variables behind them.
-
-        Parameters
-        ----------
-        output : int
-            Position of the expression.
-
-        Returns
-        -------
-        list of int
-            Nodes with at least two variables, as few as possible; never the expression itself.
-        """
+        """List nodes, free of common variables, that may stand for the variables behind them."""
         root = self._inside(self.roots[output])
         live = self._live(root)
         nearest = self._dominators(root, live)
@@ -191,19 +153,7 @@ class SxGraph:
         return [n for s, n in found.items() if not any(s < other for other in found)]
 
     def expression(self, index: int, given: Mapping[int, ca.SX] | None = None) -> ca.SX:
-        """Write a node as an expression again.
-
-        Parameters
-        ----------
-        index : int
-            The node.
-        given : mapping of int to casadi.SX, optional
-            Nodes to be replaced.
-
-        Returns
-        -------
-        casadi.SX
-        """
+        """Write a node as an expression again."""
         values = dict(given or {})
         for node in reversed(self._live(index)):
             if node in values:
@@ -223,29 +173,7 @@ class SxGraph:
 def reduce_variables(
     column: ca.SX, variables: ca.SX, extra: ca.SX, wanted: list[int]
 ) -> Reduction | None:
-    """Find quantities that can stand for several variables.
-
-    Parameters
-    ----------
-    column : casadi.SX, shape (m, 1)
-        Expressions.
-    variables, extra : casadi.SX
-        Symbols of the box and of the constants.
-    wanted : list of int
-        Expressions to be looked at.
-
-    Returns
-    -------
-    Reduction or None
-        None where no expression can be reduced.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x", 3)
-    >>> found = reduce_variables(ca.sin(x[0] * x[1]) + x[2], x, ca.SX(0, 1), [0])
-    >>> found.column, found.quantities
-    (SX((sin(z0)+x_2)), SX((x_0*x_1)))
-    """
+    """Find quantities that can stand for several variables."""
     graph = SxGraph(column, variables, extra)
     numbers: dict[int, int] = {}
     symbols: list[ca.SX] = []
@@ -277,32 +205,7 @@ def reduce_variables(
 def preimage(
     function: ca.Function, number: int, value: float, low_at: Array, high_at: Array
 ) -> Array:
-    """Find where a quantity takes a value, on the way between its smallest and largest value.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        All quantities in the original variables.
-    number : int
-        Which quantity.
-    value : float
-        The value, up to rounding between those at the two points.
-    low_at, high_at : ndarray, shape (v,)
-        Points with the smallest and the largest value.
-
-    Returns
-    -------
-    ndarray, shape (v,)
-        A point of the box where the quantity is close to the value.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> x = ca.SX.sym("x", 2)
-    >>> f = ca.Function("f", [x], [x[0] * x[1]])
-    >>> preimage(f, 0, 0.25, np.zeros(2), np.ones(2)).tolist()
-    [0.5, 0.5]
-    """
+    """Find where a quantity takes a value, on the way between its smallest and largest value."""
 
     def at(share: float) -> Array:
         return low_at + share * (high_at - low_at)

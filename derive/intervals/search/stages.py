@@ -10,8 +10,6 @@ from obsynth.derive.intervals.search.branch import Budget, Outcome, Search, maxi
 from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.intervals.search.reduction import Reduction, preimage, reduce_variables
 
-__all__ = ["staged"]
-
 # What a few sweeps over a few boxes settle needs no further thought.
 _QUICK = Budget(boxes=4_000, sweeps=7)
 # A gap that falls to this share in two sweeps over few boxes is soon closed.
@@ -21,32 +19,7 @@ _INNER = 1e-3
 
 
 def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
-    """Bound every expression of a problem, in fewer variables where it does not see all of them.
-
-    Parameters
-    ----------
-    problem : Problem
-        Expressions, gradients and box.
-    rtol : float
-        Wanted gap relative to the attained width.
-    budget : Budget
-        Where to stop, for each of the stages.
-
-    Returns
-    -------
-    Outcome
-        As `maximise` gives it, in the variables of the problem.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x", 3)
-    >>> slip = (x[0] + x[1]) / x[2]
-    >>> f = slip * ca.exp(-(slip**2)) + x[2]
-    >>> box = [(-2, 2), (-2, 2), (1, 3)]
-    >>> found = staged(make_problem(f, x, box), 1e-9, Budget(4_000, 200))
-    >>> round(float(found.bound[1]), 7), bool(found.finished.all())
-    (3.4288819, True)
-    """
+    """Bound every expression of a problem, in fewer variables where it does not see all of them."""
     quick = Budget(min(_QUICK.boxes, budget.boxes), min(_QUICK.sweeps, budget.sweeps))
     search = Search(problem, rtol)
     outcome = _while_quick(search, quick, budget)

@@ -13,13 +13,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.peak.bound import PeakBound
-
-__all__ = ["Attained", "attained"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 MOST_FREE = 10
 MOST_STEPS = 20_000
@@ -30,14 +26,9 @@ NEGLIGIBLE = 1e-12
 class Attained:
     """Peaks that the error model reaches.
 
-    Attributes
-    ----------
-    peaks : ndarray, shape (n + n_f,)
-        Errors of states, then faults, computed without guaranteed rounding.
-    scheduling : ndarray, shape (n + n_f, k)
-        The parameters s of the affine family with which each peak is reached.
-    steps : int
-        Length of the disturbance sequences.
+    peaks: errors of states, then faults, computed without guaranteed rounding
+    scheduling: the parameters s of the affine family with which each peak is reached
+    steps: length of the disturbance sequences
     """
 
     peaks: FloatArray
@@ -48,31 +39,9 @@ class Attained:
 def attained(peak: PeakBound) -> Attained:
     """Compute the peaks at the vertices of the family of Jacobians.
 
-    Parameters
-    ----------
-    peak : PeakBound
-
-    Returns
-    -------
-    Attained
-
-    Notes
-    -----
     With more than ten directions only the vertices of the ten that matter most
     in `PeakBound.Hp` are tried and the others stay in the middle, which remains
     a lower bound. Rounding, `radius` and the unknown input are left out.
-
-    Examples
-    --------
-    >>> from obsynth.designs.bounded_error.peak.bound import peak_bound
-    >>> from obsynth.designs.bounded_error.peak.system import peak_system
-    >>> system = peak_system(
-    ...     A=[[0.5]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0]], W2=[[0.0]], K=[[0.0]], F=[[]],
-    ...     constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.25, 0.25]],
-    ... )
-    >>> worst = attained(peak_bound(system, [0.1], []))
-    >>> worst.peaks.round(6).tolist(), worst.scheduling.tolist()
-    ([0.4], [[0.25]])
     """
     system = peak.system
     n, n_f, n_w = system.n, system.n_f, len(peak.wbar)

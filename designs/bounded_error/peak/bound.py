@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.rounding import add_up, lowered, product_up, raised
@@ -30,35 +30,20 @@ from obsynth.designs.bounded_error.peak.small_gain import (
 )
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = [
-    "PeakBound",
-    "PeakProof",
-    "channel_inputs",
-    "peak_bound",
-    "prove_peak",
-]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PeakProof:
     """Why a vector b bounds the errors at every instant.
 
-    Attributes
-    ----------
-    slack : ndarray, shape (n_o,)
-        Lower bounds of ``b - n - G b``; none is negative.
-    small_gain : float
-        Upper bound of the spectral radius of G, below one: ``max (G v)_i / v_i``
-        for a positive v.
-    remainder : float
-        Upper bound of the remainder of the sums of powers, below one half, which
-        proves that the error system at the midpoint is Schur.
-    steps : int
-        Number of powers that were summed.
+    slack: lower bounds of ``b - n - G b``; none is negative
+    small_gain: upper bound of the spectral radius of G, below one: ``max (G v)_i / v_i`` for a
+        positive v
+    remainder: upper bound of the remainder of the sums of powers, below one half, which proves that
+        the error system at the midpoint is Schur
+    steps: number of powers that were summed
     """
 
     slack: FloatArray
@@ -71,29 +56,15 @@ class PeakProof:
 class PeakBound:
     """Bounds of the errors ``x - xhat`` and ``f - fhat`` from a vanishing initial error.
 
-    Attributes
-    ----------
-    system : PeakSystem
-    wbar, epsbar : ndarray, shapes (n_w,) and (n_f,)
-        ``|w_k| <= wbar``, ``|f_{k+1} - f_k| <= epsbar``.
-    rounding : ndarray, shape (n + n_f,)
-        Bound of a further input of xi, such as the rounding of the recursion.
-    dbar : ndarray, shape (q,)
-        Bound of the unknown input; it counts only where T D is not exactly zero.
-    b : ndarray, shape (n_o,)
-        The bounds: states, faults, then the channels with an output of their own.
-    n : ndarray, shape (n_o,)
-        The part without channels.
-    G : ndarray, shape (n_o, n_o)
-        How the bounds feed back through the channels.
-    rho : float
-        Spectral radius of G as computed; `proof` has an upper bound.
-    Hw, He, Hp : ndarray, shapes (n_o, n_w), (n_o, n_f), (n_o, J)
-        Sums of the absolute impulse responses.
-    proof : PeakProof
+    wbar, epsbar: ``|w_k| <= wbar``, ``|f_{k+1} - f_k| <= epsbar``
+    rounding: bound of a further input of xi, such as the rounding of the recursion
+    dbar: bound of the unknown input; it counts only where T D is not exactly zero
+    b: the bounds: states, faults, then the channels with an output of their own
+    n: the part without channels
+    G: how the bounds feed back through the channels
+    rho: spectral radius of G as computed; `proof` has an upper bound
+    Hw, He, Hp: sums of the absolute impulse responses
 
-    Notes
-    -----
     All numbers but `rho` are rounded up. They hold while x and xhat stay in the
     domain over which the Jacobians were bounded, and for errors before the
     estimates are rounded for output.
@@ -119,17 +90,7 @@ class PeakBound:
         return self.b[: self.system.n + self.system.n_f]
 
     def check(self) -> PeakProof:
-        """Form the system again from its data and prove the stored `b`.
-
-        Returns
-        -------
-        PeakProof
-
-        Raises
-        ------
-        CertificateError
-            If `b` is not a bound for the data.
-        """
+        """Form the system again from its data and prove the stored `b`."""
         system = peak_system(**self.system.data)
         return prove_peak(
             system, self.wbar, self.epsbar, self.b, rounding=self.rounding, dbar=self.dbar
@@ -144,46 +105,7 @@ def peak_bound(
     rounding: ArrayLike | None = None,
     dbar: ArrayLike | None = None,
 ) -> PeakBound:
-    """Compute and prove peak bounds for given gains.
-
-    Parameters
-    ----------
-    system : PeakSystem
-    wbar : array_like, shape (n_w,) or (n_w, 2)
-        Bounds of ``|w|``, or a box. Of a box the larger absolute value counts:
-        no centre is subtracted. An observer that corrects y by ``W2 w_c`` and
-        its prediction by ``W1 w_c`` sees ``w - w_c`` and may pass the half widths.
-    epsbar : array_like, shape (n_f,)
-        Bounds of the increments of the faults per step.
-    rounding : array_like, shape (n + n_f,), optional
-        Bound of whatever else is added to ``[zeta; e_f]`` in each step: rounding
-        errors of the recursion, a remainder of a discretisation.
-    dbar : array_like, shape (q,), optional
-        Bounds of the unknown inputs, needed only if T D is not exactly zero.
-
-    Returns
-    -------
-    PeakBound
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the error system is not stable at the midpoint or the spectral radius
-        of G is not below one (attributes ``spectral_radius``, ``rho``).
-    ObsynthError
-        If a bound is misshapen, negative or missing.
-
-    Examples
-    --------
-    >>> from obsynth.designs.bounded_error.peak.system import peak_system
-    >>> system = peak_system(
-    ...     A=[[0.5]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0]], W2=[[0.0]], K=[[0.0]], F=[[]],
-    ...     constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.25, 0.25]],
-    ... )
-    >>> bound = peak_bound(system, wbar=[0.1], epsbar=[])
-    >>> bound.steady.round(6).tolist(), bound.G.round(6).tolist()
-    ([0.4], [[0.5]])
-    """
+    """Compute and prove peak bounds for given gains."""
     box = _inputs(system, wbar, epsbar, rounding, dbar)
     sums = _sums(system, *box)
     rho = spectral_radius(sums.G)
@@ -228,25 +150,7 @@ def prove_peak(
     rounding: ArrayLike | None = None,
     dbar: ArrayLike | None = None,
 ) -> PeakProof:
-    """Prove that a given b bounds the errors, whatever it came from.
-
-    Parameters
-    ----------
-    system, wbar, epsbar, rounding, dbar
-        As for `peak_bound`.
-    b : array_like, shape (n_o,)
-
-    Returns
-    -------
-    PeakProof
-
-    Raises
-    ------
-    CertificateError
-        If ``n + G b <= b`` fails; ``output`` and ``shortfall`` are attributes.
-    InfeasibleDesign
-        If the error system is not stable at the midpoint.
-    """
+    """Prove that a given b bounds the errors, whatever it came from."""
     sums = _sums(system, *_inputs(system, wbar, epsbar, rounding, dbar))
     return _prove(system, sums, _sized("b", b, len(system.outputs)))
 
@@ -262,15 +166,7 @@ class _Sums:
 
 
 def channel_inputs(system: PeakSystem) -> tuple[Enclosure, FloatArray]:
-    """Return the inputs of the uncertainty of the Jacobian and how the outputs drive them.
-
-    Returns
-    -------
-    B : Enclosure, shape (N, J) or (N, J + n)
-        Channels; and, if the family has a radius, one column for each row of it.
-    coupling : ndarray, shape (J, n_o) or (J + n, n_o)
-        ``|inputs| <= coupling |outputs|``.
-    """
+    """Return the inputs of the uncertainty of the Jacobian and how the outputs drive them."""
     coupling = raised(system.channels.radii[:, None] * system.seen, 1)
     coupling[system.seen == 0.0] = 0.0
     if not np.any(system.radius):

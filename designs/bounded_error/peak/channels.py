@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.rigour.exact_matrix import ExactMatrix
+from obsynth.symbolic.arrays import FloatArray
 
-__all__ = ["Channels", "split_channels"]
-
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
@@ -19,17 +17,11 @@ IntArray = NDArray[np.int64]
 class Channels:
     """Rank-one uncertainties ``delta_j b_j c_j'``, ``|delta_j| <= r_j``, of the Jacobian.
 
-    Attributes
-    ----------
-    columns : ndarray, shape (n, J)
-        The b_j.
-    rows : ndarray, shape (J, n)
-        The c_j'.
-    radii : ndarray, shape (J,)
-        The r_j, rounded up.
-    source : ndarray of int, shape (J,)
-        Which direction of the affine family a channel comes from. A direction
-        that is not of rank one makes one channel for each of its columns.
+    columns: the b_j
+    rows: the c_j'
+    radii: the r_j, rounded up
+    source: which direction of the affine family a channel comes from. A direction that is not of
+        rank one makes one channel for each of its columns
     """
 
     columns: FloatArray
@@ -42,27 +34,7 @@ class Channels:
 
 
 def split_channels(directions: FloatArray, ranges: FloatArray, middle: FloatArray) -> Channels:
-    """Turn the directions of an affine family into rank-one channels, without rounding.
-
-    Parameters
-    ----------
-    directions, ranges : ndarray, shapes (k, n, n) and (k, 2)
-        Matrices and the ranges of their parameters.
-    middle : ndarray, shape (k,)
-        Parameters at the midpoint, within the ranges.
-
-    Returns
-    -------
-    Channels
-        None for a direction that is zero or has a fixed parameter.
-
-    Examples
-    --------
-    >>> row = np.array([[[1.0, -1.0], [0.0, 0.0]]])
-    >>> one = split_channels(row, np.array([[0.0, 0.5]]), np.array([0.25]))
-    >>> one.columns.T.tolist(), one.rows.tolist()
-    ([[1.0, 0.0]], [[1.0, -1.0]])
-    """
+    """Turn the directions of an affine family into rank-one channels, without rounding."""
     n = directions.shape[-1]
     columns, rows, radii, source = [], [], [], []
     half = np.maximum(ranges[:, 1] - middle, middle - ranges[:, 0])

@@ -7,7 +7,6 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.bounded_error.error_system import (
     ErrorKind,
@@ -25,13 +24,12 @@ from obsynth.designs.bounded_error.step import RuntimeBound
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.designs.bounded_error.method import BoundedErrorUIO
 
-__all__ = ["bound_peak", "design_peak", "peak_runtime", "peak_start", "prove_peak_claims"]
 
-FloatArray = NDArray[np.float64]
 # Of the largest feasible gamma: where the ellipsoidal design gives a good first gain.
 START_SHARE = 2.0 / 3.0
 FAULT_WEIGHT = 0.01
@@ -63,13 +61,7 @@ def _unknown_input_bound(design: UioDesign) -> FloatArray:
 
 
 def bound_peak(design: UioDesign) -> UioDesign:
-    """Attach proved peak bounds to a design with gains.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the gains are unstable or the small-gain condition fails.
-    """
+    """Attach proved peak bounds to a design with gains."""
     peak = peak_bound(
         _system(design),
         design.w_radius,
@@ -88,13 +80,7 @@ def _widest_start(design: UioDesign) -> FloatArray:
 
 
 def design_peak(prepared: Prepared, method: BoundedErrorUIO) -> UioDesign:
-    """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If no stabilising gain is found or the small-gain condition fails.
-    """
+    """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves."""
     design = prepared.design
     n, n_f = design.A.shape[0], design.rate.size
     weights = np.ones(n + n_f) if method.weights is None else np.array(method.weights)

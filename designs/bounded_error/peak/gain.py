@@ -14,17 +14,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs, peak_bound
 from obsynth.designs.bounded_error.peak.small_gain import spectral_radius
 from obsynth.designs.bounded_error.peak.sums import absolute_sums
 from obsynth.designs.bounded_error.peak.system import PeakSystem, projected_gains
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["PeakGain", "peak_gain"]
-
-FloatArray = NDArray[np.float64]
 
 # Responses are followed until they have decayed so far; the bound found is proved afterwards.
 HORIZON = 1e-7
@@ -38,18 +35,11 @@ ROUNDING_LOSS = 1e-4
 class PeakGain:
     """Gains designed for narrow peak bounds.
 
-    Attributes
-    ----------
-    K, F : ndarray, shapes (n, m) and (n_f, m)
-        As to be deployed; ``T K Pi`` and ``F Pi`` up to the last digit.
-    bound : PeakBound
-        The proof for these gains.
-    value : float
-        Weighted sum of the proved bounds.
-    start_value : float
-        The same for the gains at the start, as computed.
-    evaluations : int
-        How often the bound was evaluated.
+    K, F: as to be deployed; ``T K Pi`` and ``F Pi`` up to the last digit
+    bound: the proof for these gains
+    value: weighted sum of the proved bounds
+    start_value: the same for the gains at the start, as computed
+    evaluations: how often the bound was evaluated
     """
 
     K: FloatArray
@@ -73,48 +63,7 @@ def peak_gain(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> PeakGain:
-    """Minimise the weighted sum of the peak bounds over the gains.
-
-    Parameters
-    ----------
-    start : PeakSystem
-        With gains whose part T K Pi, F Pi has peak bounds, for example those of
-        an LMI design.
-    wbar, epsbar, rounding, dbar
-        As for `peak_bound`.
-    weights : array_like, shape (n + n_f,), optional
-        Weights of the bounds, states then faults; ones by default. Units count.
-    starts : int
-        Number of local searches.
-    evaluations : int
-        After so many evaluations of the bound no further search is begun.
-    seed : int
-        Of the random starts; the same seed gives the same gains.
-    progress : callable, optional
-        Called with the fraction done, between 0 and 1, after each search.
-
-    Returns
-    -------
-    PeakGain
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the gains at the start have no peak bounds.
-    ObsynthError
-        If an argument is misshapen or a weight is negative.
-
-    Examples
-    --------
-    >>> from obsynth.designs.bounded_error.peak.system import peak_system
-    >>> system = peak_system(
-    ...     A=[[0.9]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0, 0.0]], W2=[[0.0, 1.0]], K=[[0.2]],
-    ...     F=[[]], constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.05, 0.05]],
-    ... )
-    >>> design = peak_gain(system, wbar=[0.1, 0.01], epsbar=[], starts=2)
-    >>> design.K.round(3).tolist(), round(design.value, 4)
-    ([[0.9]], 0.1147)
-    """
+    """Minimise the weighted sum of the peak bounds over the gains."""
     start = start.with_gains(*projected_gains(start.K, start.F, start.E, start.C))
     bound = peak_bound(start, wbar, epsbar, rounding=rounding, dbar=dbar)
     size = start.n + start.n_f

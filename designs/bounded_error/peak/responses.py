@@ -16,16 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import matrix_balance
 
 from obsynth.derive.rigour.enclosure import Enclosure, gamma_bound
 from obsynth.derive.rigour.rounding import add_up, product_up, raised
 from obsynth.designs.core.errors import InfeasibleDesign
-
-__all__ = ["PowerSum", "Response", "power_sum", "response"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # A quarter of a gigabyte of powers.
 MAX_NUMBERS = 2**25
@@ -37,19 +33,11 @@ SMALL = 2.0**-60
 class PowerSum:
     """Powers of an enclosed Schur matrix with bounds of their sum and of their errors.
 
-    Attributes
-    ----------
-    powers : ndarray, shape (steps, N, N)
-        X_k, the computed powers; zero is meant beyond the last.
-    total : ndarray, shape (N, N)
-        S, at least the sum of all ``|X_k|``.
-    bound : ndarray, shape (N, N)
-        At least ``sum_k |A^k|`` for every A of the enclosure.
-    error : ndarray, shape (N, N)
-        At least ``|A^k - X_k|`` for every k >= 0 and every such A.
-    contraction : float
-        At least the largest row sum of R; below one, which proves that the
-        matrix is Schur.
+    powers: X_k, the computed powers; zero is meant beyond the last
+    total: S, at least the sum of all ``|X_k|``
+    bound: at least ``sum_k |A^k|`` for every A of the enclosure
+    error: at least ``|A^k - X_k|`` for every k >= 0 and every such A
+    contraction: at least the largest row sum of R; below one, which proves that the matrix is Schur
     """
 
     powers: FloatArray
@@ -68,15 +56,10 @@ class PowerSum:
 class Response:
     """Absolute impulse responses ``|Q A^k B|`` of every output to every input.
 
-    Attributes
-    ----------
-    terms : ndarray, shape (steps, n_o, n_i)
-        Computed ``|Q X_k B|``.
-    spread : ndarray, shape (n_o, n_i)
-        ``|Q A^k B| <= terms[k] + spread`` for every k >= 0, with zero for the
-        terms beyond the last.
-    total : ndarray, shape (n_o, n_i)
-        At least ``sum_k |Q A^k B|``.
+    terms: computed ``|Q X_k B|``
+    spread: ``|Q A^k B| <= terms[k] + spread`` for every k >= 0, with zero for the terms beyond the
+        last
+    total: at least ``sum_k |Q A^k B|``
     """
 
     terms: FloatArray
@@ -85,28 +68,7 @@ class Response:
 
 
 def power_sum(A: Enclosure) -> PowerSum:
-    """Bound the sum of the absolute powers of a matrix, or refuse.
-
-    Parameters
-    ----------
-    A : Enclosure, shape (N, N)
-
-    Returns
-    -------
-    PowerSum
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the matrix is not Schur (``spectral_radius`` is an attribute), or so
-        slow that the sum does not fit into memory.
-
-    Examples
-    --------
-    >>> half = power_sum(Enclosure.of([[0.5]]))
-    >>> bool(2.0 <= half.bound[0, 0] < 2.0 + 1e-12)
-    True
-    """
+    """Bound the sum of the absolute powers of a matrix, or refuse."""
     size = A.mid.shape[0]
     spectral_radius = float(np.max(np.abs(np.linalg.eigvals(A.mid)), initial=0.0))
     if not spectral_radius < 1.0:
@@ -173,27 +135,8 @@ def _powers(matrix: FloatArray, most: int) -> FloatArray:
 def response(powers: PowerSum, outputs: FloatArray, B: Enclosure) -> Response:
     """Bound the responses of some outputs to some inputs.
 
-    Parameters
-    ----------
-    powers : PowerSum
-    outputs : ndarray, shape (n_o, N)
-        Q, exact.
-    B : Enclosure, shape (N, n_i)
-
-    Returns
-    -------
-    Response
-
-    Notes
-    -----
     ``|Q A^k B| <= |Q X_k B| + |Q| |A^k - X_k| |B|``; the rounding of the two
     products and the radius of B are bounded in the same way.
-
-    Examples
-    --------
-    >>> half = power_sum(Enclosure.of([[0.5]]))
-    >>> response(half, np.eye(1), Enclosure.of([[3.0]])).total.round(9).tolist()
-    [[6.0]]
     """
     size = B.mid.shape[0]
     steps = powers.steps

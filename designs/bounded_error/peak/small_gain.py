@@ -3,39 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.rigour.rounding import TINY, add_up, product_up, raised
 from obsynth.designs.core.errors import InfeasibleDesign
-
-__all__ = ["contraction", "small_gain_solution", "spectral_radius"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # Room that the certificate leaves for other orders of summation on other machines.
 SLACK = 2.0**-40
 
 
 def small_gain_solution(G: FloatArray, n: FloatArray) -> FloatArray:
-    """Return a b, barely above ``(I - G)^-1 n``, with ``n + G b <= b`` in rounded-up numbers.
-
-    Parameters
-    ----------
-    G : ndarray, shape (n_o, n_o)
-        Nonnegative, spectral radius below one.
-    n : ndarray, shape (n_o,)
-        Nonnegative.
-
-    Raises
-    ------
-    InfeasibleDesign
-        If the spectral radius is so near to one that no solution is found.
-
-    Examples
-    --------
-    >>> small_gain_solution(np.array([[0.5]]), np.array([1.0])).round(9).tolist()
-    [2.0]
-    """
+    """Return a b, barely above ``(I - G)^-1 n``, with ``n + G b <= b`` in rounded-up numbers."""
     eye = np.eye(len(n))
     b = np.maximum(np.linalg.solve(eye - G, n), n)
     b = np.maximum(np.linalg.solve(eye - G, n + SLACK * b + 64.0 * TINY), n)
@@ -61,18 +39,6 @@ def contraction(G: FloatArray, b: FloatArray) -> float:
     """Return max (G v)_i / v_i for a positive v, over the outputs that feed back, rounded up.
 
     Below one it proves that the spectral radius of G is below one.
-
-    Parameters
-    ----------
-    G : ndarray, shape (n_o, n_o)
-        Nonnegative.
-    b : ndarray, shape (n_o,)
-        Positive; sets the scale of v.
-
-    Examples
-    --------
-    >>> 0.5 <= contraction(np.array([[0.5]]), np.array([2.0])) < 0.500001
-    True
     """
     coupled = np.flatnonzero(np.any(G, axis=0))
     if coupled.size == 0:

@@ -10,26 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["AbsoluteSums", "absolute_sums"]
-
-FloatArray = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteSums:
     """``sum_k |Q A^k B|`` over a number of steps, with what its derivative needs.
 
-    Attributes
-    ----------
-    total : ndarray, shape (n_o, n_i)
-    squares : list of ndarray
-        A, A^2, A^4, ...
-    left, right : list of ndarray
-        The factors after every doubling.
-    responses : ndarray
-        Every ``Q A^k B``, as (left steps, n_o, right steps, n_i).
+    squares: A, A^2, A^4,
+    left, right: the factors after every doubling
+    responses: every ``Q A^k B``, as (left steps, n_o, right steps, n_i)
     """
 
     total: FloatArray
@@ -39,17 +30,7 @@ class AbsoluteSums:
     responses: FloatArray
 
     def derivative(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the derivative of ``sum(weights * total)`` with respect to A and B.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (n_o, n_i)
-
-        Returns
-        -------
-        A_bar, B_bar : ndarray, shapes of A and B
-            Where a response is zero, its absolute value counts as flat.
-        """
+        """Return the derivative of ``sum(weights * total)`` with respect to A and B."""
         size = self.squares[0].shape[0]
         n_o, n_i = weights.shape
         signs = np.sign(self.responses)
@@ -79,23 +60,7 @@ class AbsoluteSums:
 
 
 def absolute_sums(A: FloatArray, B: FloatArray, Q: FloatArray, wanted: float) -> AbsoluteSums:
-    """Sum over at least so many steps.
-
-    Parameters
-    ----------
-    A, B, Q : ndarray, shapes (n, n), (n, n_i), (n_o, n)
-    wanted : float
-        Number of steps; the next power of two is taken, so that small changes of A do not
-        change it.
-
-    Examples
-    --------
-    >>> sums = absolute_sums(np.array([[-0.5]]), np.array([[1.0]]), np.array([[2.0]]), 60.0)
-    >>> sums.total.round(9).tolist()
-    [[4.0]]
-    >>> [bar.round(9).tolist() for bar in sums.derivative(np.ones((1, 1)))]
-    [[[-8.0]], [[4.0]]]
-    """
+    """Sum over at least so many steps."""
     doublings = max(int(np.ceil(np.log2(max(wanted, 4.0)))), 2)
     size = len(A)
     squares, left, right = [A], [Q[None]], [B[None]]

@@ -24,17 +24,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix
 from obsynth.derive.rigour.rounding import nearest
 from obsynth.designs.bounded_error.peak.channels import Channels, split_channels
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["PeakSystem", "peak_system", "projected_gains"]
-
-FloatArray = NDArray[np.float64]
 
 DATA = (
     *("A", "B_f", "C", "D", "W1", "W2", "E", "K", "F"),
@@ -54,27 +51,18 @@ class PeakSystem:
     for every channel whose row has more than one entry: bounding those directly
     is narrower than adding up bounds of the single errors.
 
-    Attributes
-    ----------
-    A, B_f, C, D, W1, W2, E, K, F : ndarray
-        The data, shapes (n, n), (n, n_f), (m, n), (n, q), (n, n_w), (m, n_w),
-        (n, m), (n, m), (n_f, m).
-    constant, directions, ranges, radius : ndarray
-        The affine family of Jacobians, shapes (n, n), (k, n, n), (k, 2), (n, n).
-    T : Enclosure, shape (n, n)
-        ``I + E C``. An observer that runs with ``T.mid`` has to count
-        ``T.rad |A xhat + ...|`` among its rounding errors.
-    residual : ndarray, shape (n, q)
-        At least ``|T D|``; zero where the decoupling is exact.
-    A0, B_w, B_p, B_m, D_w : Enclosure
-        Shapes (N, N), (N, n_w), (N, J), (N, n), (N, n_w): the system at the
-        midpoint, the inputs of w, of the channels and of an entrywise
-        uncertainty, and the feedthrough ``[E W2; 0]`` of w to the errors.
-    channels : Channels
-    outputs : ndarray, shape (n_o, N)
-        Rows of the outputs.
-    seen : ndarray, shape (J, n_o)
-        ``|c_j' (x - xhat)| <= seen_j p`` where p bounds the outputs.
+    A, B_f, C, D, W1, W2, E, K, F: the data, shapes (n, n), (n, n_f), (m, n), (n, q), (n, n_w), (m,
+        n_w), (n, m), (n, m), (n_f, m)
+    constant, directions, ranges, radius: the affine family of Jacobians, shapes (n, n), (k, n, n),
+        (k, 2), (n, n)
+    T: ``I + E C``. An observer that runs with ``T.mid`` has to count ``T.rad |A xhat + ...|`` among
+        its rounding errors
+    residual: at least ``|T D|``; zero where the decoupling is exact
+    A0, B_w, B_p, B_m, D_w: shapes (N, N), (N, n_w), (N, J), (N, n), (N, n_w): the system at the
+        midpoint, the inputs of w, of the channels and of an entrywise uncertainty, and the
+        feedthrough ``[E W2; 0]`` of w to the errors
+    outputs: rows of the outputs
+    seen: ``|c_j' (x - xhat)| <= seen_j p`` where p bounds the outputs
     """
 
     A: FloatArray
@@ -139,49 +127,8 @@ def peak_system(
 ) -> PeakSystem:
     """Form the error system of an observer in exact arithmetic and round it with its error.
 
-    Parameters
-    ----------
-    A, B_f, C, D, W1, W2 : array_like
-        Shapes (n, n), (n, n_f), (m, n), (n, q), (n, n_w), (m, n_w). `B_f` holds
-        the columns with which the faults enter; q and n_f may be zero.
-    K, F : array_like
-        Gains as they are deployed, shapes (n, m) and (n_f, m). Only ``T K Pi``
-        and ``F Pi`` are of use, see `projected_gains`.
-    constant, directions, ranges, radius : array_like
-        Jacobians of g with respect to x over the whole domain:
-        ``constant + sum_k s_k directions[k]``, ``ranges[k, 0] <= s_k <=
-        ranges[k, 1]``, give or take `radius` in every entry (zero by default).
-        Shapes (n, n), (k, n, n), (k, 2), (n, n).
-    E : array_like, shape (n, m), optional
-        As deployed; by default eq. (13), ``-D (C D)^+``, computed in doubles.
-
-    Returns
-    -------
-    PeakSystem
-
-    Raises
-    ------
-    ObsynthError
-        If a shape does not fit, a number is not finite, a range is empty, or
-        ``rank(C D)`` is below q.
-
-    Notes
-    -----
     Buciakowski et al., "A bounded-error approach to simultaneous state and
     actuator fault estimation for a class of nonlinear systems", eqs. (10)-(16).
-
-    Examples
-    --------
-    A level with a measured outflow that is known to a tenth; no unknown input.
-
-    >>> system = peak_system(
-    ...     A=[[0.5]], B_f=[[1.0]], C=[[1.0]], D=[[]], W1=[[0.0]], W2=[[1.0]], K=[[0.5]],
-    ...     F=[[0.25]], constant=[[0.0]], directions=[[[1.0]]], ranges=[[0.0, 0.1]],
-    ... )
-    >>> system.A0.mid.tolist()
-    [[0.05, 1.0], [-0.25, 1.0]]
-    >>> system.channels.radii.round(3).tolist(), system.outputs.shape
-    ([0.05], (2, 2))
     """
     A = _array("A", A, 2)
     n = A.shape[0]
@@ -269,23 +216,6 @@ def projected_gains(
     From the second instant on the innovation lies in the range of Pi, and what
     a gain adds outside the range of T only keeps alive an error that the
     decoupling would have removed.
-
-    Parameters
-    ----------
-    K, F : array_like, shapes (n, m) and (n_f, m)
-    E, C : array_like, shapes (n, m) and (m, n)
-
-    Returns
-    -------
-    K, F : ndarray
-        Exact products rounded to the nearest doubles.
-
-    Examples
-    --------
-    >>> K, F = projected_gains([[0.5, 9.0], [9.0, 9.0]], [[0.25, 9.0]],
-    ...                        E=[[0.0, 0.0], [0.0, -1.0]], C=[[1.0, 0.0], [0.0, 1.0]])
-    >>> K.tolist(), F.tolist()
-    ([[0.5, 0.0], [0.0, 0.0]], [[0.25, 0.0]])
     """
     of = ExactMatrix.of
     eE, eC = of(_array("E", E, 2)), of(_array("C", C, 2))

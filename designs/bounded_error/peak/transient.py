@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour.enclosure import UNIT_ROUNDOFF, Enclosure
 from obsynth.derive.rigour.rounding import add_up, lowered, product_up, raised
@@ -31,11 +31,8 @@ from obsynth.designs.bounded_error.peak.responses import Response, power_sum, re
 from obsynth.designs.bounded_error.peak.small_gain import small_gain_solution, spectral_radius
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-__all__ = ["Transient", "transient"]
-
-FloatArray = NDArray[np.float64]
 
 # Room for other orders of summation when the bounds are computed again elsewhere.
 SLACK = 2.0**-36
@@ -47,19 +44,10 @@ MOST_PRODUCTS = 150_000_000
 class Transient:
     """Bounds of the part of the errors that stems from the initial error.
 
-    Attributes
-    ----------
-    peak : PeakBound
-    xibar_0 : ndarray, shape (n + n_f,)
-        ``|[zeta_0; f_0 - fhat_0]| <= xibar_0``.
-    beta : ndarray, shape (steps, n_o)
-        Bounds at the instants 0, 1, ..., steps - 1.
-    c : ndarray, shape (n_o,)
-    decay : float
-        lambda: the part is at most ``c decay^k`` for every k >= 1.
+    xibar_0: ``|[zeta_0; f_0 - fhat_0]| <= xibar_0``
+    beta: bounds at the instants 0, 1, ..., steps - 1
+    decay: lambda: the part is at most ``c decay^k`` for every k >= 1
 
-    Notes
-    -----
     All bounds are rounded up.
     """
 
@@ -87,18 +75,7 @@ class Transient:
         return add_up(self.peak.steady, self.bound(k)[:size])
 
     def check(self) -> float:
-        """Compute all again from the data and compare.
-
-        Returns
-        -------
-        float
-            The smallest relative room of the stored `beta` and `c`.
-
-        Raises
-        ------
-        CertificateError
-            If a stored number is below what can be proved.
-        """
+        """Compute all again from the data and compare."""
         system = peak_system(**self.peak.system.data)
         beta = _beta(system, self.xibar_0, len(self.beta))
         c = _tail(system, self.xibar_0, beta, self.decay)
@@ -124,44 +101,7 @@ def transient(
     steps: int | None = None,
     decay: float | None = None,
 ) -> Transient:
-    """Bound the effect of the initial error.
-
-    Parameters
-    ----------
-    peak : PeakBound
-    xibar_0 : array_like, shape (n + n_f,)
-        Bounds of ``|zeta_0|`` and ``|f_0 - fhat_0|``. An observer that starts with
-        ``z_0 = T xhat_0`` has ``zeta_0 = T (x_0 - xhat_0)``.
-    steps : int, optional
-        For how many instants beta is computed; by default about three time
-        constants of the slowest guaranteed decay, fewer for slow systems, where
-        that would take long (at least 64). More steps make `c` smaller.
-    decay : float, optional
-        lambda; by default the one with the smallest ``sum c_i / b_i`` times its
-        time constant.
-
-    Returns
-    -------
-    Transient
-
-    Raises
-    ------
-    InfeasibleDesign
-        If `decay` is below what can be guaranteed (``slowest`` is an attribute).
-    ObsynthError
-        If an argument is misshapen or negative.
-
-    Examples
-    --------
-    >>> from obsynth.designs.bounded_error.peak.bound import peak_bound
-    >>> system = peak_system(
-    ...     A=[[0.5]], B_f=[[]], C=[[1.0]], D=[[]], W1=[[1.0]], W2=[[0.0]], K=[[0.0]], F=[[]],
-    ...     constant=[[0.0]], directions=[[[1.0]]], ranges=[[-0.25, 0.25]],
-    ... )
-    >>> start = transient(peak_bound(system, [0.1], []), [2.0])
-    >>> start.beta[:3].round(6).tolist(), bool(0.75 < start.decay < 1)
-    ([[2.0], [1.5], [1.125]], True)
-    """
+    """Bound the effect of the initial error."""
     system = peak.system
     size = system.n + system.n_f
     start = np.asarray(xibar_0, dtype=float)
