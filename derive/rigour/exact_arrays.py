@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.lmi import ExactMatrix
+from obsynth.derive.rigour.exact_matrix import ExactMatrix
 from obsynth.symbolic.arrays import FloatArray
 
 Exact = NDArray[np.object_]

@@ -75,7 +75,7 @@ def run(
         check_target(folder)
         start = time.perf_counter()
         with _progress() as advance:
-            from obsynth.evaluate.studies.quadruple_tank import quadruple_tank
+            from obsynth.evaluate.studies import quadruple_tank
 
             found = quadruple_tank(folder, steps=steps, seeds=seeds, progress=advance)
     console = _console()

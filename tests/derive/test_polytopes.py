@@ -11,7 +11,7 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive import DerivationError, jacobian_bounds, polytopes
+from obsynth.derive import DerivationError, jacobian_bounds
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes import fewer, support
 from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
@@ -373,7 +373,7 @@ def test_sampled_hulls_say_so_and_are_smaller():
     assert not hasattr(hull, "vertices")
     flat = outer.vertices().reshape(outer.vertex_count, -1)
     assert in_hull(hull.matrices.reshape(len(hull.matrices), -1), flat, outer.radius)
-    assert polytopes.polytope_from_vertices(hull.scalars).volume <= outer.groups[0].polytope.volume
+    assert polytope_from_vertices(hull.scalars).volume <= outer.groups[0].polytope.volume
 
 
 def test_too_many_vertices_are_refused():

@@ -256,7 +256,7 @@ class QPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.qpv import qpv
+        >>> from obsynth.derive import qpv
         >>> from obsynth.symbolic.plants import qpv_example
         >>> qpv(qpv_example()).constant("N")[0, 0].tolist()
         [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
@@ -299,7 +299,7 @@ class QPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.qpv import qpv
+        >>> from obsynth.derive import qpv
         >>> from obsynth.symbolic.plants import qpv_example
         >>> corners = qpv(qpv_example()).vertices()
         >>> corners.A.shape, corners.A[1, 0, 2], corners.A[2, 0, 0]

@@ -169,7 +169,7 @@ class QuasiLPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.quasi_lpv import quasi_lpv
+        >>> from obsynth.derive import quasi_lpv
         >>> from obsynth.symbolic.plants import quadruple_tank
         >>> quasi_lpv(quadruple_tank()).constant("C")[2].tolist()
         [0.0, 0.0, 1.0, 0.0]
@@ -206,7 +206,7 @@ class QuasiLPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.quasi_lpv import quasi_lpv
+        >>> from obsynth.derive import quasi_lpv
         >>> from obsynth.symbolic.plants import quadruple_tank
         >>> form = quasi_lpv(quadruple_tank()).vertices()
         >>> form.A.shape, form.exact
@@ -230,7 +230,7 @@ class QuasiLPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.quasi_lpv import quasi_lpv
+        >>> from obsynth.derive import quasi_lpv
         >>> from obsynth.symbolic.plants import interval_example
         >>> form = quasi_lpv(interval_example()).centred()
         >>> form.A[0].tolist(), form.A_vertices[3].diagonal().tolist()
@@ -266,7 +266,7 @@ class QuasiLPV:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.quasi_lpv import quasi_lpv
+        >>> from obsynth.derive import quasi_lpv
         >>> from obsynth.symbolic.plants import quadruple_tank
         >>> bounds = quasi_lpv(quadruple_tank()).interval()
         >>> bounds.A_min[0, 0].round(6), bounds.A_max[0, 0].round(6)

@@ -101,7 +101,7 @@ class IntervalForm:
 
         Examples
         --------
-        >>> from obsynth.derive.forms.quasi_lpv import quasi_lpv
+        >>> from obsynth.derive import quasi_lpv
         >>> from obsynth.symbolic.plants import three_tanks
         >>> bounds = quasi_lpv(three_tanks()).interval(measured=["x1", "x2"])
         >>> low, high = bounds.at([0.5, 0.1])["A"]
