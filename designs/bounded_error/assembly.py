@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,16 @@ def to_record(design: UioDesign) -> dict[str, Any]:
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
     """Prove everything that the guarantee of a stored design rests on."""
     return _prove(UioDesign.from_record(record), level)
+
+
+def read_start(record: Mapping[str, Any]) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls, from the stored design alone."""
+    return _start(UioDesign.from_record(record))
+
+
+def _start(design: UioDesign) -> Callable[..., FloatArray]:
+    ellipsoid = isinstance(design.bound, EllipsoidBound)
+    return make_start(design, ellipsoid_first(design) if ellipsoid else peak_start(design))
 
 
 def _prove(design: UioDesign, level: Level) -> tuple[Claim, ...]:
@@ -92,10 +102,8 @@ def assemble(
     certificate = Certificate(claims, to_record(design)).require()
     if isinstance(design.bound, EllipsoidBound):
         runtime = ellipsoid_runtime(design)
-        start = make_start(design, ellipsoid_first(design))
     else:
         runtime = peak_runtime(design)
-        start = make_start(design, peak_start(design))
     step = build_step(
         design.plant,
         design.C,
@@ -119,7 +127,7 @@ def assemble(
         half_widths=runtime.steady,
         certificate=certificate,
         guarantee=_guarantee(design),
-        start=start,
+        start=_start(design),
     )
 
 

@@ -87,6 +87,18 @@ class Observer:
     ode: ca.Function | None = None
     step_covered: bool = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out `start`, a closure: the stored design says what it is."""
+        return {name: value for name, value in self.__dict__.items() if name != "start"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        from importlib import import_module
+
+        from obsynth.designs.core.registry import method_module
+
+        self.__dict__.update(state)
+        self.__dict__["start"] = import_module(method_module(self.record)).read_start(self.record)
+
     @property
     def record(self) -> Mapping[str, Any]:
         """The stored design: everything that the certificate and the step are made from."""

@@ -100,11 +100,12 @@ def assemble_bank(design: BankDesign, level: Level) -> Observer:
         half_widths=steady_half_widths(design),
         certificate=certificate,
         guarantee=_guarantee(design),
-        start=_make_start(design),
+        start=start_bank(design),
     )
 
 
-def _make_start(design: BankDesign) -> Callable[..., FloatArray]:
+def start_bank(design: BankDesign) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls."""
     plant = design.plant
 
     def start(

@@ -30,6 +30,11 @@ def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]
     return _prove(HinfDesign.from_record(record), level)
 
 
+def read_start(record: Mapping[str, Any]) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls, from the stored design alone."""
+    return _make_start(HinfDesign.from_record(record))
+
+
 def _prove(design: HinfDesign, level: Level) -> tuple[Claim, ...]:
     claims = (prove_decoupling(design), *prove_level(design))
     return claims + prove_derivation(design) if level == "full" else claims

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,11 @@ def to_record(design: IntervalDesign) -> dict[str, Any]:
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
     """Prove everything that the guarantee of a stored design rests on."""
     return _prove(IntervalDesign.from_record(record), level)
+
+
+def read_start(record: Mapping[str, Any]) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls, from the stored design alone."""
+    return make_start(IntervalDesign.from_record(record))
 
 
 def _prove(design: IntervalDesign, level: Level) -> tuple[Claim, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,11 @@ def to_record(design: QPVDesign) -> dict[str, Any]:
 def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]:
     """Prove everything that the guarantee of a stored design rests on."""
     return _prove(QPVDesign.from_record(record), level, None)
+
+
+def read_start(record: Mapping[str, Any]) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls, from the stored design alone."""
+    return make_start(QPVDesign.from_record(record))
 
 
 def _prove(design: QPVDesign, level: Level, form: QPV | None) -> tuple[Claim, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import with_header
-from obsynth.designs.filter_bank.claims import assemble_bank, prove_bank
+from obsynth.designs.filter_bank.claims import assemble_bank, prove_bank, start_bank
 from obsynth.designs.filter_bank.model import BankDesign
 from obsynth.designs.set_adaptive.claims import prove_design
 from obsynth.designs.set_adaptive.equations import memory_layout
@@ -35,6 +35,13 @@ def prove(record: Mapping[str, Any], level: Level = "full") -> tuple[Claim, ...]
     if record.get("kind") == "bank":
         return prove_bank(BankDesign.from_record(record), level)
     return prove_design(SetDesign.from_record(record), level)
+
+
+def read_start(record: Mapping[str, Any]) -> Callable[..., FloatArray]:
+    """Return what `Observer.memory0` calls, from the stored design alone."""
+    if record.get("kind") == "bank":
+        return start_bank(BankDesign.from_record(record))
+    return _make_start(SetDesign.from_record(record))
 
 
 def assemble(

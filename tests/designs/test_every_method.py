@@ -2,6 +2,7 @@
 
 import functools
 import json
+import pickle
 import subprocess
 import sys
 
@@ -171,3 +172,18 @@ def test_a_missing_measurement_is_told_and_survived(observer):
         assert np.isfinite(after["xhat"]).all() and np.isfinite(after["fhat"]).all()
         assert not int(after["status"][0]) & 2
         assert (after["x_lower"] <= after["x_upper"]).all()
+
+
+def test_an_observer_pickles(observer):
+    again = pickle.loads(pickle.dumps(observer))
+    given = held(observer)
+    memory = observer.memory0(guess(observer), y0=given[1])
+    np.testing.assert_array_equal(again.memory0(guess(observer), y0=given[1]), memory)
+    for _ in range(3):
+        expected, told = outputs(observer, memory, given), outputs(again, memory, given)
+        for name in STEP_OUTPUTS:
+            np.testing.assert_array_equal(told[name], expected[name])
+        memory = expected["memory"]
+    assert again.record == observer.record
+    assert str(again.guarantee) == str(observer.guarantee)
+    np.testing.assert_equal(dict(again.gains), dict(observer.gains))
