@@ -8,15 +8,23 @@ from typing import TypeVar
 import numpy as np
 
 from obsynth.derive.equilibrium import Equilibrium
-from obsynth.derive.faults import invariant_zeros, separable_faults
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.split import Split, split
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
-from obsynth.derive.structure.summary import family_lines, fault_lines
+from obsynth.derive.structure.detectability import weakest_member
+from obsynth.derive.structure.excitation import excitation
+from obsynth.derive.structure.isolability import fault_isolability
+from obsynth.derive.structure.zeros import (
+    invariant_zeros,
+    list_zeros,
+    separable_faults,
+    zeros_over_polytope,
+)
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
 
 T = TypeVar("T")
+_MOST_VERTICES = 512
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,12 @@ class _Notes:
         self.checks.append(Check(title, True, text))
         return value
 
+    def note(self, title: str, action: Callable[[], tuple[bool | None, str]]) -> None:
+        try:
+            self.checks.append(Check(title, *action()))
+        except ObsynthError as error:
+            self.checks.append(Check(title, False, str(error)))
+
     def inform(self, title: str, text: str) -> None:
         self.checks.append(Check(title, None, text))
 
@@ -158,7 +172,9 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
             return StructureReport(model.name, tuple(notes.checks), None, None)
         notes.inform("signals", _signals(model))
         part = notes.step("split", lambda: _split(model))
-    notes.checks += [Check(*line) for line in fault_lines(model)]
+    if model.f:
+        notes.note("single faults", lambda: _isolate(model))
+        notes.note("excitation", lambda: (None, str(excitation(model))))
     if part is None:
         return StructureReport(model.name, tuple(notes.checks), None, None)
     found = part
@@ -174,7 +190,7 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
     notes.inform("vertices", text + (f":\n{reasons}" if reasons else ""))
     if decoupling is not None:
         notes.step("detectability", lambda: _detect(found, family))
-        notes.checks += [Check(*line) for line in family_lines(found, family)]
+        _look_at_family(notes, found, family)
     if model.names("f"):
         _separate(notes, found, family)
     return StructureReport(model.name, tuple(notes.checks), found, family)
@@ -226,12 +242,39 @@ def _detect(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:
     return True, text
 
 
+def _isolate(model: Plant) -> tuple[bool | None, str]:
+    found = fault_isolability(model)
+    if not found.detectable.all():
+        return False, str(found)
+    return (True if len(found.unique) == len(found.faults) else None), str(found)
+
+
+def _look_at_family(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:
+    """Zeros at the vertices of the Jacobian family, and its weakest member."""
+    count = bounds.family.vertex_count
+    if count > _MOST_VERTICES:
+        notes.inform("zeros at vertices", f"not looked at: the family has {count} vertices")
+        return
+
+    def unknown() -> tuple[bool, str]:
+        found = zeros_over_polytope(part, bounds, "unknown")
+        return found.decays, str(found)
+
+    if part.model.d:
+        notes.note("zeros of unknown inputs", unknown)
+    if part.model.f:
+        notes.note(
+            "zeros with faults", lambda: (None, str(zeros_over_polytope(part, bounds, "all")))
+        )
+    if count > 1:
+        notes.note("weakest member", lambda: (None, str(weakest_member(part, bounds))))
+
+
 def _separate(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:
     apart, rank, signals = separable_faults(part, bounds.family.midpoint)
     names = part.model.names("f")
-    zeros = invariant_zeros(part, bounds.family.midpoint)
     if signals <= len(part.C):
-        listed = ", ".join(f"{z.real:.6g}" if z.imag == 0 else f"{z:.6g}" for z in zeros)
+        listed = list_zeros(invariant_zeros(part, bounds.family.midpoint))
         notes.inform("invariant zeros", listed or "none, from faults and unknown inputs to outputs")
     if len(apart) == len(names):
         text = f"{', '.join(names)} can be told apart (rank {rank} of {signals})"

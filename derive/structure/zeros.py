@@ -1,4 +1,4 @@
-"""Invariant zeros of state-space systems, and over the vertices of a Jacobian family."""
+"""What faults and unknown inputs do to the outputs: invariant zeros, separable faults."""
 
 from dataclasses import dataclass
 from html import escape
@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 
 from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.complex128]
+Signals = Literal["unknown", "all"]
 _TOLERANCE = 1e-10
+_ROUNDING = 1e-12
+_RANK_TOLERANCE = 1e-9
 
 
-def system_zeros(A: Array, B: Array, C: Array, D: Array) -> Numbers:
+def system_zeros(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> Numbers:
     """Finite invariant zeros: where the Rosenbrock pencil [A - z I, B; C, D] loses rank.
 
     The algorithm of Emami-Naeini and Van Dooren removes from the pencil everything that is
@@ -30,8 +33,15 @@ def system_zeros(A: Array, B: Array, C: Array, D: Array) -> Numbers:
     Returns
     -------
     ndarray of complex
-        The largest modulus first. Modes that the outputs do not see or the inputs do not reach
-        are among them as far as they lower the rank.
+        The largest modulus first, a multiple zero as often as it occurs. Modes that the outputs do
+        not see or the inputs do not reach are among them as far as they lower the rank.
+
+    Notes
+    -----
+    Rounding the entries of a system splits a zero of multiplicity k by about eps^(1/k), 1e-4 for
+    k = 4, in exact arithmetic too: the doubles next to 3.6, 4.32 and 1.728 are not the
+    coefficients of a cube. What a relative change of the entries of 1e-12 makes coincide is
+    returned as one zero, their mean, which rounding hardly moves.
 
     References
     ----------
@@ -52,18 +62,47 @@ def system_zeros(A: Array, B: Array, C: Array, D: Array) -> Numbers:
     A, B, C, D = _reduce(A.T, C.T, B.T, D.T)
     if A.size == 0:
         return np.zeros(0, dtype=complex)
-    values = np.linalg.eigvals(A - B @ np.linalg.solve(D, C) if D.size else A) * size
+    values = _gather(A - B @ np.linalg.solve(D, C) if D.size else A) * size
     return np.asarray(values[np.argsort(-np.abs(values), kind="stable")], dtype=complex)
 
 
-def _unit_columns(upper: Array, lower: Array) -> tuple[Array, Array]:
+def _gather(matrix: FloatArray) -> Numbers:
+    """Eigenvalues, with those that rounding alone tells apart replaced by their mean."""
+    from scipy.linalg import eig
+
+    values, left, right = eig(matrix, left=True, right=True)
+    size = max(1.0, float(np.linalg.norm(matrix)))
+    with np.errstate(divide="ignore"):
+        # how far rounding moves an eigenvalue; those that split from a multiple one move far
+        reach = _ROUNDING * size / np.abs((left.conj() * right).sum(axis=0))
+    found, left_over = values.copy(), np.ones(len(values), dtype=bool)
+    for start in range(len(values)):
+        if not left_over[start]:
+            continue
+        distance = np.abs(values - values[start])
+        near = left_over & (distance <= reach + reach[start])
+        group = [j for j in np.argsort(distance, kind="stable") if near[j]]
+        while not _coincide((values[group] - values[group].mean()) / size):
+            group.pop()
+        found[group] = values[group].mean()
+        left_over[group] = False
+    found.imag[np.abs(found.imag) <= _ROUNDING * size] = 0.0
+    return np.asarray(found, dtype=complex)
+
+
+def _coincide(offsets: Numbers) -> bool:
+    """Whether the product of z - offset is z^k, up to rounding of its coefficients."""
+    return bool(np.abs(np.poly(offsets)[1:]).max() <= _ROUNDING)
+
+
+def _unit_columns(upper: FloatArray, lower: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scale the columns of [upper; lower] to size one; zeros do not change."""
     size = np.sqrt((upper**2).sum(axis=0) + (lower**2).sum(axis=0))
     size = np.where(size > 0.0, size, 1.0)
     return upper / size, lower / size
 
 
-def _row_rank(matrix: Array) -> tuple[int, Array]:
+def _row_rank(matrix: FloatArray) -> tuple[int, FloatArray]:
     """Rank, and an orthogonal matrix whose transpose puts the rows that matter first."""
     if matrix.size == 0:
         return 0, np.eye(len(matrix))
@@ -71,7 +110,9 @@ def _row_rank(matrix: Array) -> tuple[int, Array]:
     return int((values > _TOLERANCE).sum()), left
 
 
-def _reduce(A: Array, B: Array, C: Array, D: Array) -> tuple[Array, Array, Array, Array]:
+def _reduce(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Remove states until D has full row rank; the zeros stay the same."""
     while True:
         found, turn = _row_rank(D)
@@ -117,11 +158,16 @@ class PolytopeZeros:
     decays: bool
     vertex: int | None
 
+    @property
+    def multiplicity(self) -> int:
+        """How often the worst zero occurs at its vertex."""
+        return 0 if self.vertex is None else self.zeros[self.vertex].tolist().count(self.worst)
+
     def __str__(self) -> str:
         what = f"from {', '.join(self.signals)} to the outputs" if self.signals else "without input"
         if self.worst is None:
             return f"none {what}, at all {len(self.zeros)} vertices"
-        value = f"{self.worst.real:.6g}" if self.worst.imag == 0 else f"{self.worst:.6g}"
+        value = list_zeros(np.array([self.worst] * self.multiplicity))
         verdict = "all decay" if self.decays else "does not decay"
         return (
             f"{what}: slowest {value} at vertex {int(self.vertex or 0) + 1} of {len(self.zeros)} "
@@ -132,8 +178,61 @@ class PolytopeZeros:
         return f"<p>Invariant zeros {escape(str(self))}</p>"
 
 
+def list_zeros(zeros: Numbers) -> str:
+    """Write zeros with six digits, a multiple one once with the number of times it occurs."""
+    listed = zeros.tolist()
+    return ", ".join(
+        (f"{z.real:.6g}" if z.imag == 0 else f"{z:.6g}")
+        + (f" ({listed.count(z)} times)" if listed.count(z) > 1 else "")
+        for z in dict.fromkeys(listed)
+    )
+
+
+def _entering(split: Split, signals: Signals) -> tuple[FloatArray, FloatArray]:
+    """Columns with which unknown inputs, or these and the faults, enter states and outputs."""
+    B, D = split.D, np.zeros((len(split.C), split.D.shape[1]))
+    if signals == "unknown":
+        return B, D
+    return np.hstack([B, split.B_f]), np.hstack([D, split.D_f])
+
+
+def invariant_zeros(split: Split, M: FloatArray, signals: Signals = "all") -> Numbers:
+    """Invariant zeros of a plant with Jacobian M of g, (n, n): from the signals to the outputs."""
+    B, D = _entering(split, signals)
+    return system_zeros(split.A + M, B, split.C, D)
+
+
+def separable_faults(split: Split, M: FloatArray) -> tuple[tuple[str, ...], int, int]:
+    """Faults that can be told apart from all others and from unknown inputs; rank, signals.
+
+    The normal rank of the transfer matrix from unknown inputs and faults to the outputs is taken
+    at a few fixed points off the axes, where a rank below it has probability zero.
+    """
+    names = split.model.names("f")
+    inputs, direct = _entering(split, "all")
+    q, count = split.D.shape[1], inputs.shape[1]
+
+    def rank(columns: list[int]) -> int:
+        found = 0
+        for z in (1.37 + 0.61j, -0.83 + 1.29j):
+            pencil = z * np.eye(len(split.A)) - split.A - M
+            transfer = split.C @ np.linalg.solve(pencil, inputs[:, columns]) + direct[:, columns]
+            size = np.linalg.norm(transfer, axis=0)
+            scaled = transfer / np.where(size > 0.0, size, 1.0)
+            if scaled.size:
+                found = max(found, int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE)))
+        return found
+
+    every = list(range(count))
+    whole = rank(every)
+    apart = tuple(
+        name for k, name in enumerate(names) if rank([c for c in every if c != q + k]) < whole
+    )
+    return apart, whole, count
+
+
 def zeros_over_polytope(
-    split: Split, bounds: JacobianBounds, signals: Literal["unknown", "all"] = "unknown"
+    split: Split, bounds: JacobianBounds, signals: Signals = "unknown"
 ) -> PolytopeZeros:
     """Compute the invariant zeros of a plant at every vertex of its Jacobian family.
 
@@ -166,22 +265,16 @@ def zeros_over_polytope(
     (0.99647, True)
     """
     model = split.model
-    B, D = split.D, np.zeros((len(split.C), split.D.shape[1]))
-    names = model.names("d")
-    if signals == "all":
-        B, D = np.hstack([B, split.B_f]), np.hstack([D, split.D_f])
-        names = (*names, *model.names("f"))
-    found = tuple(system_zeros(split.A + M, B, split.C, D) for M in bounds.vertices())
+    names = model.names("d") + (model.names("f") if signals == "all" else ())
+    found = tuple(invariant_zeros(split, M, signals) for M in bounds.vertices())
     discrete = model.Ts is not None
-    worst: complex | None = None
-    vertex = None
-    for index, zeros in enumerate(found):
-        for zero in zeros.tolist():
-            size = abs(zero) if discrete else zero.real
-            if worst is None or size > (abs(worst) if discrete else worst.real):
-                worst, vertex = complex(zero), index
-    if worst is not None and abs(worst.imag) < 1e-9 * max(1.0, abs(worst)):
-        worst = complex(worst.real, 0.0)
-    limit = 1.0 if discrete else 0.0
-    reached = -np.inf if worst is None else (abs(worst) if discrete else worst.real)
-    return PolytopeZeros(names, found, worst, bool(reached < limit - 1e-9), vertex)
+    ranked = [
+        (abs(zero) if discrete else zero.real, -index, zero)
+        for index, zeros in enumerate(found)
+        for zero in zeros.tolist()
+    ]
+    if not ranked:
+        return PolytopeZeros(names, found, None, True, None)
+    size, index, worst = max(ranked, key=lambda item: item[:2])
+    decays = size < (1.0 if discrete else 0.0) - 1e-9
+    return PolytopeZeros(names, found, worst, decays, -index)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import StructureError, analyse, jacobian_bounds, split, unknown_input_condition
-from obsynth.derive.faults import invariant_zeros
 from obsynth.derive.structure import isolability
+from obsynth.derive.structure import zeros as zeros_module
 from obsynth.derive.structure.detectability import pair_margin, weakest_member
 from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.frozen import balls, precision, rank
@@ -104,10 +104,118 @@ def test_more_outputs_than_inputs_have_only_common_zeros():
     assert len(system_zeros(A, B, one, np.zeros((2, 1)))) == 0
 
 
-def test_tank_zeros_agree_with_the_other_computation(parts, bounds):
+def chain_with_zeros(zeros):
+    """f drives a chain of integrators; y has the zeros, and x_last+ = x_last / 2 + y."""
+    numerator = np.poly(zeros)[::-1].tolist()
+    count = len(numerator)
+    plant = Plant("chain")
+    x = plant.states(f"x1:{count + 2}", range=(-1, 1))
+    (f,) = plant.process_faults("f")
+    y = sum(value * symbol for value, symbol in zip(numerator, x[:-1], strict=True))
+    plant.dynamics([*x[1:-1], f, x[-1] / 2 + y], Ts=1)
+    plant.outputs([y, x[-1]])
+    return plant
+
+
+def triple_zero():
+    plant = Plant("triple zero")
+    x1, x2, x3, x4, x5 = plant.states("x1:6", range=(-1, 1))
+    (f,) = plant.process_faults("f")
+    y = x4 - 3.6 * x3 + 4.32 * x2 - 1.728 * x1
+    plant.dynamics([x2, x3, x4, f, x5 / 2 + y], Ts=1)
+    plant.outputs([y, x5])
+    return plant
+
+
+def test_analyse_agrees_with_itself_on_a_triple_zero():
+    report = analyse(triple_zero())
+    assert report["invariant zeros"].text == "1.2 (3 times)"
+    assert report["zeros with faults"].text.startswith(
+        "from f to the outputs: slowest 1.2 (3 times) at vertex 1 of 1 (does not decay)"
+    )
+    assert str(report).count("1.2 (3 times)") == 2
+
+
+def gathered(zeros, c, multiplicity):
+    """Assert that c is there with its multiplicity, to the last bits one number."""
+    near = zeros[np.abs(zeros - c) < 1e-3]
+    assert len(near) == multiplicity
+    assert len(set(near.tolist())) == 1
+    assert abs(near[0] - c) < 1e-9
+
+
+@pytest.mark.parametrize("multiplicity", [1, 2, 3, 4])
+@pytest.mark.parametrize("c", [1.2, 0.9, -0.5, 1.0, 0.0])
+def test_a_multiple_zero_is_one_number_in_both_lines(c, multiplicity):
+    report = analyse(chain_with_zeros([c] * multiplicity + [0.3]))
+    parts, bounds = report.split, report.bounds
+    gathered(zeros_module.invariant_zeros(parts, bounds.family.midpoint), c, multiplicity)
     found = zeros_over_polytope(parts, bounds, "all")
+    gathered(found.zeros[0], c, multiplicity)
+    times = f" ({multiplicity} times)" if multiplicity > 1 else ""
+    if abs(c) > 0.3:
+        assert found.multiplicity == multiplicity
+        assert report["invariant zeros"].text.startswith(f"{c:.6g}{times}, 0.3")
+        assert f"slowest {c:.6g}{times} at" in report["zeros with faults"].text
+
+
+@pytest.mark.parametrize("multiplicity", [2, 3, 4])
+def test_hidden_modes_with_and_without_jordan_blocks(multiplicity):
+    """Multiple hidden modes, in any coordinates: defective, semisimple, and both at once."""
+    rng = np.random.default_rng(multiplicity)
+    k, n = multiplicity, multiplicity + 2
+    for ones in (np.ones(k - 1), np.zeros(k - 1), np.arange(k - 1) % 2):
+        hidden = 1.2 * np.eye(k) + np.diag(ones, 1)
+        A = scipy.linalg.block_diag(hidden, [[0.5, 0.1], [-0.1, 0.5]])
+        B, C = np.eye(n)[:, [-1]], np.eye(n)[[-1]]
+        for turn in (np.eye(n), np.linalg.qr(rng.normal(size=(n, n)))[0]):
+            A_t, B_t, C_t = turn @ A @ turn.T, turn @ B, C @ turn.T
+            zeros = system_zeros(A_t, B_t, C_t, np.zeros((1, 1)))
+            assert len(zeros) == k + 1
+            gathered(zeros, 1.2, k)
+
+
+def test_pairs_of_complex_zeros_are_gathered_apart():
+    turn = np.array([[0.9, 0.3], [-0.3, 0.9]])
+    A = np.block([[turn, np.eye(2)], [np.zeros((2, 2)), turn]])
+    zeros = system_zeros(A, np.zeros((4, 0)), np.zeros((1, 4)), np.zeros((1, 0)))
+    for c in (0.9 + 0.3j, 0.9 - 0.3j):
+        gathered(zeros, c, 2)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-4, 1e-5])
+def test_zeros_that_are_only_near_each_other_stay_apart(gap):
+    """A slow pair of modes is no double one, however small beside the other entries."""
+    parts = analyse(chain_with_zeros([0.9, 0.9 + gap])).split
+    found = np.sort(zeros_module.invariant_zeros(parts, np.zeros((4, 4))).real)
+    np.testing.assert_allclose(found, [0.9, 0.9 + gap], rtol=0, atol=gap / 100)
+    A = np.diag([-1e-8, -3e-8, -1.0])
+    slow = system_zeros(A, np.zeros((3, 0)), np.zeros((1, 3)), np.zeros((1, 0)))
+    np.testing.assert_allclose(np.sort(slow.real), [-1.0, -3e-8, -1e-8], rtol=1e-9)
+
+
+def test_zeros_that_are_not_gathered_fail(monkeypatch):
+    """What numerical eigenvalues give: a triple zero as three numbers on a circle."""
+    monkeypatch.setattr(zeros_module, "_coincide", lambda offsets: len(offsets) == 1)
+    assert "times" not in str(analyse(triple_zero()))
+
+
+def test_zeros_that_forget_multiplicity_fail(monkeypatch):
+    """What the selection of common zeros did: three zeros within rounding count as one or none."""
+    whole = zeros_module.system_zeros
+    monkeypatch.setattr(zeros_module, "system_zeros", lambda *args: np.unique(whole(*args)))
+    assert "1.2 (3 times)" not in str(analyse(triple_zero()))
+
+
+def test_tank_zeros_agree_with_the_generalised_eigenvalue_problem(parts, bounds):
+    found = zeros_over_polytope(parts, bounds, "all")
+    inputs = np.hstack([parts.D, parts.B_f])
+    unit = np.diag([1.0] * 4 + [0.0] * 3)
     for M, zeros in zip(bounds.vertices(), found.zeros, strict=True):
-        np.testing.assert_allclose(zeros, invariant_zeros(parts, M), rtol=1e-9)
+        direct = np.hstack([np.zeros((3, 1)), parts.D_f])
+        known = scipy.linalg.eigvals(np.block([[parts.A + M, inputs], [parts.C, direct]]), unit)
+        known = known[np.isfinite(known) & (np.abs(known) < 1e6)]
+        np.testing.assert_allclose(zeros, known, rtol=1e-9)
     assert found.decays
     assert found.signals == ("d", "f1", "f2")
     # the level of the only tank that is not measured: 1 - a4 sqrt(2 g) / (2 A4 sqrt(h4)) at 100 cm

@@ -13,7 +13,7 @@ from obsynth.derive import (
     split,
     unknown_input_condition,
 )
-from obsynth.derive.faults import invariant_zeros, separable_faults
+from obsynth.derive.structure.zeros import invariant_zeros, separable_faults
 from obsynth.symbolic import Plant
 from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
 
