@@ -32,7 +32,6 @@ from obsynth.derive.rigour.definite import ProofResult, prove_positive_definite
 from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.blocks import block, he, symmetric_block
-from obsynth.designs.lmi.caps import cap_condition, cap_gain
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
@@ -44,11 +43,9 @@ from obsynth.designs.lmi.expression import (
     symmetric,
     trace,
 )
-from obsynth.designs.lmi.family import Family
-from obsynth.designs.lmi.lazy import LazySolution, solve_lazily
-from obsynth.designs.lmi.problem import Block, Problem
+from obsynth.designs.lmi.margin import Margin, MarginSolution, largest_margin, solve_with_margin
+from obsynth.designs.lmi.problem import Problem, cap_gain
 from obsynth.designs.lmi.proof import FamilyProof, prove_family
-from obsynth.designs.lmi.recipe import Margin, MarginSolution, largest_margin, solve_with_margin
 from obsynth.designs.lmi.reductions import (
     Extremes,
     SplitFamily,
@@ -63,7 +60,6 @@ from obsynth.designs.lmi.relaxation import (
     relax_sum,
     row_multipliers,
 )
-from obsynth.designs.lmi.retry import solve_with_retries
 from obsynth.designs.lmi.search import (
     Bisection,
     Knob,
@@ -73,21 +69,19 @@ from obsynth.designs.lmi.search import (
     search_log_convex,
     smallest_changes,
 )
-from obsynth.designs.lmi.solution import Solution
+from obsynth.designs.lmi.solve import solve_lazily, solve_reliably, solve_with_retries
+from obsynth.designs.lmi.statement import Solution
 
 __all__ = [
     "Affine",
     "Bisection",
-    "Block",
     "Enclosure",
     "ExactMatrix",
     "ExpressionError",
     "Extremes",
-    "Family",
     "FamilyProof",
     "Inequality",
     "Knob",
-    "LazySolution",
     "Margin",
     "MarginSolution",
     "Problem",
@@ -99,7 +93,6 @@ __all__ = [
     "UncertainRow",
     "bisect_feasible",
     "block",
-    "cap_condition",
     "cap_gain",
     "constant",
     "corner_block",
@@ -119,6 +112,7 @@ __all__ = [
     "search_log_convex",
     "smallest_changes",
     "solve_lazily",
+    "solve_reliably",
     "solve_with_margin",
     "solve_with_retries",
     "split_common",

@@ -12,12 +12,12 @@ import numpy as np
 
 from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix
-from obsynth.designs.lmi.expression import Affine, ExpressionError, constant
+from obsynth.designs.lmi.expression import Affine, ExpressionError, constant, is_zero
 
 
 def block(rows: Sequence[Sequence[Any]]) -> Any:
     """Matrix of blocks."""
-    grid = [[None if _is_zero(cell) else _as_cell(cell) for cell in row] for row in rows]
+    grid = [[None if is_zero(cell) else _as_cell(cell) for cell in row] for row in rows]
     if len({len(row) for row in grid}) != 1:
         raise ExpressionError(f"rows of {[len(row) for row in grid]} blocks")
     heights = [_size(row, 0, f"row {i}") for i, row in enumerate(grid)]
@@ -63,13 +63,9 @@ def he(matrix: Any) -> Any:
 
 
 def _transpose(cell: Any) -> Any:
-    if _is_zero(cell):
+    if is_zero(cell):
         return 0
     return np.swapaxes(cell, -1, -2) if isinstance(cell, np.ndarray) else cell.T
-
-
-def _is_zero(cell: Any) -> bool:
-    return isinstance(cell, (int, float)) and cell == 0
 
 
 def _as_cell(cell: Any) -> Any:

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi.expression import Affine
-from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.lmi.solution import Solution
-from obsynth.designs.lmi.variables import Structure, Variable
+from obsynth.designs.core.errors import SolverTrouble
+from obsynth.designs.lmi.expression import Affine, Structure, Variable
+from obsynth.designs.lmi.statement import Solution, Statement
 
 # SDPA often stops a little short of its default of 1e-7 and then calls itself inaccurate.
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -18,8 +16,8 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def to_cvxpy(problem: Problem) -> Any:
-    """Translate; see :meth:`Problem.to_cvxpy`."""
+def to_cvxpy(problem: Statement) -> Any:
+    """Translate; variables have the same names, and every vertex is a constraint."""
     import cvxpy as cp
 
     unknowns = {v: _variable(v) for v in problem.variables.values()}
@@ -39,10 +37,8 @@ def to_cvxpy(problem: Problem) -> Any:
     return cp.Problem(cp.Maximize(goal) if problem.maximising else cp.Minimize(goal), constraints)
 
 
-def solve_with_cvxpy(
-    problem: Problem, solver: str, *, accept_inaccurate: bool = False, **options: Any
-) -> Solution:
-    """Solve by any solver cvxpy knows."""
+def solve_with_cvxpy(problem: Statement, solver: str) -> Solution:
+    """Solve by any solver cvxpy knows; the solution says how it ended."""
     import cvxpy as cp
 
     translated = to_cvxpy(problem)
@@ -50,7 +46,7 @@ def solve_with_cvxpy(
         with warnings.catch_warnings():
             # The status says the same, and says it to the caller.
             warnings.simplefilter("ignore", UserWarning)
-            translated.solve(solver=solver, **{**_OPTIONS.get(solver, {}), **options})
+            translated.solve(solver=solver, **_OPTIONS.get(solver, {}))
     except cp.error.SolverError as trouble:
         raise SolverTrouble(
             f"{problem.name}: {solver} failed", [str(trouble).splitlines()[0]], solver=solver
@@ -61,7 +57,7 @@ def solve_with_cvxpy(
         name: _value(found.get(name), variable) for name, variable in problem.variables.items()
     }
     statistics = translated.solver_stats
-    solution = Solution(
+    return Solution(
         values=values,
         status=status,
         solved=status == "optimal",
@@ -72,10 +68,6 @@ def solve_with_cvxpy(
         solve_time=float(statistics.solve_time or 0.0),
         iterations=int(statistics.num_iters or 0),
     )
-    if solution.solved or accept_inaccurate:
-        return solution
-    kind = InfeasibleDesign if solution.infeasible else SolverTrouble
-    raise kind(f"{problem.name}: {solver} ended with {status}", **solution.facts())
 
 
 def _variable(variable: Variable) -> Any:

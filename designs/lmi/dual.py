@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.lmi.solution import Solution
+from obsynth.designs.lmi.statement import Solution
 
 # Blocks with less than this share of the dual weight get the multiplier zero.
 _NEGLIGIBLE = 1e-10
@@ -73,7 +73,7 @@ def binding_blocks(
     """List the strict blocks with the largest dual weight."""
     found = []
     for name, item in problem.blocks.items():
-        if item.cone != "psd" or not item.strict or name not in solution.duals:
+        if not item.asks_margin or name not in solution.duals:
             continue
         dual = solution.duals[name]
         weights = np.atleast_1d(np.trace(dual, axis1=-2, axis2=-1))

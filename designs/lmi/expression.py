@@ -1,23 +1,93 @@
-"""Affine matrix expressions, alone or as a family with one member per vertex."""
+"""Matrix unknowns and what is affine in them, alone or as a family with one member per vertex."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.lmi.variables import Structure, Variable
 from obsynth.symbolic.errors import ObsynthError
 
 Matrix = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 
 class ExpressionError(ObsynthError):
     """An expression that is not affine, or whose shapes do not fit."""
+
+
+class Structure(StrEnum):
+    """Pattern of a matrix variable."""
+
+    FULL = "full"
+    SYMMETRIC = "symmetric"
+    DIAGONAL = "diagonal"
+    SCALAR = "scalar"
+
+
+def upper_triangle(n: int) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the upper triangle, stacked by columns."""
+    columns, rows = np.tril_indices(n)
+    return rows, columns
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A matrix variable: a value compared by name, shape and structure.
+
+    name: name under which the solution returns it
+    shape: rows and columns
+    structure: which entries are free
+    """
+
+    name: str
+    shape: tuple[int, int]
+    structure: Structure
+
+    @property
+    def size(self) -> int:
+        """Number of free entries."""
+        return len(self.free_entries[0])
+
+    @property
+    def free_entries(self) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the free entries, in the order of the parameter vector."""
+        rows, columns = self.shape
+        if self.structure is Structure.SYMMETRIC:
+            return upper_triangle(rows)
+        if self.structure is Structure.DIAGONAL:
+            index = np.arange(rows)
+            return index, index
+        index = np.arange(rows * columns)
+        return index % rows, index // rows
+
+    def operator(self) -> sparse.csr_array:
+        """Sparse map (rows * columns, size) from the free entries to the column-stacked matrix."""
+        rows, columns = self.free_entries
+        index = np.arange(len(rows))
+        targets = columns * self.shape[0] + rows
+        if self.structure is Structure.SYMMETRIC:
+            off = rows != columns
+            targets = np.concatenate([targets, (rows * self.shape[0] + columns)[off]])
+            index = np.concatenate([index, index[off]])
+        entries = self.shape[0] * self.shape[1]
+        return sparse.csr_array((np.ones(len(index)), (targets, index)), shape=(entries, len(rows)))
+
+    def unpack(self, entries: ArrayLike) -> Matrix:
+        """Matrix with the given free entries."""
+        stacked = self.operator() @ np.asarray(entries, dtype=float)
+        matrix: Matrix = stacked.reshape(self.shape, order="F")
+        return matrix
+
+    def pack(self, matrix: ArrayLike) -> Matrix:
+        """Free entries of a matrix of this variable's shape."""
+        values = np.asarray(matrix, dtype=float).reshape(self.shape)
+        return values[self.free_entries]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +176,7 @@ class Affine:
         return Affine(-self.constant, {v: -op for v, op in self.terms.items()})
 
     def __add__(self, other: Any) -> Affine:
-        if _is_zero(other):
+        if is_zero(other):
             return self
         right = constant(other)
         shape = _common_shape(self, right, "+")
@@ -119,10 +189,10 @@ class Affine:
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Affine:
-        return self if _is_zero(other) else self + (-constant(other))
+        return self if is_zero(other) else self + (-constant(other))
 
     def __rsub__(self, other: Any) -> Affine:
-        return -self if _is_zero(other) else constant(other) - self
+        return -self if is_zero(other) else constant(other) - self
 
     def __mul__(self, other: Any) -> Affine:
         """Elementwise product with a constant that broadcasts (a number, or (N, 1, 1))."""
@@ -161,12 +231,12 @@ class Affine:
     def __le__(self, other: Any) -> Inequality:
         return Inequality("nonnegative", _as_bound(other, self) - self)
 
-    def _numbers(self) -> NDArray[np.intp]:
+    def _numbers(self) -> IntArray:
         """Row number in the operators of every entry."""
         count = self.constant.size
         return _unstack(np.arange(count), self.constant.shape)
 
-    def _take(self, numbers: NDArray[np.intp]) -> Affine:
+    def _take(self, numbers: IntArray) -> Affine:
         rows = _stack(numbers)
         picked = _stack(self.constant)[rows]
         terms = {v: op[rows] for v, op in self.terms.items()}
@@ -270,7 +340,8 @@ def _as_matrix(value: Any) -> Matrix:
     return array
 
 
-def _is_zero(value: Any) -> bool:
+def is_zero(value: Any) -> bool:
+    """Whether a value is the plain number 0, which has every shape."""
     return isinstance(value, (int, float)) and value == 0
 
 

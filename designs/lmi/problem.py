@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from obsynth.designs.lmi.blocks import block, symmetric_block
+from obsynth.designs.lmi.conic import solve
+from obsynth.designs.lmi.cvxpy_backend import to_cvxpy
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
     Inequality,
+    Variable,
     constant,
     diagonal,
     full,
@@ -20,25 +23,7 @@ from obsynth.designs.lmi.expression import (
     symmetric,
     trace,
 )
-from obsynth.designs.lmi.solution import Solution
-from obsynth.designs.lmi.variables import Variable
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """A named constraint: an expression and the cone it lies in.
-
-    name: name in reports and in the duals of the solution
-    cone: ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three)
-    expression: for ``"psd"`` with sense ``<<`` the negative of what was typed, margin included
-    strict: whether a margin is asked of the block; helpers that only define an auxiliary variable
-        are not strict
-    """
-
-    name: str
-    cone: str
-    expression: Affine
-    strict: bool = True
+from obsynth.designs.lmi.statement import Block, Solution, Statement
 
 
 class Problem:
@@ -169,23 +154,24 @@ class Problem:
         """Copy the problem with ``margin`` times the identity taken from every strict block."""
         copy = self.members({})
         for name, item in self._blocks.items():
-            if item.cone == "psd" and item.strict:
+            if item.asks_margin:
                 lowered = item.expression - margin * np.eye(item.expression.shape[0])
                 copy._learn(lowered, name)
                 copy._blocks[name] = replace(item, expression=lowered)
         return copy
 
+    @property
+    def statement(self) -> Statement:
+        """What the back ends read."""
+        return Statement(self.name, self.variables, self.blocks, self.objective, self.maximising)
+
     def solve(self, *, accept_inaccurate: bool = False, **settings: Any) -> Solution:
         """Solve with Clarabel."""
-        from obsynth.designs.lmi.clarabel_backend import solve
-
-        return solve(self, accept_inaccurate=accept_inaccurate, **settings)
+        return solve(self.statement, accept_inaccurate=accept_inaccurate, **settings)
 
     def to_cvxpy(self) -> Any:
         """Translate for cvxpy; variables have the same names."""
-        from obsynth.designs.lmi.cvxpy_backend import to_cvxpy
-
-        return to_cvxpy(self)
+        return to_cvxpy(self.statement)
 
     def __repr__(self) -> str:
         counts = ", ".join(
@@ -227,3 +213,14 @@ class Problem:
         self._learn(objective, "objective")
         self._criterion = None
         self.objective, self.maximising = objective, maximising
+
+
+def cap_gain(problem: Problem, P: Affine, H: Affine, limit: float, name: str = "gain") -> None:
+    """Keep the largest singular value of K = P^-1 H below a limit (sufficient).
+
+    With p I <= P and ``[limit^2 p I, H'; H, P] >= 0`` follows p K'K <= K'P K <= limit^2 p I.
+    """
+    p = scalar(f"{name}.p")
+    problem.add_lmi(f"{name}.floor", P - p * np.eye(P.shape[0]), ">>", strict=False)
+    cap: Any = symmetric_block([[limit**2 * p * np.eye(H.shape[1])], [H, P]])
+    problem.add_lmi(f"{name}.cap", cap, ">>", strict=False)

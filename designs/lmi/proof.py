@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.rigour.definite import prove_positive_definite
 from obsynth.derive.rigour.enclosure import Enclosure
 from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.core.errors import CertificateError
-
-IntArray = NDArray[np.intp]
+from obsynth.designs.lmi.expression import IntArray
 
 # Entries of the blocks formed at a time, so that the work arrays stay in the cache.
 _CHUNK_ENTRIES = 2**16

@@ -16,10 +16,8 @@ import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.lmi.blocks import block
-from obsynth.designs.lmi.expression import Affine, symmetric
+from obsynth.designs.lmi.expression import Affine, IntArray, symmetric
 from obsynth.symbolic.errors import ObsynthError
-
-IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

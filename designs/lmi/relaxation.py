@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.designs.lmi.blocks import block, he
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
+    Matrix,
     constant,
     full,
     scalar,
@@ -24,8 +24,6 @@ from obsynth.designs.lmi.expression import (
 )
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.reductions import present_entries
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

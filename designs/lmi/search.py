@@ -67,32 +67,28 @@ class Knob:
     current: value at which the design is infeasible
     limit: as far as it may be changed
     feasible: whether the design is feasible at a value, all else being equal
-    unit: printed after values
     """
 
     name: str
     current: float
     limit: float
     feasible: Callable[[float], bool]
-    unit: str = ""
 
 
 def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
     """Say for each scalar how far it has to move, or that it does not help."""
     lines = []
     for knob in knobs:
-        unit = f" {knob.unit}" if knob.unit else ""
         found = bisect_feasible(knob.feasible, knob.limit, knob.current, rtol=rtol)
         if found is None:
             way = "down to" if knob.limit < knob.current else "up to"
             lines.append(
                 f"{knob.name}: does not enter feasibility; infeasible from "
-                f"{knob.current:.3g}{unit} {way} {knob.limit:.3g}{unit}"
+                f"{knob.current:.3g} {way} {knob.limit:.3g}"
             )
         else:
             lines.append(
-                f"{knob.name}: {knob.current:.3g}{unit} is infeasible, "
-                f"{found.feasible:.3g}{unit} is feasible"
+                f"{knob.name}: {knob.current:.3g} is infeasible, {found.feasible:.3g} is feasible"
             )
     return lines
 
@@ -123,12 +119,15 @@ def search_line(
     *,
     refine: int = 0,
     name: str = "search",
-    jobs: int = 1,
 ) -> Search[Result]:
     """Design at every value of a grid, then refine around the best by golden sections."""
+    from rich.console import Console
+    from rich.progress import track
+
     record = _Record(objective)
-    for value, outcome in zip(grid, _design_all(design, list(grid), name, jobs), strict=True):
-        record.add(value, outcome)
+    terminal = Console().is_terminal
+    for value in track(grid, description=name, disable=not terminal, transient=True):
+        record.add(value, _attempt(design, value))
     if record.best is None:
         raise InfeasibleDesign(
             f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design",
@@ -272,21 +271,3 @@ def _attempt(design: Callable[[float], Result], value: float) -> Result | Except
         return design(value)
     except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
         return refusal
-
-
-def _design_all(
-    design: Callable[[float], Result], grid: list[float], name: str, jobs: int
-) -> list[Result | Exception]:
-    from rich.console import Console
-    from rich.progress import track
-
-    terminal = Console().is_terminal
-    if jobs == 1:
-        shown = track(grid, description=name, disable=not terminal, transient=True)
-        return [_attempt(design, value) for value in shown]
-    from joblib import Parallel, delayed
-
-    parallel = Parallel(n_jobs=jobs, return_as="generator")
-    outcomes = parallel(delayed(_attempt)(design, value) for value in grid)
-    bar = track(outcomes, name, total=len(grid), disable=not terminal, transient=True)
-    return list(bar)

@@ -7,14 +7,13 @@ from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, Solv
 from obsynth.designs.lmi import (
     Enclosure,
     ExactMatrix,
-    Family,
     Problem,
     full,
     is_positive_definite,
     largest_margin,
+    margin,
     prove_family,
     prove_positive_definite,
-    recipe,
     solve_lazily,
     solve_with_margin,
     symmetric,
@@ -101,24 +100,6 @@ def test_lazy_and_whole_have_the_same_optimum():
     assert np.linalg.eigvalsh(values).min() < -1e-4
 
 
-def test_a_family_given_by_a_formula_is_never_formed_whole():
-    problem, _, family = design()
-    P, H = symmetric("P", N), full("H", N, 3)
-    largest = 0
-
-    def formula(k, P, H):
-        nonlocal largest
-        if not isinstance(P, np.ndarray):
-            largest = max(largest, len(k))
-        return decay(P, H, family[k])
-
-    other = Problem("chain")
-    other.minimise_trace_inverse(P)
-    lazy = solve_lazily(other, [Family("decay", 128, formula, {"P": P, "H": H})], floor=-1e-7)
-    assert lazy.solution.objective == pytest.approx(problem.solve().objective, rel=1e-5)
-    assert largest < 100
-
-
 def test_what_the_solver_cannot_reach_is_told():
     problem, _, _ = design()
     with pytest.raises(SolverTrouble, match="wider margin") as caught:
@@ -152,7 +133,7 @@ def test_back_off_leads_to_the_proof_and_failure_is_no_design(monkeypatch):
 
     found = solve_with_margin(problem, prove=strict)
     assert found.back_off > 0 and len(calls) > 1
-    monkeypatch.setattr(recipe, "_BACK_OFF", 1e-7)
+    monkeypatch.setattr(margin, "_BACK_OFF", 1e-7)
     with pytest.raises(CertificateError, match="not proved"):
         solve_with_margin(problem, prove=strict)
 

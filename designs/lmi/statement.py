@@ -1,4 +1,4 @@
-"""What a solver returned, before anything is proved about it."""
+"""What a solver is handed, and what it returned before anything is proved about it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.lmi.expression import Affine
+from obsynth.designs.lmi.expression import Affine, Variable
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A named constraint: an expression and the cone it lies in.
+
+    name: name in reports and in the duals of the solution
+    cone: ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three)
+    expression: for ``"psd"`` with sense ``<<`` the negative of what was typed, margin included
+    strict: whether a margin is asked of the block; helpers that only define an auxiliary variable
+        are not strict
+    """
+
+    name: str
+    cone: str
+    expression: Affine
+    strict: bool = True
+
+    @property
+    def asks_margin(self) -> bool:
+        """Whether the block is a matrix inequality of which a margin is asked."""
+        return self.strict and self.cone == "psd"
+
+
+@dataclass(frozen=True, eq=False)
+class Statement:
+    """A problem as a back end reads it: blocks and variables by name, and a 1 x 1 objective."""
+
+    name: str
+    variables: Mapping[str, Variable]
+    blocks: Mapping[str, Block]
+    objective: Affine
+    maximising: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +83,7 @@ class Solution:
         """Read a 1 x 1 variable as a float."""
         return float(self.values[name].item())
 
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{name}</td><td>{value.shape}</td></tr>" for name, value in self.values.items()
-        )
-        head = f"{self.solver}: {self.status}, objective {self.objective:.6g}"
-        return f"<table><caption>{head}</caption>{rows}</table>"
-
     def facts(self) -> dict[str, Any]:
         """Status, objective, solver and time, for errors and reports."""
-        return {
-            "status": self.status,
-            "objective": self.objective,
-            "solver": self.solver,
-            "solve_time": self.solve_time,
-            "iterations": self.iterations,
-        }
+        names = ("status", "objective", "solver", "solve_time", "iterations")
+        return {name: getattr(self, name) for name in names}

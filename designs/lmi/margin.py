@@ -7,7 +7,7 @@ phase 1 point until the proof goes through.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +17,11 @@ from numpy.typing import NDArray
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.dual import Binding, MarginBound, binding_blocks, bound_margin
 from obsynth.designs.lmi.expression import Inequality, scalar
-from obsynth.designs.lmi.family import Family
-from obsynth.designs.lmi.lazy import LazySolution, solve_lazily
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.lmi.retry import solve_with_retries
-from obsynth.designs.lmi.solution import Solution
+from obsynth.designs.lmi.solve import LazySolution, solve_lazily, solve_with_retries
+from obsynth.designs.lmi.statement import Solution
 
 Values = Mapping[str, NDArray[np.float64]]
-Caps = Mapping[str, Inequality]
 
 _MARGIN = "margin.t"
 
@@ -87,20 +84,14 @@ class MarginSolution:
 
     values: by variable name
     objective: of these values
-    margin: of phase 1
-    kept: margin asked for in phase 2
     back_off: share of the phase 1 point mixed in
-    solution: of phase 2 as the solver returned it
-    chosen: vertices stated, to start from when solving a similar problem
+    chosen: vertices stated in phase 2, by family
     proof: what ``prove`` returned for the values
     """
 
     values: Values
     objective: float
-    margin: Margin
-    kept: float
     back_off: float
-    solution: Solution
     chosen: Mapping[str, NDArray[np.intp]]
     proof: Any
 
@@ -109,12 +100,7 @@ class MarginSolution:
 
 
 def largest_margin(
-    problem: Problem,
-    families: Sequence[Family] = (),
-    *,
-    caps: Caps | None = None,
-    start: Mapping[str, NDArray[np.intp]] | None = None,
-    explain: bool = True,
+    problem: Problem, *, caps: Mapping[str, Inequality] | None = None, explain: bool = True
 ) -> Margin:
     """Phase 1: the largest t with every strict block >= t I.
 
@@ -127,8 +113,7 @@ def largest_margin(
     for name, cap in (caps or {}).items():
         first.add(name, cap)
     first.maximise(t)
-    tight = [family.tightened(t) for family in families]
-    found = solve_lazily(first, tight, start=start, floor=_phase_one_floor, solve=_phase_one)
+    found = solve_lazily(first, floor=_phase_one_floor, solve=_phase_one)
     value = _measured(found.problem, found.solution)
     binding: tuple[Binding, ...] = ()
     bound = None
@@ -139,16 +124,10 @@ def largest_margin(
 
 
 def solve_with_margin(
-    problem: Problem,
-    families: Sequence[Family] = (),
-    *,
-    prove: Callable[[Values], Any],
-    caps: Caps | None = None,
-    fraction: float = 1e-4,
-    start: Mapping[str, NDArray[np.intp]] | None = None,
+    problem: Problem, *, prove: Callable[[Values], Any], fraction: float = 1e-4
 ) -> MarginSolution:
     """Phase 1, phase 2, back-off and proof."""
-    margin = largest_margin(problem, families, caps=caps, start=start)
+    margin = largest_margin(problem)
     if not margin.feasible:
         raise InfeasibleDesign(
             f"{problem.name}: the inequalities leave no room",
@@ -159,7 +138,7 @@ def solve_with_margin(
         )
     kept = fraction * margin.value
     inner = margin.found.solution.values
-    second = _phase_two(problem, families, kept, margin)
+    second = _phase_two(problem, kept, margin)
     outer = second.solution.values
     proof: Any = None
     for share in _shares(_lowest(second.problem, second.solution) + kept, margin.value):
@@ -172,10 +151,7 @@ def solve_with_margin(
             return MarginSolution(
                 values=values,
                 objective=problem.evaluate(values),
-                margin=margin,
-                kept=kept,
                 back_off=share,
-                solution=second.solution,
                 chosen=second.chosen,
                 proof=proof,
             )
@@ -215,7 +191,7 @@ def _lowest(problem: Problem, solution: Solution) -> float:
     """Smallest eigenvalue of the strict blocks as stated."""
     lowest = np.inf
     for item in problem.blocks.values():
-        if item.cone == "psd" and item.strict:
+        if item.asks_margin:
             matrices = solution.value(item.expression)
             lowest = min(lowest, float(np.linalg.eigvalsh(matrices).min()))
     return lowest
@@ -227,20 +203,12 @@ def _phase_one_floor(problem: Problem, solution: Solution) -> float:
     return -0.5 * least if least > _LEAST_MARGIN else -np.inf
 
 
-def _phase_two(
-    problem: Problem,
-    families: Sequence[Family],
-    kept: float,
-    margin: Margin,
-) -> LazySolution:
+def _phase_two(problem: Problem, kept: float, margin: Margin) -> LazySolution:
     if not problem.objective.terms:
         return margin.found
-    tight = [family.tightened(kept) for family in families]
     try:
         return solve_lazily(
             problem.tightened(kept),
-            tight,
-            start=margin.found.chosen,
             # No vertex is left much worse than the solver leaves those it knows.
             floor=lambda stated, solution: min(-2.0 * kept, 1.5 * _lowest(stated, solution)),
             solve=lambda stated: solve_with_retries(
