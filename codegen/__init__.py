@@ -1,7 +1,7 @@
 """What ships: C projects of one observer step."""
 
 from obsynth.codegen.build import Build, Comparison, build_and_compare, find_compiler
-from obsynth.codegen.errors import BuildError, CodegenError, ComparisonError
+from obsynth.codegen.errors import BuildError, CodegenError, ComparisonError, FolderError
 from obsynth.codegen.project import CProject, generate_c
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "CodegenError",
     "Comparison",
     "ComparisonError",
+    "FolderError",
     "build_and_compare",
     "find_compiler",
     "generate_c",

@@ -13,11 +13,12 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.interface import ObserverLike, PlantLike
 from obsynth.codegen.kernel import STEP_INPUTS
 from obsynth.codegen.machine import Machine
 from obsynth.codegen.names import project_name, unique
-from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
 
@@ -61,7 +62,7 @@ class Description:
     """
 
     name: str
-    observer: ObserverLike
+    observer: Observer | FaultDetector
     sample_time: float
     fields: tuple[Field, ...]
     x: tuple[Port, ...]
@@ -93,7 +94,7 @@ class Description:
 
 
 def describe(
-    observer: ObserverLike, name: str | None = None, memory: FloatArray | None = None
+    observer: Observer | FaultDetector, name: str | None = None, memory: FloatArray | None = None
 ) -> Description:
     """Check that an observer can ship and collect what its C project says of it.
 
@@ -156,7 +157,7 @@ def _fields(layout: Mapping[str, slice]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _scheduling(step: ca.Function, model: PlantLike) -> tuple[int, ...]:
+def _scheduling(step: ca.Function, model: Plant) -> tuple[int, ...]:
     """Return the places of the scheduling signals that a step reads as theta."""
     if step.n_in() < len(STEP_INPUTS):
         return ()
@@ -177,7 +178,7 @@ def _scheduling(step: ca.Function, model: PlantLike) -> tuple[int, ...]:
     return measured
 
 
-def _check_step(step: ca.Function, model: PlantLike, n_memory: int, n_theta: int) -> None:
+def _check_step(step: ca.Function, model: Plant, n_memory: int, n_theta: int) -> None:
     n, n_f = len(model.x), len(model.f)
     inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
     names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
@@ -217,7 +218,7 @@ def midpoints(box: FloatArray) -> FloatArray:
     return result
 
 
-def nominal_values(model: PlantLike, kind: Literal["x", "u", "rho"]) -> FloatArray:
+def nominal_values(model: Plant, kind: Literal["x", "u", "rho"]) -> FloatArray:
     """Return the nominal values; the middle of the range where none is declared."""
     signals = {"x": model.x, "u": model.u}[kind] if kind != "rho" else model.rho
     values = midpoints(model.box(kind))
@@ -227,7 +228,9 @@ def nominal_values(model: PlantLike, kind: Literal["x", "u", "rho"]) -> FloatArr
     return values
 
 
-def _start(observer: ObserverLike, memory: FloatArray | None, n_memory: int) -> FloatArray:
+def _start(
+    observer: Observer | FaultDetector, memory: FloatArray | None, n_memory: int
+) -> FloatArray:
     given = "memory=" if memory is not None else "what memory0 returned"
     value = observer.memory0(nominal_values(observer.model, "x")) if memory is None else memory
     start = np.array(value, dtype=float)
@@ -239,7 +242,7 @@ def _start(observer: ObserverLike, memory: FloatArray | None, n_memory: int) -> 
     return start
 
 
-def _check_not_initialised(observer: ObserverLike) -> None:
+def _check_not_initialised(observer: Observer | FaultDetector) -> None:
     """Make sure that a state nobody has initialised is told apart by the step itself."""
     zeros = [np.zeros(observer.step.numel_in(i)) for i in range(observer.step.n_in())]
     status = float(Machine(observer.step)(*zeros)[STEP_OUTPUTS.index("status")][0])
@@ -251,7 +254,7 @@ def _check_not_initialised(observer: ObserverLike) -> None:
         )
 
 
-def _ports(model: PlantLike, kind: str) -> tuple[Port, ...]:
+def _ports(model: Plant, kind: str) -> tuple[Port, ...]:
     signals = getattr(model, kind)
     box = np.asarray(model.box(kind), dtype=float).reshape(-1, 2)
     names = unique(signal.name for signal in signals)
@@ -261,7 +264,7 @@ def _ports(model: PlantLike, kind: str) -> tuple[Port, ...]:
     )
 
 
-def _measurements(model: PlantLike) -> tuple[Port, ...]:
+def _measurements(model: Plant) -> tuple[Port, ...]:
     names = tuple(model.output_names)
     return tuple(
         Port(c_name, name, unit)

@@ -13,6 +13,10 @@ class CodegenError(ObsynthError):
     """
 
 
+class FolderError(CodegenError):
+    """A folder that holds what is not ours to replace; ``folder`` and ``files`` as attributes."""
+
+
 class BuildError(CodegenError):
     """Generated C that a compiler rejects, or a program that cannot be run.
 

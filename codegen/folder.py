@@ -1,4 +1,4 @@
-"""Put a project in its place: whole or not at all, and never over someone else's files."""
+"""Leave a folder whole or not at all, and never over someone else's files."""
 
 from __future__ import annotations
 
@@ -6,97 +6,97 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
 
-from obsynth.codegen.errors import CodegenError
+from obsynth.codegen.errors import FolderError
 
-KIND = "obsynth C project"
 MANIFEST = "manifest.json"
-_BUILD = "build"
-
-Result = TypeVar("Result")
 
 
-def place(
-    folder: str | os.PathLike[str],
-    files: Mapping[str, str],
-    overwrite: bool,
-    check: Callable[[Path], Result],
-) -> tuple[Path, Result]:
-    """Write files to a folder beside the target, check them there, move the folder into place."""
-    target = Path(folder).expanduser().resolve()
-    _check_target(target, overwrite)
+@contextmanager
+def complete_folder(
+    folder: str | os.PathLike[str], kind: str, *, overwrite: bool = True, built: str | None = None
+) -> Iterator[Path]:
+    """Give a new folder to write to; it takes the target's place when all went well.
+
+    A manifest lists what was written, so that a later call may replace exactly that; what
+    `check_target` says holds before and after the block. If the block raises, or is
+    interrupted, the target stays as it was.
+    """
+    target = check_target(folder, kind, overwrite=overwrite, built=built)
     target.parent.mkdir(parents=True, exist_ok=True)
     token = secrets.token_hex(4)
     new = target.with_name(f".{target.name}.new-{token}")
     old = target.with_name(f".{target.name}.old-{token}")
     new.mkdir()
     try:
-        for path, text in files.items():
-            file = new / path
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text, encoding="utf-8", newline="\n")
-        result = check(new)
-        # Something may have come into the target while the check ran.
-        _check_target(target, overwrite)
-        _swap(new, target, old)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-    return target, result
-
-
-def _swap(new: Path, target: Path, old: Path) -> None:
-    if target.exists():
-        target.rename(old)
+        yield new
+        if not (new / MANIFEST).exists():
+            manifest = json.dumps({"kind": kind, "files": sorted(_files(new))}, indent=1)
+            (new / MANIFEST).write_text(manifest + "\n", encoding="utf-8")
+        # Something may have come into the target in the meantime.
+        check_target(target, kind, overwrite=overwrite, built=built)
+        if target.exists():
+            target.rename(old)
         try:
             new.rename(target)
         except BaseException:
-            old.rename(target)
+            if old.exists():
+                old.rename(target)
             raise
-        shutil.rmtree(old)
-    else:
-        new.rename(target)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
-def _check_target(target: Path, overwrite: bool) -> None:
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise CodegenError(f"{target} is a file; name a folder for the project", folder=str(target))
-    if not any(target.iterdir()):
-        return
-    ours = _files_of(target)
+def check_target(
+    folder: str | os.PathLike[str], kind: str, *, overwrite: bool = True, built: str | None = None
+) -> Path:
+    """Return the folder's full path, or refuse one that is not free.
+
+    Free are new and empty folders and, with `overwrite`, what an earlier call of this kind
+    left; files below `built` are made from those and go with them.
+    """
+    target = Path(folder).expanduser().resolve()
+    if target.exists() and not target.is_dir():
+        raise FolderError(f"{target} is a file; name a folder", folder=str(target))
+    if not target.exists() or not any(target.iterdir()):
+        return target
+    ours = _listed(target, kind)
     if ours is None:
-        raise CodegenError(
-            f"{target} holds files and is no project of obsynth; name another folder",
-            folder=str(target),
-        )
-    if not overwrite:
-        raise CodegenError(
-            f"{target} holds a project already; say overwrite=True to replace it",
-            folder=str(target),
-        )
-    present = {p.relative_to(target).as_posix() for p in target.rglob("*") if not p.is_dir()}
-    foreign = sorted(p for p in present - ours if not p.startswith(f"{_BUILD}/"))
+        foreign, word = sorted(path.name for path in target.iterdir()), f" and is no {kind}"
+    else:
+        foreign, word = sorted(_files(target) - ours), ""
+        if built is not None:
+            foreign = [path for path in foreign if not path.startswith(f"{built}/")]
     if foreign:
         shown = ", ".join(foreign[:5]) + (", ..." if len(foreign) > 5 else "")
-        raise CodegenError(
-            f"{target} holds files that obsynth did not write ({shown}); move them elsewhere"
-            " before the project is replaced",
+        raise FolderError(
+            f"{target} holds files that obsynth did not write ({shown}){word}; name another"
+            " folder, or move them elsewhere",
             folder=str(target),
             files=tuple(foreign),
         )
+    if not overwrite:
+        raise FolderError(
+            f"{target} holds an {kind} already; say overwrite=True to replace it",
+            folder=str(target),
+        )
+    return target
 
 
-def _files_of(target: Path) -> set[str] | None:
-    """Return the files that a manifest lists; None where there is no manifest of ours."""
+def _files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
+
+
+def _listed(target: Path, kind: str) -> set[str] | None:
+    """Return the files that a manifest lists; None where there is no manifest of this kind."""
     try:
         manifest = json.loads((target / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    if not isinstance(manifest, dict) or manifest.get("kind") != KIND:
+    if not isinstance(manifest, dict) or manifest.get("kind") != kind:
         return None
-    listed = manifest.get("files")
-    return {MANIFEST, *listed} if isinstance(listed, dict) else None
+    return {MANIFEST, *map(str, manifest.get("files", ()))}

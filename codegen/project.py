@@ -17,11 +17,12 @@ import casadi as ca
 from obsynth.codegen.build import Build, Comparison, build_and_compare, find_compiler
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
-from obsynth.codegen.folder import KIND, MANIFEST, place
-from obsynth.codegen.interface import ObserverLike
+from obsynth.codegen.folder import MANIFEST, complete_folder
 from obsynth.codegen.kernel import Kernel, generate_kernel
 from obsynth.codegen.render import generator_name, render
 from obsynth.codegen.vectors import Vectors, make_vectors
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
 
 PRECISIONS = ("double",)
@@ -30,7 +31,10 @@ PRECISIONS = ("double",)
 BACKENDS = ("casadi",)
 """Writers of the kernel."""
 
+KIND = "obsynth C project"
+
 _FORMAT = 1
+_BUILT = "build"
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ class CProject:
 
 
 def generate_c(
-    observer: ObserverLike,
+    observer: Observer | FaultDetector,
     folder: str | os.PathLike[str],
     name: str | None = None,
     precision: Literal["double"] = "double",
@@ -120,8 +124,7 @@ def generate_c(
 
     Parameters
     ----------
-    observer : Observer
-        A designed observer.
+    observer : Observer or FaultDetector
     folder : path
         Where the project shall be. It appears there only when it is complete and compared.
     name : str, optional
@@ -155,7 +158,7 @@ def generate_c(
 
     Examples
     --------
-    >>> generate_c(observer=None, folder="tank", precision="single")
+    >>> generate_c(None, folder="tank", precision="single")
     Traceback (most recent call last):
     ...
     obsynth.codegen.errors.CodegenError: precision='single' is not available; available: 'double'
@@ -171,25 +174,15 @@ def generate_c(
     files = render(description, kernel, recorded, start_given=memory is not None)
     files[MANIFEST] = _manifest(description, kernel, recorded, start, files)
 
-    def check(place: Path) -> tuple[Build, Comparison] | None:
-        compiler = find_compiler()
-        if compiler is None:
-            return None
-        build, comparison = build_and_compare(place, description.name, compiler=compiler)
-        if (comparison.vectors, comparison.values) != (recorded.count, recorded.values):
-            raise BuildError(
-                f"the test compared {comparison.vectors} steps and {comparison.values} values of"
-                f" {recorded.count} and {recorded.values}",
-                command=compiler,
-                output=str(comparison),
-            )
-        return build, comparison
-
-    target, result = place(folder, files, overwrite, check)
-    build, comparison = (None, None) if result is None else result
+    with complete_folder(folder, KIND, overwrite=overwrite, built=_BUILT) as place:
+        for path, text in files.items():
+            file = place / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text, encoding="utf-8", newline="\n")
+        build, comparison = _compared(place, description.name, recorded)
     return CProject(
         name=description.name,
-        folder=target,
+        folder=Path(folder).expanduser().resolve(),
         files=tuple(sorted(files)),
         sizes=description.sizes,
         operations=kernel.operations,
@@ -198,6 +191,24 @@ def generate_c(
         build=build,
         comparison=comparison,
     )
+
+
+def _compared(
+    place: Path, name: str, recorded: Vectors
+) -> tuple[Build, Comparison] | tuple[None, None]:
+    """Build the project and compare every recorded step; None where there is no compiler."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None, None
+    build, comparison = build_and_compare(place, name, compiler=compiler)
+    if (comparison.vectors, comparison.values) != (recorded.count, recorded.values):
+        raise BuildError(
+            f"the test compared {comparison.vectors} steps and {comparison.values} values of"
+            f" {recorded.count} and {recorded.values}",
+            command=compiler,
+            output=str(comparison),
+        )
+    return build, comparison
 
 
 def _available(option: str, value: str, values: tuple[str, ...]) -> None:

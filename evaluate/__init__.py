@@ -3,7 +3,6 @@
 from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.domain import Domain, StatusCount
 from obsynth.evaluate.errors import ReportError, SimulationError
-from obsynth.evaluate.interface import StepObserver
 from obsynth.evaluate.plotting.alarms import plot_alarms
 from obsynth.evaluate.plotting.plots import plot_errors, plot_run, plot_signal
 from obsynth.evaluate.plotting.width_plot import plot_widths
@@ -19,7 +18,6 @@ __all__ = [
     "Run",
     "SimulationError",
     "StatusCount",
-    "StepObserver",
     "Table",
     "Trace",
     "Violation",

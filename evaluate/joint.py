@@ -6,25 +6,22 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.evaluate.calls import (
-    first_memory,
-    refuse_algebraic_loop,
-    scheduling_columns,
-    step_function,
-)
-from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.fields import (
+from obsynth.evaluate.checked import (
     WORDS,
     broken_assumptions,
     finite,
+    first_memory,
     function_values,
+    refuse_algebraic_loop,
     scenario_fields,
+    scheduling_columns,
+    step_function,
     vector,
 )
-from obsynth.evaluate.interface import StepObserver
+from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import (
     Call,
@@ -37,15 +34,18 @@ from obsynth.evaluate.truth import (
     substeps_of,
 )
 from obsynth.symbolic import Plant, Scenario
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 # Runge-Kutta steps evaluated in one call; bounds what the signals' values take of memory.
 _CHUNK = 8192
 
 
 def joint(
-    model: Plant, observer: StepObserver, scenario: Scenario, seed: int, substeps: int | None
+    model: Plant,
+    observer: Observer | FaultDetector,
+    scenario: Scenario,
+    seed: int,
+    substeps: int | None,
 ) -> Run:
     """Integrate plant and observer together; see :func:`obsynth.simulate`.
 
@@ -83,8 +83,8 @@ def joint(
 class _System:
     """z' = rates(z, v) and y = output(z, v) with z = (x, memory) and v = (u, d, f, w, rho)."""
 
-    def __init__(self, model: Plant, observer: StepObserver, substeps: int) -> None:
-        ode = getattr(observer, "ode", None)
+    def __init__(self, model: Plant, observer: Observer, substeps: int) -> None:
+        ode = observer.ode
         if ode is None:
             raise SimulationError(
                 "engine='joint' integrates plant and observer as one differential equation and "
@@ -125,7 +125,7 @@ class _System:
         self.rates = _scalar(ca.Function("rates", [z, v], [ca.vertcat(dx, derivative)]))
         self.output = _scalar(ca.Function("output", [z, v], [y]))
 
-    def start(self, observer: StepObserver, scenario: Scenario, v: Array) -> Array:
+    def start(self, observer: Observer, scenario: Scenario, v: FloatArray) -> FloatArray:
         """Return z at k = 0: the scenario's x0 and the memory for the first measurement."""
         x0 = vector(scenario.x0, self.model.names("x"), "x0")
         z0 = np.concatenate([x0, np.zeros(self.n_memory)])
@@ -154,13 +154,13 @@ def _scalar(function: ca.Function) -> ca.Function:
         return dense(function)
 
 
-def _parts(*arrays: Array) -> Iterator[list[Array]]:
+def _parts(*arrays: FloatArray) -> Iterator[list[FloatArray]]:
     """Yield the rows of several arrays in chunks."""
     for k in range(0, len(arrays[0]), _CHUNK):
         yield [array[k : k + _CHUNK] for array in arrays]
 
 
-def _mapped(function: ca.Function, arguments: list[Array]) -> list[Array]:
+def _mapped(function: ca.Function, arguments: list[FloatArray]) -> list[FloatArray]:
     """Evaluate a function of columns for every row of its arguments."""
     rows = len(arguments[0])
     call = Call(dense(function).map(rows))
@@ -171,8 +171,12 @@ def _mapped(function: ca.Function, arguments: list[Array]) -> list[Array]:
 
 
 def _claims(
-    step: ca.Function, model: Plant, memory: Array, y: Array, fields: dict[str, Array]
-) -> dict[str, Array]:
+    step: ca.Function,
+    model: Plant,
+    memory: FloatArray,
+    y: FloatArray,
+    fields: dict[str, FloatArray],
+) -> dict[str, FloatArray]:
     """Read from the observer's step what it says for the integrated memories."""
     arguments = [memory, fields["u"], y]
     if len(step.name_in()) == 4:
@@ -188,14 +192,14 @@ def _claims(
     return dict(zip(step.name_out()[1:], columns, strict=True))
 
 
-def _samples(fields: dict[str, Array]) -> Array:
+def _samples(fields: dict[str, FloatArray]) -> FloatArray:
     """Return all signals at the samples, beside each other; zero where a feedback sets u."""
     return np.hstack([fields[key] for key in WORDS])
 
 
 def _stages(
-    system: _System, scenario: Scenario, samples: Array
-) -> Iterator[tuple[int, int, tuple[Array, Array, Array]]]:
+    system: _System, scenario: Scenario, samples: FloatArray
+) -> Iterator[tuple[int, int, tuple[FloatArray, FloatArray, FloatArray]]]:
     """Yield the signals at beginning, middle and end of every Runge-Kutta step, in chunks.
 
     Each item is a range of samples and three arrays with one row for each step.
@@ -218,8 +222,8 @@ def _stages(
 
 
 def _with_signals(
-    system: _System, observer: StepObserver, scenario: Scenario, fields: dict[str, Array]
-) -> Array:
+    system: _System, observer: Observer, scenario: Scenario, fields: dict[str, FloatArray]
+) -> FloatArray:
     """Integrate with every signal known beforehand; return z at the samples."""
     samples = _samples(fields)
     z = np.empty((scenario.steps + 1, system.n_x + system.n_memory))
@@ -259,8 +263,8 @@ def _called(function: ca.Function) -> Callable[..., Any]:
 
 
 def _with_feedback(
-    system: _System, observer: StepObserver, scenario: Scenario, fields: dict[str, Array]
-) -> Array:
+    system: _System, observer: Observer, scenario: Scenario, fields: dict[str, FloatArray]
+) -> FloatArray:
     """Integrate with inputs that read the output of every stage; return z, and u in the fields."""
     refuse_algebraic_loop(scenario, system.plant)
     model = system.model
@@ -271,7 +275,7 @@ def _with_feedback(
     loop = _Stages(system)
     law: Any = scenario.inputs
 
-    def control(k: float) -> Array:
+    def control(k: float) -> FloatArray:
         value = np.asarray(law(k, loop.y.copy()), dtype=float)
         if value.shape == (n_u,) and np.isfinite(value.sum()):
             return value
@@ -326,7 +330,7 @@ class _Stages:
         now = [self.z, self.v]
 
         def stage(
-            inputs: list[Any], outputs: list[Any], args: list[Array], results: list[Array]
+            inputs: list[Any], outputs: list[Any], args: list[FloatArray], results: list[FloatArray]
         ) -> Call:
             return Call(_scalar(ca.Function("stage", inputs, outputs)), args, results)
 

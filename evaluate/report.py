@@ -162,7 +162,7 @@ def _half_widths(observers: Mapping[str, "Observer"]) -> dict[str, Any]:
 
 def _subject(observer: "Observer") -> str:
     """Say which equations the guarantee speaks of."""
-    if getattr(observer, "ode", None) is None:
+    if observer.ode is None:
         return "All guarantees speak of the discrete model."
     if observer.step_covered:
         return "The guarantees speak of the differential equation, observed at these instants."

@@ -13,13 +13,13 @@ from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.table import Table
 from obsynth.evaluate.trace import Trace, Violation
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
-    from obsynth.evaluate.interface import StepObserver
+    from obsynth.designs.core.observer import Observer
+    from obsynth.designs.detection.detector import FaultDetector
     from obsynth.symbolic import Plant
 
-
-Array = NDArray[np.float64]
 
 # Instants listed for each violated signal; the count is always complete.
 LISTED = 5
@@ -56,25 +56,25 @@ class Run:
         bound that the scenario does not keep; empty when it does.
     """
 
-    t: Array
-    x: Array
-    y: Array
-    u: Array
-    d: Array
-    f: Array
-    w: Array
-    rho: Array
-    xhat: Array
-    fhat: Array
-    x_lower: Array
-    x_upper: Array
-    f_lower: Array
-    f_upper: Array
+    t: FloatArray
+    x: FloatArray
+    y: FloatArray
+    u: FloatArray
+    d: FloatArray
+    f: FloatArray
+    w: FloatArray
+    rho: FloatArray
+    xhat: FloatArray
+    fhat: FloatArray
+    x_lower: FloatArray
+    x_upper: FloatArray
+    f_lower: FloatArray
+    f_upper: FloatArray
     status: NDArray[np.int64]
     names: Mapping[str, tuple[str, ...]]
     units: Mapping[str, tuple[str, ...]]
-    box: Array
-    half_widths: Array | None
+    box: FloatArray
+    half_widths: FloatArray | None
     fault_delay: int
     model: str
     scenario: str
@@ -89,21 +89,21 @@ class Run:
         cls,
         *,
         model: "Plant",
-        observer: "StepObserver",
+        observer: "Observer | FaultDetector",
         scenario: str,
         seed: int,
         truth: str,
         outside: tuple[str, ...],
-        t: Array,
-        truths: Mapping[str, Array],
-        claims: Mapping[str, Array],
+        t: FloatArray,
+        truths: Mapping[str, FloatArray],
+        claims: Mapping[str, FloatArray],
     ) -> "Run":
         """Label what the simulation loop recorded."""
         groups = {key: getattr(model, key) for key in ("x", "u", "d", "f", "w", "rho")}
         names = {key: tuple(s.name for s in signals) for key, signals in groups.items()}
         units = {key: tuple(s.unit for s in signals) for key, signals in groups.items()}
         names["y"] = tuple(model.output_names)
-        units["y"] = tuple(getattr(model, "output_units", ("",) * len(names["y"])))
+        units["y"] = tuple(model.output_units)
         status = np.asarray(claims["status"], dtype=np.int64).reshape(-1)
         arrays = {key: value for key, value in claims.items() if key not in ("status", "alarm")}
         arrays |= truths
@@ -145,7 +145,7 @@ class Run:
 
     def _trace(self, group: str, i: int) -> Trace:
         name, unit = self.names[group][i], self.units[group][i]
-        true: Array = getattr(self, group)[:, i]
+        true: FloatArray = getattr(self, group)[:, i]
         if group == "x":
             claims = (self.xhat[:, i], self.x_lower[:, i], self.x_upper[:, i])
             return Trace(name, unit, self.t, true, *claims)
@@ -213,7 +213,7 @@ class Run:
         return {name: float(np.sqrt(np.mean(e**2))) for name, e in errors.items()}
 
     @cached_property
-    def widths(self) -> dict[str, Array]:
+    def widths(self) -> dict[str, FloatArray]:
         """Half the length of each interval at every instant."""
         return {name: self[name].half_width for name in self.estimated}
 
@@ -301,7 +301,7 @@ class Run:
         )
 
 
-def _bounds(trace: Trace) -> tuple[Array, Array]:
+def _bounds(trace: Trace) -> tuple[FloatArray, FloatArray]:
     if trace.lower is None or trace.upper is None:
         raise SimulationError(f"{trace.name} has no interval.", symbol=trace.name)
     return trace.lower, trace.upper

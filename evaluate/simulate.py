@@ -4,28 +4,30 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from obsynth.evaluate.calls import (
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.evaluate.checked import (
+    broken_assumptions,
+    finite,
     first_memory,
     refuse_algebraic_loop,
+    scenario_fields,
     scheduling_columns,
     step_function,
+    vector,
 )
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.fields import broken_assumptions, finite, scenario_fields, vector
-from obsynth.evaluate.interface import StepObserver
 from obsynth.evaluate.joint import joint
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Call, Truth, dense
 from obsynth.symbolic import Plant, Scenario
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def simulate(
     model: Plant,
-    observer: StepObserver,
+    observer: Observer | FaultDetector,
     scenario: Scenario,
     seed: int = 0,
     engine: str = "step",
@@ -43,8 +45,7 @@ def simulate(
     model : Plant
         The truth: the observer's own discrete model, another discretisation,
         or, with `substeps`, the continuous plant behind it.
-    observer : Observer
-        Anything with the step of :class:`StepObserver`.
+    observer : Observer or FaultDetector
     scenario : Scenario
         Inputs, faults, disturbances and initial values.
     seed : int
@@ -94,12 +95,12 @@ def simulate(
 
 def _feedback(
     scenario: Scenario, plant: Plant, truth: Call, names: tuple[str, ...]
-) -> Callable[[int], Array]:
+) -> Callable[[int], FloatArray]:
     """Return a function of k that reads y_k and returns u_k; refuses an algebraic loop."""
     refuse_algebraic_loop(scenario, plant)
     law: Any = scenario.inputs
 
-    def at(k: int) -> Array:
+    def at(k: int) -> FloatArray:
         truth.evaluate()
         return vector(law(k, truth.results[1].copy()), names, f"inputs at k = {k}")
 
@@ -108,9 +109,9 @@ def _feedback(
 
 def _loop(
     truth: Truth,
-    observer: StepObserver,
+    observer: Observer | FaultDetector,
     scenario: Scenario,
-    fields: dict[str, Array],
+    fields: dict[str, FloatArray],
     seed: int,
 ) -> Run:
     """March plant and observer through the samples."""

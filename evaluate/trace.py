@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.evaluate.errors import SimulationError
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +21,11 @@ class Trace:
 
     name: str
     unit: str
-    t: Array
-    true: Array
-    estimate: Array | None = None
-    lower: Array | None = None
-    upper: Array | None = None
+    t: FloatArray
+    true: FloatArray
+    estimate: FloatArray | None = None
+    lower: FloatArray | None = None
+    upper: FloatArray | None = None
     alarm: NDArray[np.bool_] | None = None
 
     @property
@@ -49,14 +48,14 @@ class Trace:
         return np.asarray((self.lower <= self.true) & (self.true <= self.upper))
 
     @property
-    def error(self) -> Array:
+    def error(self) -> FloatArray:
         """Truth minus estimate."""
         if self.estimate is None:
             raise SimulationError(f"{self.name} is not estimated.", symbol=self.name)
         return np.asarray(self.true - self.estimate)
 
     @property
-    def half_width(self) -> Array:
+    def half_width(self) -> FloatArray:
         """Half the length of the interval."""
         if self.lower is None or self.upper is None:
             raise SimulationError(f"{self.name} has no interval.", symbol=self.name)

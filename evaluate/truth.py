@@ -5,25 +5,26 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.interface import StepObserver
 from obsynth.symbolic import Plant
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 class Truth:
     """One plant step (x, u, d, f, w, rho) -> (next x, y) and what the run says about it."""
 
-    def __init__(self, model: Plant, observer: StepObserver, substeps: int | None) -> None:
+    def __init__(
+        self, model: Plant, observer: Observer | FaultDetector, substeps: int | None
+    ) -> None:
         own = observer.model
         same_signals(model, own)
         self.model = model
         self.Ts = sample_time(own)
         self.outside: tuple[str, ...] = ()
-        self._ode = getattr(observer, "ode", None)
+        self._ode = observer.ode
         p = parameters(model)
         if substeps is not None:
             self._continuous(substeps)
@@ -32,7 +33,7 @@ class Truth:
             self._discrete(own)
             x, u, d, f, w, rho = _symbols(model)
             step = ca.Function("truth", [x, u, d, f, w, rho], _call(model, x, u, d, f, w, p, rho))
-        if self._ode is not None and not getattr(observer, "step_covered", False):
+        if self._ode is not None and not observer.step_covered:
             self.outside += (
                 "the guarantee speaks of the observer's differential equation; its sampled step, "
                 f"with everything measured held over {self.Ts:g} s, is outside it",
@@ -121,12 +122,12 @@ def continuous_plant(model: Plant, why: str) -> Plant:
     return source
 
 
-def parameters(model: Plant) -> Array:
+def parameters(model: Plant) -> FloatArray:
     """Return the constant parameters of the truth: nominal, else mid-range."""
     return np.array([_nominal(signal) for signal in model.p], dtype=np.float64)
 
 
-def parameter_text(model: Plant, p: Array) -> str:
+def parameter_text(model: Plant, p: FloatArray) -> str:
     """Say which parameters the truth has, to be put behind its description."""
     if not p.size:
         return ""
@@ -144,13 +145,13 @@ def _symbols(plant: Plant) -> tuple[ca.SX, ...]:
 
 
 def _call(
-    plant: Plant, x: Any, u: Any, d: Any, f: Any, w: Any, p: Array, rho: Any
+    plant: Plant, x: Any, u: Any, d: Any, f: Any, w: Any, p: FloatArray, rho: Any
 ) -> tuple[Any, Any]:
     rhs, y = plant.function()(x, u, d, f, w, p, rho)
     return rhs, y
 
 
-def _held(plant: Plant, Ts: float, substeps: int, p: Array) -> ca.Function:
+def _held(plant: Plant, Ts: float, substeps: int, p: FloatArray) -> ca.Function:
     """Classical Runge-Kutta over one sample with everything but x held."""
     x, u, d, f, w, rho = _symbols(plant)
 
@@ -189,8 +190,8 @@ class Call:
     def __init__(
         self,
         function: ca.Function,
-        args: list[Array] | None = None,
-        results: list[Array] | None = None,
+        args: list[FloatArray] | None = None,
+        results: list[FloatArray] | None = None,
     ) -> None:
         if args is None:
             args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]

@@ -1,5 +1,6 @@
 """What the user says: plants, signals, equations, scenarios."""
 
+from obsynth.symbolic import plants, scenarios
 from obsynth.symbolic.convert import nearest_double, to_sx
 from obsynth.symbolic.errors import ObsynthError, ObsynthWarning, PlantError
 from obsynth.symbolic.functions import phi1, tanhc
@@ -27,7 +28,9 @@ __all__ = [
     "from_tape",
     "nearest_double",
     "phi1",
+    "plants",
     "read_text",
+    "scenarios",
     "tanhc",
     "to_sx",
     "write_text",

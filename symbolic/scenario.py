@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
-
-Array = NDArray[np.float64]
 
 _FIELDS = {
     "u": "inputs",
@@ -76,15 +75,15 @@ class Scenario:
 
     name: str
     steps: int
-    x0: Array
-    guess: Array
-    inputs: Array | Callable[..., ArrayLike]
-    faults: Array | Callable[[float], ArrayLike] | None = None
-    unknown_inputs: Array | Callable[[float], ArrayLike] | None = None
-    scheduling: Array | Callable[[float], ArrayLike] | None = None
-    disturbances: Array | Callable[..., ArrayLike] | None = None
-    x_range: Array | None = None
-    f_range: Array | None = None
+    x0: FloatArray
+    guess: FloatArray
+    inputs: FloatArray | Callable[..., ArrayLike]
+    faults: FloatArray | Callable[[float], ArrayLike] | None = None
+    unknown_inputs: FloatArray | Callable[[float], ArrayLike] | None = None
+    scheduling: FloatArray | Callable[[float], ArrayLike] | None = None
+    disturbances: FloatArray | Callable[..., ArrayLike] | None = None
+    x_range: FloatArray | None = None
+    f_range: FloatArray | None = None
     feedback: bool = False
 
     def __post_init__(self) -> None:
@@ -132,7 +131,7 @@ class Scenario:
         """Whether the disturbances are a sampler (rng, k)."""
         return callable(self.disturbances) and _needed(self.disturbances, unknown=2) != 1
 
-    def arrays(self, model: "Plant", seed: int | None = 0) -> dict[str, Array | None]:
+    def arrays(self, model: "Plant", seed: int | None = 0) -> dict[str, FloatArray | None]:
         """Return the samples of u, d, f, w and rho for a plant.
 
         Parameters
@@ -181,7 +180,7 @@ class Scenario:
             "rho": self._fit("scheduling", self._samples("scheduling"), model.names("rho"), middle),
         }
 
-    def _disturbances(self, model: "Plant", seed: int | None) -> Array:
+    def _disturbances(self, model: "Plant", seed: int | None) -> FloatArray:
         rng = np.random.default_rng(seed)
         samples = self.steps + 1
         if self.disturbances is None:
@@ -206,13 +205,13 @@ class Scenario:
             return value
         return self._called(field, [value(k) for k in range(self.steps + 1)])
 
-    def _called(self, field: str, rows: list[ArrayLike]) -> Array:
+    def _called(self, field: str, rows: list[ArrayLike]) -> FloatArray:
         """Return what a function gave, one row per sample."""
         return self._array(field, [np.ravel(row) for row in rows], (self.steps + 1, None))
 
     def _fit(
         self, field: str, value: Any, names: tuple[str, ...], default: list[float] | None = None
-    ) -> Array:
+    ) -> FloatArray:
         shape = (self.steps + 1, len(names))
         if value is None:
             return (
@@ -226,7 +225,7 @@ class Scenario:
             )
         return self._array(field, value, shape)
 
-    def _array(self, field: str, value: Any, shape: tuple[int | None, ...]) -> Array:
+    def _array(self, field: str, value: Any, shape: tuple[int | None, ...]) -> FloatArray:
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError) as error:

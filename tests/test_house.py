@@ -75,8 +75,8 @@ def test_public_names_resolve_and_are_documented():
 
     for name in obsynth.__all__:
         value = getattr(obsynth, name)
-        assert name.startswith("__") or (value.__doc__ or "").strip(), name
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        assert (value.__doc__ or "").strip(), name
+    with pytest.raises(AttributeError, match="attribute nothing"):
         _ = obsynth.nothing
 
 

@@ -28,7 +28,7 @@ def test_the_wheel_holds_every_module(tmp_path):
     (wheel,) = tmp_path.glob("*.whl")
     names = {name for name in zipfile.ZipFile(wheel).namelist() if "dist-info" not in name}
     expected = {name.removeprefix("src/") for name in tracked("src/obsynth/*.py")}
-    expected |= {"obsynth/py.typed"}
+    expected |= {"obsynth/py.typed", "obsynth/__init__.pyi"}
     expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/*.py")}
     expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/templates/*")}
     assert names == expected

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.layout import new_figure
 from obsynth.evaluate.plotting.style import ESTIMATE, SOFT, style
+from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
     from obsynth.evaluate.run import Run
 
 
-Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
@@ -80,7 +80,7 @@ def plot_alarms(
         return ax
 
 
-def shade(ax: Any, t: Array, alarm: BoolArray) -> None:
+def shade(ax: Any, t: FloatArray, alarm: BoolArray) -> None:
     """Shade where an alarm is raised over the whole height of a panel."""
     bars = _bars(t, alarm)
     if bars:
@@ -96,7 +96,7 @@ def shade(ax: Any, t: Array, alarm: BoolArray) -> None:
         )
 
 
-def _bars(t: Array, there: BoolArray) -> list[tuple[float, float]]:
+def _bars(t: FloatArray, there: BoolArray) -> list[tuple[float, float]]:
     """Return start and length of every stretch in time; a sample lasts until the next one."""
     edges = np.diff(np.concatenate([[0], there.astype(np.int8), [0]]))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)

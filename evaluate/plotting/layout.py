@@ -1,11 +1,13 @@
-"""Figures, panels and legends of the plots."""
+"""Figures, panels, legends and points of the plots."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from obsynth.evaluate.errors import ReportError
+from obsynth.symbolic.arrays import FloatArray
 
 _ORDER = {"truth": 0, "estimate": 1, "interval": 2, "alarm": 3}
 
@@ -65,3 +67,24 @@ def _constrained(engine: Any) -> bool:
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     return isinstance(engine, ConstrainedLayoutEngine)
+
+
+def thin(t: FloatArray, values: FloatArray, columns: int = 500) -> tuple[FloatArray, FloatArray]:
+    """Keep first, smallest, largest and last value of each of `columns` slices in time.
+
+    At a resolution of `columns` pixels the picture is the same as that of all
+    points, as every column shows its whole extent.
+
+    Shapes: t, values (N,), t, values (at most 4 * columns,).
+    """
+    n = len(t)
+    if n <= 4 * columns:
+        return t, values
+    edges = np.linspace(0, n, columns + 1).astype(int)
+    keep = set()
+    for start, stop in pairwise(edges):
+        part = values[start:stop]
+        finite = np.where(np.isfinite(part), part, 0.0)
+        keep |= {start, stop - 1, start + int(finite.argmin()), start + int(finite.argmax())}
+    index = np.array(sorted(keep))
+    return t[index], values[index]

@@ -5,14 +5,13 @@ shows a window. matplotlib is imported on first use.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import shade
-from obsynth.evaluate.plotting.layout import grid, name_lines, new_figure
+from obsynth.evaluate.plotting.layout import grid, name_lines, new_figure, thin
 from obsynth.evaluate.plotting.style import (
     BARS,
     ESTIMATE,
@@ -22,16 +21,17 @@ from obsynth.evaluate.plotting.style import (
     SOFT,
     style,
 )
-from obsynth.evaluate.run import Run
-from obsynth.evaluate.thin import thin
 from obsynth.evaluate.trace import Trace
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from obsynth.evaluate.run import Run
+
 Window = tuple[float, float]
 
 
 def plot_signal(
-    run: Run,
+    run: "Run",
     name: str,
     ax: Any = None,
     zooms: Sequence[Window] | None = None,
@@ -114,7 +114,7 @@ def plot_signal(
 
 
 def plot_run(
-    run: Run, signals: Sequence[str] | None = None, axes: Any = None, window: Window | None = None
+    run: "Run", signals: Sequence[str] | None = None, axes: Any = None, window: Window | None = None
 ) -> Any:
     """Plot all estimated signals of a run in a grid.
 
@@ -148,7 +148,7 @@ def plot_run(
 
 
 def plot_errors(
-    runs: Run | Mapping[str, Run],
+    runs: "Run | Mapping[str, Run]",
     signals: Sequence[str] | None = None,
     axes: Any = None,
     window: Window | None = None,
@@ -171,7 +171,7 @@ def plot_errors(
     -------
     ndarray of Axes, one for each signal
     """
-    labelled = {"": runs} if isinstance(runs, Run) else dict(runs)
+    labelled = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     if not labelled:
         raise ReportError("there is no run to plot.")
     first = next(iter(labelled.values()))
@@ -206,12 +206,12 @@ def plot_errors(
         return flat
 
 
-def _finite(bound: Array) -> Array:
+def _finite(bound: FloatArray) -> FloatArray:
     """Leave a gap where a bound is infinite."""
     return np.where(np.isinf(bound), np.nan, bound)
 
 
-def _cut(t: Array, values: Array, window: Window | None) -> tuple[Array, Array]:
+def _cut(t: FloatArray, values: FloatArray, window: Window | None) -> tuple[FloatArray, FloatArray]:
     if window is None:
         return t, values
     inside = (t >= window[0]) & (t <= window[1])
@@ -277,7 +277,7 @@ def _window_title(i: int, window: Window, automatic: bool) -> str:
     return word or f"{window[0]:g} s to {window[1]:g} s"
 
 
-def _settled(run: Run) -> int:
+def _settled(run: "Run") -> int:
     """Find the first instant from which no interval is much wider than at the end."""
     start = len(run.t) // 100
     for width in run.widths.values():
@@ -287,7 +287,7 @@ def _settled(run: Run) -> int:
     return min(start, len(run.t) // 2)
 
 
-def _windows(run: Run, trace: Trace) -> list[Window]:
+def _windows(run: "Run", trace: Trace) -> list[Window]:
     """Choose the start until the estimate has settled, and a stretch around a moving fault."""
     n = len(trace.t)
     if trace.estimate is None or n < 40:

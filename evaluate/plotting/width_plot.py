@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.layout import new_figure
 from obsynth.evaluate.plotting.style import BARS, INK, style
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 def plot_widths(
@@ -72,7 +71,9 @@ def plot_widths(
         return drawn[0] if len(drawn) == 1 else np.array(drawn, dtype=object)
 
 
-def _draw(ax: Any, table: Mapping[str, Array], names: Sequence[str], units: Sequence[str]) -> None:
+def _draw(
+    ax: Any, table: Mapping[str, FloatArray], names: Sequence[str], units: Sequence[str]
+) -> None:
     count = max(len(table), 1)
     step = 0.84 / count
     places = np.arange(len(names), dtype=float)

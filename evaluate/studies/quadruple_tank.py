@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from obsynth.codegen import CProject, generate_c
+from obsynth.codegen.folder import complete_folder
 from obsynth.derive import jacobian_bounds, split
 from obsynth.designs import BoundedErrorUIO, InfeasibleDesign, Observer
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.folder import complete_folder
 from obsynth.evaluate.report import report
 from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.simulate import simulate
@@ -31,7 +32,6 @@ from obsynth.evaluate.table import Table
 from obsynth.symbolic import Scenario, plants, scenarios
 
 if TYPE_CHECKING:
-    from obsynth.codegen import CProject
     from obsynth.derive import JacobianBounds, Split
     from obsynth.symbolic import Plant
 
@@ -52,6 +52,9 @@ STAGES = {
     "writing the report": 8,
 }
 
+RUN = "obsynth run"
+"""What the manifest of a study's folder says that it is."""
+
 Progress = Callable[[str, float], None]
 
 
@@ -71,7 +74,7 @@ class QuadrupleTank:
     refusals: Refusals
     designs: dict[str, Observer]
     runs: dict[str, tuple[Run, ...]]
-    project: "CProject"
+    project: CProject
     folder: Path
 
     @property
@@ -120,13 +123,11 @@ def quadruple_tank(
     that ships), ``design_ellipsoid.json`` and the C project ``c/``. It appears
     only when all of it is complete, and replaces only what an earlier run left.
     """
-    from obsynth.codegen import generate_c
-
     if seeds < 1:
         raise SimulationError(f"seeds={seeds}; at least one noise seed is needed.", seeds=seeds)
     cases = [shortened(name, steps) for name in ("FS1", "FS2")]
     say = _stages(progress)
-    with complete_folder(folder) as place:
+    with complete_folder(folder, RUN) as place:
         say(0)
         model = plants.quadruple_tank().discretise("euler", Ts=1.0)
         parts = split(model)

@@ -70,13 +70,12 @@ def run(
         _refuse(f"there is no study {study!r}; there is {', '.join(STUDIES)}.")
     folder = Path("out", study) if out is None else out
     with _refusals():
-        from obsynth.evaluate.folder import check_target
+        from obsynth.codegen.folder import check_target
+        from obsynth.evaluate.studies import RUN, quadruple_tank
 
-        check_target(folder)
+        check_target(folder, RUN)
         start = time.perf_counter()
         with _progress() as advance:
-            from obsynth.evaluate.studies import quadruple_tank
-
             found = quadruple_tank(folder, steps=steps, seeds=seeds, progress=advance)
     console = _console()
     for table in found.tables():

@@ -5,12 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.scenario import Scenario
 
-Array = NDArray[np.float64]
 Name = Literal["FS0", "FS1", "FS2", "Fig. 7", "SC"]
 
 _NAMES = ("FS0", "FS1", "FS2", "Fig. 7", "SC")
@@ -147,7 +146,7 @@ def _faults(name: str, Ts: float, factor: float) -> Callable[[float], Sequence[f
     return abrupt if name == "FS1" else slow
 
 
-def _noise(steps: int, Ts: float, duration: float, hold: float | None, seed: int) -> Array:
+def _noise(steps: int, Ts: float, duration: float, hold: float | None, seed: int) -> FloatArray:
     if hold is None:
         return np.zeros((steps + 1, 3))
     per = round(hold / Ts)

@@ -126,9 +126,9 @@ def test_a_folder_of_someone_else(toy: Any, tmp_path: Path) -> None:
     target.mkdir()
     (target / "thesis.tex").write_text("years of work")
     for overwrite in (False, True):
-        refused(toy, target, "no project of obsynth", overwrite=overwrite)
+        refused(toy, target, "is no obsynth C project", overwrite=overwrite)
     (target / "manifest.json").write_text('{"kind": "of another tool"}')
-    refused(toy, target, "no project of obsynth", overwrite=True)
+    refused(toy, target, "is no obsynth C project", overwrite=True)
     assert (target / "thesis.tex").read_text() == "years of work"
 
 

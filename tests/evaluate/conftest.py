@@ -42,6 +42,8 @@ class ToyObserver:
     shift: int = 0
     half_widths: np.ndarray = field(default_factory=lambda: np.array([0.1, 0.5, 1.0]))
     method: str = "toy"
+    ode: ca.Function | None = None
+    step_covered: bool = False
 
     @property
     def step(self) -> ca.Function:

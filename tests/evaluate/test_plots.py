@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.evaluate import ReportError, plot_errors, plot_run, plot_signal, plot_widths
-from obsynth.evaluate.thin import thin
+from obsynth.evaluate.plotting.layout import thin
 
 pytestmark = pytest.mark.usefixtures("no_window")
 

@@ -79,6 +79,7 @@ def test_feedback_through_a_direct_feedthrough_is_an_algebraic_loop():
 
     class Step:
         model, method, fault_delay, half_widths = plant, "toy", 0, None
+        ode, step_covered = None, False
         m, u, y = ca.SX.sym("m"), ca.SX.sym("u"), ca.SX.sym("y")
         none = ca.SX(0, 1)
         step = ca.Function(
@@ -113,6 +114,7 @@ def test_continuous_truth_is_integrated_and_marked():
 
     class Copy:
         method, fault_delay, half_widths = "copy", 0, None
+        ode, step_covered = None, False
         m, u, y = ca.SX.sym("m"), ca.SX.sym("u"), ca.SX.sym("y")
         none = ca.SX(0, 1)
         step = ca.Function(
@@ -248,6 +250,7 @@ def test_a_truth_that_is_no_number_any_more_is_refused_with_state_and_instant():
 
     class Blind:
         model, method, fault_delay, half_widths = plant, "blind", 0, None
+        ode, step_covered = None, False
         m, u, y = ca.SX.sym("m"), ca.SX(0, 1), ca.SX.sym("y")
         u = ca.SX.sym("u", 0)
         none = ca.SX(0, 1)

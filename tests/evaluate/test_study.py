@@ -6,17 +6,16 @@ from functools import partial
 
 import pytest
 
-from obsynth.evaluate import ReportError, SimulationError
-from obsynth.evaluate.folder import check_target, complete_folder
+from obsynth.codegen import FolderError
+from obsynth.codegen.folder import check_target, complete_folder
+from obsynth.evaluate import SimulationError
 from obsynth.evaluate.studies import printed
-from obsynth.evaluate.studies.quadruple_tank import ELLIPSOID, PEAK, quadruple_tank, shortened
+from obsynth.evaluate.studies.quadruple_tank import ELLIPSOID, PEAK, RUN, quadruple_tank, shortened
 
 
 @pytest.fixture(scope="module")
 def quick(base, given_peak):
     """The study with designs at hand and few vectors; everything else is as it ships."""
-    import obsynth.codegen
-
     module = sys.modules["obsynth.evaluate.studies.quadruple_tank"]
     genuine = module.BoundedErrorUIO
 
@@ -27,10 +26,10 @@ def quick(base, given_peak):
 
         return genuine(**options) if options.get("gamma") == printed.PRINTED_GAMMA else Known()
 
-    few = partial(obsynth.codegen.generate_c, vectors=100)
+    few = partial(module.generate_c, vectors=100)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "BoundedErrorUIO", method)
-        patch.setattr(obsynth.codegen, "generate_c", few)
+        patch.setattr(module, "generate_c", few)
         yield quadruple_tank
 
 
@@ -51,11 +50,11 @@ def study(quick, tmp_path_factory):
 def test_the_study_leaves_a_complete_folder(study):
     folder = study.folder
     present = {path.name for path in folder.iterdir()}
-    assert present == {"report.html", "design.json", "design_ellipsoid.json", "c", "run.json"}
+    assert present == {"report.html", "design.json", "design_ellipsoid.json", "c", "manifest.json"}
     assert list(folder.parent.iterdir()) == [folder]
     assert study.project.folder == folder / "c"
     assert (study.project.folder / "manifest.json").is_file()
-    manifest = json.loads((folder / "run.json").read_text())
+    manifest = json.loads((folder / "manifest.json").read_text())
     assert {"report.html", "c/manifest.json"} <= set(manifest["files"])
     import obsynth as ob
 
@@ -112,7 +111,7 @@ def test_highlights_come_from_the_results(study):
 
 def test_a_run_that_fails_or_is_interrupted_leaves_the_folder_as_it_was(quick, tmp_path):
     target = tmp_path / "out"
-    with complete_folder(target) as place:
+    with complete_folder(target, RUN) as place:
         (place / "report.html").write_text("an earlier run")
 
     def interrupt(stage, done):
@@ -129,27 +128,27 @@ def test_a_folder_with_anything_else_is_refused_before_the_work(quick, tmp_path)
     target = tmp_path / "thesis"
     target.mkdir()
     (target / "chapter.tex").write_text("")
-    with pytest.raises(ReportError, match=r"did not write \(chapter\.tex\)") as error:
+    with pytest.raises(FolderError, match=r"did not write \(chapter\.tex\)") as error:
         quick(target)
     assert error.value.files == ("chapter.tex",)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ReportError, match="is a file"):
-        check_target(tmp_path / "file")
+    with pytest.raises(FolderError, match="is a file"):
+        check_target(tmp_path / "file", RUN)
 
 
 def test_a_later_run_replaces_what_an_earlier_one_wrote_and_nothing_else(tmp_path):
     target = tmp_path / "out"
     for text in ("first", "second"):
-        with complete_folder(target) as place:
+        with complete_folder(target, RUN) as place:
             (place / "c").mkdir()
             (place / "c" / "a.c").write_text(text)
     assert (target / "c" / "a.c").read_text() == "second"
     (target / "notes.txt").write_text("mine")
-    with pytest.raises(ReportError, match="notes"), complete_folder(target):
+    with pytest.raises(FolderError, match="notes"), complete_folder(target, RUN):
         pass
     assert (target / "notes.txt").read_text() == "mine"
     (target / "notes.txt").unlink()
-    with pytest.raises(ReportError, match="late"), complete_folder(target):
+    with pytest.raises(FolderError, match="late"), complete_folder(target, RUN):
         (target / "late.txt").write_text("came while the run was on")
     assert (target / "late.txt").exists()
     assert list(tmp_path.iterdir()) == [target]

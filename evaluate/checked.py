@@ -1,15 +1,16 @@
-"""The signals of a scenario as checked arrays, and the assumptions that they do not keep."""
+"""What a simulation is given, checked: the scenario's signals and the observer's functions."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
+from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 WORDS: Mapping[str, str] = {
     "u": "inputs",
@@ -20,13 +21,15 @@ WORDS: Mapping[str, str] = {
 }
 """What a scenario calls each group of signals, in the order in which plants take them."""
 
+_INPUTS = ("memory", "u", "y")
 
-def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, Array]:
+
+def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, FloatArray]:
     """Return the scenario's signals as checked arrays of N + 1 samples; no u in a feedback."""
     if isinstance(seed, bool) or int(seed) != seed or seed < 0:
         raise SimulationError(f"seed={seed!r} is not a whole number from 0 on.", seed=seed)
     arrays: Mapping[str, Any] = scenario.arrays(model, int(seed))
-    fields: dict[str, Array] = {}
+    fields: dict[str, FloatArray] = {}
     for key, word in WORDS.items():
         names = model.names(key)
         value = arrays.get(key)
@@ -43,7 +46,7 @@ def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, Ar
     return fields
 
 
-def _checked(value: Any, shape: tuple[int, int], word: str, names: tuple[str, ...]) -> Array:
+def _checked(value: Any, shape: tuple[int, int], word: str, names: tuple[str, ...]) -> FloatArray:
     try:
         array = np.array(value, dtype=float, order="C")
     except (TypeError, ValueError) as error:
@@ -70,9 +73,9 @@ def _checked(value: Any, shape: tuple[int, int], word: str, names: tuple[str, ..
     return array
 
 
-def vector(value: Any, names: tuple[str, ...], word: str) -> Array:
+def vector(value: Any, names: tuple[str, ...], word: str) -> FloatArray:
     """Return a finite vector with one number for each name."""
-    row: Array = np.asarray(value, dtype=float)
+    row: FloatArray = np.asarray(value, dtype=float)
     if row.shape != (len(names),):
         raise SimulationError(
             f"{word} has shape {row.shape}; one number for each of {', '.join(names)} is needed.",
@@ -83,8 +86,8 @@ def vector(value: Any, names: tuple[str, ...], word: str) -> Array:
 
 
 def function_values(
-    function: Callable[[float], Any], points: Array, names: tuple[str, ...], word: str
-) -> Array:
+    function: Callable[[float], Any], points: FloatArray, names: tuple[str, ...], word: str
+) -> FloatArray:
     """Return a function of the real-valued k at many points, one row for each."""
     rows = [np.ravel(np.asarray(function(k), dtype=float)) for k in points.tolist()]
     for k, row in zip(points, rows, strict=True):
@@ -95,7 +98,7 @@ def function_values(
                 field=word,
                 shape=row.shape,
             )
-    values: Array = np.array(rows)
+    values: FloatArray = np.array(rows)
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
         row_of, i = (int(v) for v in bad[0])
@@ -109,7 +112,7 @@ def function_values(
     return values
 
 
-def finite(values: Array, names: tuple[str, ...]) -> None:
+def finite(values: FloatArray, names: tuple[str, ...]) -> None:
     """Refuse a truth that is no number any more, with its first instant."""
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
@@ -124,7 +127,7 @@ def finite(values: Array, names: tuple[str, ...]) -> None:
 
 
 def broken_assumptions(
-    model: Plant, scenario: Scenario, fields: Mapping[str, Array]
+    model: Plant, scenario: Scenario, fields: Mapping[str, FloatArray]
 ) -> tuple[str, ...]:
     """Say which bounds of the observer's discrete model the scenario does not keep.
 
@@ -153,7 +156,9 @@ def broken_assumptions(
     return tuple(said)
 
 
-def _outside_box(values: Array, box: Array, names: tuple[str, ...], word: str) -> list[str]:
+def _outside_box(
+    values: FloatArray, box: FloatArray, names: tuple[str, ...], word: str
+) -> list[str]:
     said = []
     for i, name in enumerate(names):
         out = np.flatnonzero((values[:, i] < box[i, 0]) | (values[:, i] > box[i, 1]))
@@ -164,3 +169,71 @@ def _outside_box(values: Array, box: Array, names: tuple[str, ...], word: str) -
                 f"instants, first k = {k}: {values[k, i]:.6g}"
             )
     return said
+
+
+def step_function(observer: Observer | FaultDetector, model: Plant) -> ca.Function:
+    """Return the observer's step once its inputs and outputs are known to fit the model."""
+    step: ca.Function = observer.step
+    scheduling_columns(step, model, "step")
+    # CasADi accepts one name on both sides only on request, so the first output is left free.
+    if tuple(step.name_out())[1:] not in (STEP_OUTPUTS[1:], (*STEP_OUTPUTS[1:], ALARM_OUTPUT)):
+        raise SimulationError(
+            f"the observer's step returns ({', '.join(step.name_out())}); "
+            f"({', '.join(STEP_OUTPUTS)}[, {ALARM_OUTPUT}]) is needed.",
+            given=tuple(step.name_out()),
+        )
+    return step
+
+
+def scheduling_columns(function: ca.Function, model: Plant, word: str) -> list[int]:
+    """Return which scheduling signals step or ode reads; refuse inputs that do not fit."""
+    given = tuple(function.name_in())
+    if given[:3] != _INPUTS or given[3:] not in ((), ("theta",)):
+        raise SimulationError(
+            f"the observer's {word} takes ({', '.join(given)}); (memory, u, y[, theta]) is needed.",
+            given=given,
+        )
+    measured = [i for i, signal in enumerate(model.rho) if signal.measured]
+    columns = measured if len(given) == 4 else []
+    counts = {"u": len(model.u), "y": len(model.output_names), "theta": len(columns)}
+    for i, name in enumerate(given[1:], start=1):
+        if function.numel_in(i) != counts[name]:
+            raise SimulationError(
+                f"the observer's {word} takes {function.numel_in(i)} numbers as {name}; the model "
+                f"has {counts[name]}.",
+                field=name,
+            )
+    return columns
+
+
+def first_memory(
+    observer: Observer | FaultDetector, scenario: Scenario, y0: FloatArray, size: int
+) -> FloatArray:
+    """Return what the observer remembers before the first step."""
+    memory: FloatArray = np.asarray(
+        observer.memory0(
+            scenario.guess, x_range=scenario.x_range, f_range=scenario.f_range, y0=y0.copy()
+        ),
+        dtype=float,
+    )
+    if memory.shape != (size,):
+        raise SimulationError(
+            f"the observer's memory0 has shape {memory.shape}; its step takes {size} numbers.",
+            field="memory0",
+        )
+    return memory
+
+
+def refuse_algebraic_loop(scenario: Scenario, plant: Plant) -> None:
+    """Refuse a feedback (k, y) where y depends on the inputs of the same instant."""
+    pattern: Any = np.array(ca.DM(plant.function().sparsity_jac(1, 1)), dtype=bool)
+    if pattern.any():
+        row, column = (int(v) for v in np.argwhere(pattern)[0])
+        name = plant.names("u")[column]
+        raise SimulationError(
+            f"the inputs of scenario {scenario.name!r} are a function of (k, y), but output "
+            f"{plant.output_names[row]} depends on {name} at the same instant: that is an "
+            "algebraic loop. Give the inputs as an array or a function of k.",
+            output=plant.output_names[row],
+            symbol=name,
+        )

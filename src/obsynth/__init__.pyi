@@ -1,0 +1,52 @@
+# The one list of public names: __init__.py loads them from here, type checkers read it.
+from .codegen import CProject as CProject
+from .codegen import generate_c as generate_c
+from .derive import Equilibrium as Equilibrium
+from .derive import JacobianBounds as JacobianBounds
+from .derive import Split as Split
+from .derive import StructureError as StructureError
+from .derive import UnboundedError as UnboundedError
+from .derive import analyse as analyse
+from .derive import discretisation_remainder as discretisation_remainder
+from .derive import equilibrium as equilibrium
+from .derive import excitation as excitation
+from .derive import fault_isolability as fault_isolability
+from .derive import jacobian_bounds as jacobian_bounds
+from .derive import lipschitz as lipschitz
+from .derive import majorant as majorant
+from .derive import qpv as qpv
+from .derive import quasi_lpv as quasi_lpv
+from .derive import split as split
+from .designs import BoundedErrorUIO as BoundedErrorUIO
+from .designs import Certificate as Certificate
+from .designs import CertificateError as CertificateError
+from .designs import Ellipsoid as Ellipsoid
+from .designs import FaultDetector as FaultDetector
+from .designs import HinfUIO as HinfUIO
+from .designs import InfeasibleDesign as InfeasibleDesign
+from .designs import IntervalObserver as IntervalObserver
+from .designs import Observer as Observer
+from .designs import QPVObserver as QPVObserver
+from .designs import SetAdaptiveObserver as SetAdaptiveObserver
+from .designs import load as load
+from .designs import worst_case as worst_case
+from .evaluate import Run as Run
+from .evaluate import SimulationError as SimulationError
+from .evaluate import Table as Table
+from .evaluate import coverage_table as coverage_table
+from .evaluate import plot_alarms as plot_alarms
+from .evaluate import plot_errors as plot_errors
+from .evaluate import plot_run as plot_run
+from .evaluate import plot_signal as plot_signal
+from .evaluate import plot_widths as plot_widths
+from .evaluate import report as report
+from .evaluate import simulate as simulate
+from .symbolic import ObsynthError as ObsynthError
+from .symbolic import Plant as Plant
+from .symbolic import PlantError as PlantError
+from .symbolic import Scenario as Scenario
+from .symbolic import plants as plants
+from .symbolic import scenarios as scenarios
+
+__version__: str
+__all__: list[str]
