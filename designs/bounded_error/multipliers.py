@@ -13,15 +13,16 @@ from obsynth.designs.bounded_error.error_system import ModelData
 from obsynth.designs.bounded_error.infeasibility import find_fixed_point
 from obsynth.designs.bounded_error.lmis import multiplier_block
 from obsynth.designs.bounded_error.synthesis import (
+    FLOOR,
+    GAP,
     MARGIN,
     EllipsoidSolution,
     Objective,
     largest_feasible,
     set_objective,
-    solve_reliably,
 )
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, symmetric
+from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, solve_reliably, symmetric
 from obsynth.symbolic.arrays import FloatArray
 
 MOST_ENTRIES = 12
@@ -131,7 +132,7 @@ def synthesise_multipliers(
     p = sum(data.sizes[:2])
     scale = np.ones(p) if scale is None else scale
     problem = multiplier_problem(data, gamma, noise, objective, weights, form, scale)
-    solution = solve_reliably(problem)
+    solution = solve_reliably(problem, floor=FLOOR, gap=GAP)
     gain = np.linalg.solve(solution["P"], solution["H"]) * scale[:, None]
     P = gamma * solution["P"] / np.outer(scale, scale)
     return EllipsoidSolution(gain, 0.5 * (P + P.T), gamma, noise)

@@ -15,15 +15,13 @@ from obsynth.designs.lmi import (
     Affine,
     Margin,
     Problem,
-    Solution,
     bisect_feasible,
     diagonal,
     full,
     largest_margin,
     search_line,
     search_log_convex,
-    solve_lazily,
-    solve_with_retries,
+    solve_reliably,
     symmetric,
     symmetric_block,
     trace,
@@ -36,6 +34,7 @@ OBJECTIVES: tuple[Objective, ...] = ("trace_inverse", "log_det", "lambda_min", "
 # Room between the solver's answer and the boundary, relative to blocks scaled to about one:
 # large against the solver's tolerance, small against the digits anybody reads.
 MARGIN = 1e-7
+FLOOR = -0.5 * MARGIN
 GAP = 1e-5
 LEAST_GAMMA = 1e-9
 # Shares of the largest gamma that are tried before the golden sections.
@@ -149,28 +148,13 @@ def synthesise(
     if np.linalg.eigvalsh(rough["P"])[0] > 0:
         scale = 2.0 ** np.round(0.5 * np.log2(np.diag(np.linalg.inv(rough["P"]))))
     problem = design_problem(system, gamma, noise, objective, weights, scale, gain)
-    solution = solve_reliably(problem)
+    solution = solve_reliably(problem, floor=FLOOR, gap=GAP)
     K = gain
     if K is None:
         K = np.linalg.solve(solution["P"], solution["H"]) * scale[:, None]
     P = gamma * solution["P"] / np.outer(scale, scale)
     Q_v = np.diag(solution["Q_v"]).copy() if noise is None else noise
     return EllipsoidSolution(K, 0.5 * (P + P.T), gamma, np.maximum(Q_v, 0.0))
-
-
-def solve_reliably(problem: Problem) -> Solution:
-    """Solve lazily over the vertices, with retries.
-
-    An answer short of the solver's full accuracy serves if its duality gap is
-    small: that it is feasible is proved afterwards in any case.
-    """
-
-    def solve(stated: Problem) -> Solution:
-        return solve_with_retries(
-            stated, second_solvers=(), good_enough=lambda found: 0 <= found.gap < GAP
-        )
-
-    return solve_lazily(problem, floor=-0.5 * MARGIN, solve=solve).solution
 
 
 def analyse_gain(

@@ -17,8 +17,7 @@ from obsynth.designs.lmi import (
     Solution,
     bisect_feasible,
     largest_margin,
-    solve_lazily,
-    solve_with_retries,
+    solve_reliably,
     symmetric,
 )
 from obsynth.symbolic.arrays import FloatArray
@@ -58,17 +57,6 @@ class Found:
             for name in ("P", "tau", "tau_decay", "printed")
         )
         return Found(*((1.0 - share) * a + share * b for a, b in pairs))
-
-
-def solve_reliably(problem: Problem) -> Solution:
-    """Solve lazily over the vertices, with retries; what it finds is proved afterwards."""
-
-    def solve(stated: Problem) -> Solution:
-        return solve_with_retries(
-            stated, second_solvers=(), good_enough=lambda found: 0 <= found.gap < GAP
-        )
-
-    return solve_lazily(problem, floor=-LEFT, solve=solve).solution
 
 
 def find_level(
@@ -132,7 +120,7 @@ def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] 
     troubles: list[SolverTrouble] = []
     for cap in caps:
         try:
-            return solve_reliably(state(cap))
+            return solve_reliably(state(cap), floor=-LEFT, gap=GAP)
         except SolverTrouble as trouble:
             troubles.append(trouble)
         except InfeasibleDesign:

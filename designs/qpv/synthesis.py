@@ -15,9 +15,8 @@ from obsynth.designs.lmi import (
     cap_gain,
     full,
     scalar,
-    solve_lazily,
+    solve_reliably,
     solve_with_margin,
-    solve_with_retries,
     split_common,
     symmetric,
     symmetric_block,
@@ -43,8 +42,9 @@ Norm = Literal["h2", "hinf"]
 # Part of the largest margin that phase 2 keeps; the objective loses about as much, relatively.
 _FRACTION = 1e-5
 
-# Smallest eigenvalue that a search tolerates, in units where the sets have size one.
+# What a search tolerates: the smallest eigenvalue, where the sets have size one, and the gap.
 _ROUGH = -1e-5
+_ROUGH_GAP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +179,8 @@ def _distinct(matrices: FloatArray) -> FloatArray:
 
 def rough_objective(setting: Setting, gains: FloatArray | None = None) -> float:
     """Return the optimum without margin and proof, for searches."""
-    found = solve_lazily(
-        state_problem(setting, gains),
-        floor=_ROUGH,
-        solve=lambda stated: solve_with_retries(
-            stated, second_solvers=(), good_enough=lambda s: s.gap < 1e-3
-        ),
-    )
-    return found.solution.objective
+    problem = state_problem(setting, gains)
+    return solve_reliably(problem, floor=_ROUGH, gap=_ROUGH_GAP).objective
 
 
 def solve(

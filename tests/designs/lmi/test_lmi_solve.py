@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import Problem, conic, solve, solve_with_retries, symmetric, trace
+from obsynth.designs.lmi import (
+    Problem,
+    conic,
+    solve,
+    solve_reliably,
+    solve_with_retries,
+    symmetric,
+    trace,
+)
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy
 
 
@@ -82,6 +90,16 @@ def test_an_answer_good_enough_ends_the_attempts(monkeypatch):
     stubborn(monkeypatch, 2)
     solution = solve_with_retries(problem(), good_enough=lambda solution: True)
     assert not solution.solved and len(solution.attempts) == 1
+
+
+@pytest.mark.parametrize("gap", [1e-12, np.inf])
+def test_a_small_duality_gap_decides_what_serves(monkeypatch, gap):
+    stubborn(monkeypatch, 2)
+    if np.isfinite(gap):
+        with pytest.raises(SolverTrouble):
+            solve_reliably(problem(), floor=-np.inf, gap=gap)
+    else:
+        assert not solve_reliably(problem(), floor=-np.inf, gap=gap).solved
 
 
 def infeasible():
