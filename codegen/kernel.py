@@ -1,15 +1,18 @@
-"""The arithmetic of one step as C: CasADi's generated code without CasADi's interface."""
+"""The arithmetic of one step: as C without CasADi's interface, and on CasADi's virtual machine."""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.names import c_number
 from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.symbolic.arrays import FloatArray
 
 STEP_INPUTS = ("memory", "u", "y", "theta")
 """Inputs of a step, in their order; the last one of scheduled observers only."""
@@ -196,3 +199,42 @@ def _enclose(function: ca.Function, prefix: str, body: str) -> tuple[str, tuple[
             parameters.append(f"{real} {name}[{function.numel_out(i)}]")
     head = ",\n    ".join(parameters)
     return f"static void {prefix}_kernel(\n    {head})\n{{\n{body}\n}}", tuple(arguments)
+
+
+def c_number(value: float) -> str:
+    """Return the shortest C literal of type double that is read back as the same number."""
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return repr(float(value))
+
+
+class Machine:
+    """A CasADi function of vectors as one of NumPy vectors, through buffers: ten times as fast.
+
+    function: inputs and outputs are vectors; structural zeros become zeros
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        # The function itself is kept as one call, so that nothing is simplified anew.
+        ports = [ca.MX.sym(f"i{i}", function.numel_in(i)) for i in range(function.n_in())]
+        outputs = [ca.densify(out) for out in function.call(ports, False, True)]
+        dense = ca.Function("dense", ports, outputs)
+        buffer: Any
+        buffer, self._run = dense.buffer()
+        self._arguments = [np.zeros(dense.numel_in(i)) for i in range(dense.n_in())]
+        self._results = [np.zeros(dense.numel_out(i)) for i in range(dense.n_out())]
+        for i, array in enumerate(self._arguments):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(self._results):
+            buffer.set_res(i, array.data)
+        # The buffer holds the addresses of the arrays for as long as it is called.
+        self._buffer = buffer
+
+    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
+        """Return the results as new vectors."""
+        for array, value in zip(self._arguments, arguments, strict=True):
+            array[:] = value
+        self._run()
+        return [result.copy() for result in self._results]

@@ -11,10 +11,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.description import Description, Port, midpoints, nominal_values
-from obsynth.codegen.kernel import Kernel
-from obsynth.codegen.machine import Machine
-from obsynth.codegen.names import c_comment, c_number
+from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
+from obsynth.codegen.kernel import Kernel, Machine, c_number
 from obsynth.codegen.vectors import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray

@@ -10,8 +10,7 @@ from obsynth.symbolic.scenario import Scenario
 from obsynth.symbolic.signals import Role, Signal
 from obsynth.symbolic.sxmodel import SxModel
 from obsynth.symbolic.tape import from_tape
-from obsynth.symbolic.text import TextError, read_text
-from obsynth.symbolic.text_writer import write_text
+from obsynth.symbolic.text import TextError, read_text, write_text
 
 __all__ = [
     "ObsynthError",

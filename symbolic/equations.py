@@ -15,6 +15,7 @@ from obsynth.symbolic.arguments import expand_names, per_symbol
 from obsynth.symbolic.convert import nearest_double
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
+from obsynth.symbolic.signals import Role, Signal
 from obsynth.symbolic.text import TextError, read_text, undeclared
 
 _PLAIN = (
@@ -214,3 +215,24 @@ def _float(number: sp.Number) -> float:
         return float(number)
     except OverflowError:
         return math.inf
+
+
+def insert_faults(
+    rows: Sequence[sp.Expr], outputs: Mapping[str, sp.Expr], signals: Sequence[Signal]
+) -> tuple[sp.Matrix, sp.Matrix]:
+    """Put additive faults into the equations.
+
+    Every input v with an actuator fault f becomes v + f, in the outputs too, since it is
+    what the actuator does; every output with a sensor fault becomes y + f.
+    """
+    inputs = {s.name: s.symbol for s in signals if s.role is Role.INPUT}
+    shift: dict[sp.Symbol, sp.Expr] = {}
+    sensor: dict[str, sp.Symbol] = {}
+    for signal in signals:
+        if signal.role is Role.ACTUATOR_FAULT:
+            shift[inputs[str(signal.of)]] = inputs[str(signal.of)] + signal.symbol
+        elif signal.role is Role.SENSOR_FAULT:
+            sensor[str(signal.of)] = signal.symbol
+    rhs = [row.xreplace(shift) for row in rows]
+    y = [row.xreplace(shift) + sensor.get(name, 0) for name, row in outputs.items()]
+    return sp.ImmutableMatrix(len(rhs), 1, rhs), sp.ImmutableMatrix(len(y), 1, y)

@@ -9,8 +9,7 @@ import sympy as sp
 from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal
-from obsynth.symbolic.text import read_text
-from obsynth.symbolic.text_writer import write_text
+from obsynth.symbolic.text import read_text, write_text
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant

@@ -1,4 +1,4 @@
-"""The signals of a plant, by name and by kind."""
+"""The signals of a plant, by name and by kind; what its faults add to."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic.arguments import exact_number, expand_names, make_signals
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.faults import check_targets, fault_units, read_targets
 from obsynth.symbolic.signals import KINDS, Role, Signal
 
 
@@ -76,11 +75,11 @@ class SignalTable:
         self, role: Role, names: Any, of: Any, outputs: Mapping[str, str], **keywords: Any
     ) -> tuple[sp.Symbol, ...]:
         """Declare faults that add to inputs or outputs, with the units of these."""
-        targets = read_targets(role, expand_names(names, str(role)), of)
+        targets = _read_targets(role, expand_names(names, str(role)), of)
         if keywords.get("unit") is None:
             inputs = {signal.name: signal.unit for signal in self.kind("u")}
             units = inputs if role is Role.ACTUATOR_FAULT else outputs
-            keywords["unit"] = fault_units(targets, units)
+            keywords["unit"] = [units.get(target, "") for target in targets]
         return self.declare(role, names, tuple(outputs), of=targets, **keywords)
 
     def add(self, signals: Sequence[Signal], outputs: Sequence[str] = ()) -> None:
@@ -97,3 +96,48 @@ class SignalTable:
             added[signal.name] = signal
         check_targets([*self.all, *signals], outputs or None)
         self._signals.update(added)
+
+
+def _read_targets(role: Role, names: Sequence[str], of: Any) -> list[str]:
+    """Read ``of=``: the name of one input or output for every fault."""
+    items = [of] if isinstance(of, str | sp.Symbol) else of
+    if not isinstance(items, Sequence) or not all(isinstance(i, str | sp.Symbol) for i in items):
+        raise PlantError(
+            f"{role} {names[0]}: of= names inputs or outputs, not {of!r}", symbol=names[0]
+        )
+    targets = [name for item in items for name in expand_names(str(item), f"{role}: of=")]
+    if len(targets) != len(names):
+        raise PlantError(
+            f"{role}: {len(names)} faults ({', '.join(names)}) for {len(targets)} signals in of= "
+            f"({', '.join(targets)})",
+            symbols=tuple(names),
+            of=tuple(targets),
+        )
+    return targets
+
+
+def check_targets(signals: Sequence[Signal], outputs: Sequence[str] | None) -> None:
+    """Refuse faults of what is not there, and two faults of the same signal."""
+    inputs = [s.name for s in signals if s.role is Role.INPUT]
+    known = {Role.ACTUATOR_FAULT: ("input", inputs), Role.SENSOR_FAULT: ("output", outputs)}
+    taken: dict[tuple[Role, str], str] = {}
+    for fault in signals:
+        if fault.role not in known:
+            continue
+        word, names = known[fault.role]
+        if names is not None and fault.of not in names:
+            raise PlantError(
+                f"{fault.role} {fault.name}: of={fault.of} is no {word}; {word}s are "
+                f"{', '.join(names) or 'none yet'}",
+                symbol=fault.name,
+                of=fault.of,
+            )
+        key = (fault.role, str(fault.of))
+        if key in taken:
+            raise PlantError(
+                f"{fault.role} {fault.name}: {fault.of} has the fault {taken[key]} already; "
+                "the two could not be told apart",
+                symbol=fault.name,
+                of=fault.of,
+            )
+        taken[key] = fault.name

@@ -27,7 +27,7 @@ from sympy.core.relational import Relational
 from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
 
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.functions import ALIASES, BY_NAME
+from obsynth.symbolic.functions import ALIASES, BY_CLASS, BY_NAME
 
 WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
 """Words of the language that cannot name a symbol."""
@@ -38,6 +38,7 @@ _TOKEN = re.compile(
     r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>]))"
 )
 _COMPARE = {"<": sp.Lt, "<=": sp.Le, ">": sp.Gt, ">=": sp.Ge, "==": sp.Eq, "!=": sp.Ne}
+_SIGNS = {relation: sign for sign, relation in _COMPARE.items()}
 _CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
 _DEEPEST = 100
 _LARGEST_BITS = 8192
@@ -80,9 +81,6 @@ def undeclared(name: str, declared: Mapping[str, object]) -> str:
     close = difflib.get_close_matches(name, declared, n=1, cutoff=0.5)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"the symbol {name} is not declared (declared: {', '.join(declared) or 'none'}){hint}"
-
-
-# -- reading ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -160,18 +158,20 @@ class _Reader:
             self._fail(f"more than {_DEEPEST} levels of signs, powers and parentheses")
 
     def _number(self, rule: Any) -> sp.Expr:
-        position = self._now.position
-        result = rule()
-        if isinstance(result, _CONDITIONS):
-            self._fail(f"the condition {result} stands where a number is needed", position)
-        return result
+        return self._as_number(self._now.position, rule())
+
+    def _as_number(self, position: int, value: sp.Basic) -> sp.Expr:
+        if isinstance(value, _CONDITIONS):
+            self._fail(f"the condition {value} stands where a number is needed", position)
+        return value
 
     def _truth(self, rule: Any) -> sp.Basic:
-        position = self._now.position
-        result = rule()
-        if not isinstance(result, _CONDITIONS):
-            self._fail(f"{result} stands where a condition is needed", position)
-        return result
+        return self._as_truth(self._now.position, rule())
+
+    def _as_truth(self, position: int, value: sp.Basic) -> sp.Basic:
+        if not isinstance(value, _CONDITIONS):
+            self._fail(f"{value} stands where a condition is needed", position)
+        return value
 
     def _condition(self) -> sp.Basic:
         self._deeper()
@@ -184,9 +184,7 @@ class _Reader:
         first = rule()
         if self._now.text != word:
             return first
-        if not isinstance(first, _CONDITIONS):
-            self._fail(f"{first} stands where a condition is needed", position)
-        parts = [first]
+        parts = [self._as_truth(position, first)]
         while self._take(word):
             parts.append(self._truth(rule))
         return join(*parts)
@@ -211,9 +209,7 @@ class _Reader:
         first = self._product(self._sign())
         if self._now.text not in ("+", "-"):
             return first
-        if isinstance(first, _CONDITIONS):
-            self._fail(f"the condition {first} stands where a number is needed", position)
-        terms = [first]
+        terms = [self._as_number(position, first)]
         while self._now.text in ("+", "-"):
             sign = self._sign()
             terms.append(self._number(lambda sign=sign: self._product(sign)))
@@ -231,9 +227,7 @@ class _Reader:
         first = self._factor()
         if self._now.text not in ("*", "/") and not factors:
             return first
-        if isinstance(first, _CONDITIONS):
-            self._fail(f"the condition {first} stands where a number is needed", position)
-        factors = [*factors, first]
+        factors = [*factors, self._as_number(position, first)]
         while operator := self._take("*", "/"):
             factor = self._number(self._factor)
             if operator.text == "/" and factor == 0:
@@ -337,3 +331,123 @@ class _Reader:
         if pairs[-1][1] != sp.true:
             self._fail("the last case of piecewise needs the condition True", token.position)
         return sp.Piecewise(*pairs)
+
+
+# How strongly the outermost operator of a text binds.
+_OR, _AND, _NOT, _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(8)
+
+
+def write_text(expression: sp.Basic) -> str:
+    """Write an expression so that `read_text` gives it back."""
+    return _write(expression, _OR)
+
+
+def _write(node: sp.Basic, level: int) -> str:
+    """Write a node, in parentheses when it binds more weakly than ``level``."""
+    text, own = _text(node)
+    return text if own >= level else f"({text})"
+
+
+def _text(node: sp.Basic) -> tuple[str, int]:
+    """Return the text of a node and the level of its outermost operator."""
+    if isinstance(node, sp.Symbol):
+        return str(node), _ATOM
+    if isinstance(node, sp.Number):
+        return _number_text(node)
+    if node in (sp.pi, sp.E):
+        return ("pi" if node == sp.pi else "exp(1)"), _ATOM
+    if isinstance(node, sp.Add):
+        return _add_text(node), _SUM
+    if isinstance(node, sp.Mul):
+        return _mul_text(node)
+    if isinstance(node, sp.Pow):
+        return _pow_text(node)
+    if isinstance(node, sp.Piecewise):
+        cases = [f"({_write(e, _OR)}, {_write(c, _OR)})" for e, c in node.args]
+        return f"piecewise({', '.join(cases)})", _ATOM
+    if isinstance(node, _CONDITIONS):
+        return _condition_text(node)
+    function = BY_CLASS.get(node.func)
+    if function is None:
+        raise PlantError(
+            f"the function {node.func.__name__} in {node} has no text form",
+            function=node.func.__name__,
+        )
+    arguments = list(node.args)
+    if isinstance(node, sp.Max | sp.Min):
+        arguments.sort(key=sp.default_sort_key)
+    if isinstance(node, sp.Heaviside) and arguments[1] == sp.Rational(1, 2):
+        arguments.pop()
+    return f"{function.name}({', '.join(_write(a, _OR) for a in arguments)})", _ATOM
+
+
+def _number_text(node: sp.Number) -> tuple[str, int]:
+    if isinstance(node, sp.Float):
+        text = repr(float(node))
+        if sp.Float(float(node)) != node or not text.lstrip("-")[0].isdigit():
+            raise PlantError(f"the number {node} is not a double", number=node)
+        return text, _SUM if text.startswith("-") else _ATOM
+    if not isinstance(node, sp.Rational) or not node.is_finite:
+        raise PlantError(f"{node} is not a finite real number", number=node)
+    if node < 0:
+        return str(node), _SUM
+    return str(node), _ATOM if isinstance(node, sp.Integer) else _PRODUCT
+
+
+def _add_text(node: sp.Add) -> str:
+    text = ""
+    for term in node.as_ordered_terms():
+        part = _text(term)[0]
+        if not text:
+            text = part
+        elif part.startswith("-"):
+            text += f" - {part[1:]}"
+        else:
+            text += f" + {part}"
+    return text
+
+
+def _mul_text(node: sp.Mul) -> tuple[str, int]:
+    top, bottom = [], []
+    negative = False
+    for factor in sorted(node.args, key=sp.default_sort_key):
+        if isinstance(factor, sp.Number):
+            negative = bool(factor < 0)
+            size = abs(factor)
+            if not isinstance(size, sp.Rational):
+                top.append(_write(size, _POWER))
+                continue
+            if size.p != 1:
+                top.append(str(size.p))
+            if size.q != 1:
+                bottom.append(str(size.q))
+        elif isinstance(factor, sp.Pow) and factor.exp.is_Rational and factor.exp < 0:
+            bottom.append(_write(1 / factor, _POWER))
+        else:
+            top.append(_write(factor, _POWER))
+    text = "*".join(top or ["1"]) + "".join(f"/{divisor}" for divisor in bottom)
+    return (f"-{text}", _SUM) if negative else (text, _PRODUCT)
+
+
+def _pow_text(node: sp.Pow) -> tuple[str, int]:
+    if node.exp == sp.Rational(1, 2):
+        return f"sqrt({_write(node.base, _OR)})", _ATOM
+    if node.exp.is_Rational and node.exp < 0:
+        return f"1/{_write(1 / node, _POWER)}", _PRODUCT
+    return f"{_write(node.base, _ATOM)}**{_write(node.exp, _ATOM)}", _POWER
+
+
+def _condition_text(node: sp.Basic) -> tuple[str, int]:
+    if isinstance(node, BooleanTrue | BooleanFalse):
+        return str(node), _ATOM
+    if isinstance(node, Relational):
+        left, right = _write(node.lhs, _SUM), _write(node.rhs, _SUM)
+        return f"{left} {_SIGNS[node.func]} {right}", _COMPARISON
+    arguments = sorted(node.args, key=sp.default_sort_key)
+    if isinstance(node, Not):
+        return f"not {_write(arguments[0], _COMPARISON)}", _NOT
+    if isinstance(node, And):
+        return " and ".join(_write(a, _NOT) for a in arguments), _AND
+    if isinstance(node, Or):
+        return " or ".join(_write(a, _AND) for a in arguments), _OR
+    raise PlantError(f"the condition {node} has no text form")

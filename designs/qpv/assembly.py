@@ -17,7 +17,7 @@ from obsynth.designs.qpv.record import METHOD, QPVDesign
 from obsynth.designs.qpv.schedule import FASTEST, fastest_mode, measured_schedule
 from obsynth.designs.qpv.step import build_ode, build_step, make_start, memory_layout
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.text_writer import write_text
+from obsynth.symbolic.text import write_text
 
 
 def to_record(design: QPVDesign) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from obsynth.designs.qpv.synthesis import (
 )
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-from obsynth.symbolic.text_writer import write_text
+from obsynth.symbolic.text import write_text
 
 if TYPE_CHECKING:
     from obsynth.designs.core.observer import Observer

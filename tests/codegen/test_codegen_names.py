@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.codegen import CodegenError
-from obsynth.codegen.names import c_comment, c_number, identifier, project_name, unique
+from obsynth.codegen.description import c_comment, identifier, project_name, unique
+from obsynth.codegen.kernel import c_number
 from obsynth.codegen.vectors import bits
 
 C_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*_?")

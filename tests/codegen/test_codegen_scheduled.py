@@ -23,7 +23,7 @@ from obsynth.codegen import (
     generate_c,
 )
 from obsynth.codegen.description import describe
-from obsynth.codegen.sequences import Drive
+from obsynth.codegen.vectors import Drive
 from obsynth.symbolic import Plant
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -15,8 +15,7 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_NAME, phi1, tanhc
 from obsynth.symbolic.parity import ParityError, check_parity, sample_box
 from obsynth.symbolic.tape import from_tape
-from obsynth.symbolic.text import read_text
-from obsynth.symbolic.text_writer import write_text
+from obsynth.symbolic.text import read_text, write_text
 
 NAMES = {name: sp.Symbol(name, real=True) for name in ("x", "y", "z")}
 X, Y, Z = NAMES.values()
