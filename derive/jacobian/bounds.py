@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
+from obsynth.derive.intervals.ranges import Ranges, Status
 from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name, find_dependences
 from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries, sample_entries
@@ -189,16 +189,7 @@ def jacobian_bounds(
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     refuse_jumps(model.check())
     entries = jacobian_entries(model, part, wrt)
-    ranges = bound_ranges(
-        entries.values,
-        entries.variables,
-        entries.box,
-        entries.constants,
-        entries.constant_box,
-        rtol=rtol,
-        effort=effort,
-        quotients=entries.quotients,
-    )
+    ranges = entries.search(rtol, effort)
     function = "dg" if part is not None else "df"
     _refuse(entries, ranges, f"{function}/d{'x' if wrt == 'states' else 'u'}")
     shape = (len(model.x), len(model.x) if wrt == "states" else len(model.u))

@@ -11,6 +11,7 @@ from obsynth.derive.algebra.common_factors import cancel_common_factors
 from obsynth.derive.algebra.products_to_sums import products_to_sums
 from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.rewriting.removable import remove_singularities
 from obsynth.derive.rigour.numbers import enclose_number, rational, substitute
@@ -56,6 +57,19 @@ class JacobianEntries:
     constant_box: list[tuple[float, float]]
     symbolic: dict[Entry, sp.Expr]
     quotients: Quotients | None
+
+    def search(self, rtol: float, effort: str, values: ca.SX | None = None) -> Ranges:
+        """Bound every entry over the box, or other functions of the same signals."""
+        return bound_ranges(
+            self.values if values is None else values,
+            self.variables,
+            self.box,
+            self.constants,
+            self.constant_box,
+            rtol=rtol,
+            effort=effort,
+            quotients=self.quotients,
+        )
 
 
 def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntries:

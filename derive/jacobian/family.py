@@ -141,6 +141,28 @@ class AffineFamily:
             scalars.append(min(max(float(matrix[tuple(places[0])]), lower), upper))
         return bool((np.abs(matrix - self.at(scalars)) <= self.radius).all())
 
+    def covers(self, other: "AffineFamily") -> bool:
+        """Whether a family with the same constant and directions holds another one.
+
+        Parameters
+        ----------
+        other : AffineFamily
+            The family that has to lie inside.
+
+        Returns
+        -------
+        bool
+            False too where the two do not vary in the same directions.
+        """
+        return bool(
+            self.directions.shape == other.directions.shape
+            and np.array_equal(self.directions, other.directions)
+            and np.array_equal(self.constant, other.constant)
+            and np.all(self.radius >= other.radius)
+            and np.all(self.ranges[:, 0] <= other.ranges[:, 0])
+            and np.all(self.ranges[:, 1] >= other.ranges[:, 1])
+        )
+
     def _reaches(self, matrix: Array) -> bool:
         """Look for scalars that reproduce a matrix where no entry defines them."""
         from scipy.optimize import linprog

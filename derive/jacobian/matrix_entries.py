@@ -84,10 +84,10 @@ class MatrixEntries:
             self.values, self.variables, self.box, self.constants, self.constant_box
         )
 
-    def ranges(self, rtol: float, effort: str, what: str = "entry") -> Ranges:
-        """Bound every entry over the box."""
-        found = bound_ranges(
-            self.values,
+    def search(self, rtol: float, effort: str, values: ca.SX | None = None) -> Ranges:
+        """Bound every entry, or other functions of the same signals; some may stay unbounded."""
+        return bound_ranges(
+            self.values if values is None else values,
             self.variables,
             self.box,
             self.constants,
@@ -95,6 +95,10 @@ class MatrixEntries:
             rtol=rtol,
             effort=effort,
         )
+
+    def ranges(self, rtol: float, effort: str, what: str = "entry") -> Ranges:
+        """Bound every entry over the box, or refuse."""
+        found = self.search(rtol, effort)
         if found.failures:
             failure = found.failures[0]
             i, j = self.places[failure.index]

@@ -15,7 +15,6 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive import StructureError
-from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import rational, substitute
 from obsynth.symbolic import Plant, Role, Signal
@@ -91,15 +90,7 @@ class Monotone:
         entries = matrix_entries(
             {(0, 0): expression}, self.plant, [piece.signal for piece in self.pieces]
         )
-        found = bound_ranges(
-            entries.values,
-            entries.variables,
-            entries.box,
-            entries.constants,
-            entries.constant_box,
-            rtol=1e-2,
-            effort="fast",
-        )
+        found = entries.search(1e-2, "fast")
         return float(found.lower[0]), float(found.upper[0])
 
     def _replace(self, row: sp.Expr) -> sp.Expr:

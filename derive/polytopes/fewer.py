@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.bounds import jacobian_bounds
 from obsynth.derive.jacobian.entries import jacobian_entries, sample_entries
 from obsynth.derive.jacobian.family import AffineFamily
@@ -162,16 +161,7 @@ def principal_family(
     axes, inverse = rotation / half, rotation.T * half[:, None]
     columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
     scalars = ca.vertcat(*[columns[place] for place in basis])
-    found = bound_ranges(
-        ca.mtimes(ca.DM(axes), scalars),
-        entries.variables,
-        entries.box,
-        entries.constants,
-        entries.constant_box,
-        rtol=rtol,
-        effort=effort,
-        quotients=entries.quotients,
-    )
+    found = entries.search(rtol, effort, ca.mtimes(ca.DM(axes), scalars))
     if not np.isfinite(found.lower + found.upper).all():
         raise UnboundedError("a principal coordinate has no finite bound over the box")
     # s = inverse c + defect s: the product of the two matrices is not quite the identity

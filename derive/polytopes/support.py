@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.dependence import entry_name
 from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries
@@ -338,16 +337,7 @@ def _group(
     directions = np.array(_PLANE if len(members) == 2 else _SPACE, dtype=float)
     single = np.abs(directions).sum(axis=1) == 1.0
     scaled = directions * weight
-    found = bound_ranges(
-        ca.mtimes(ca.DM(scaled[~single]), expressions),
-        entries.variables,
-        entries.box,
-        entries.constants,
-        entries.constant_box,
-        rtol=rtol,
-        effort=effort,
-        quotients=entries.quotients,
-    )
+    found = entries.search(rtol, effort, ca.mtimes(ca.DM(scaled[~single]), expressions))
     lower, upper = np.empty(len(directions)), np.empty(len(directions))
     lower[~single], upper[~single] = found.lower, found.upper
     for k in np.flatnonzero(single):

@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
@@ -169,15 +168,7 @@ def _effect(plant: Plant, index: int) -> FaultEffect:
     floor: float | None = None
     at: dict[str, float] = {}
     if np.isfinite(entries.box).all():
-        found = bound_ranges(
-            ca.sumsqr(entries.values),
-            entries.variables,
-            entries.box,
-            entries.constants,
-            entries.constant_box,
-            rtol=1e-8,
-            effort="fast",
-        )
+        found = entries.search(1e-8, "fast", ca.sumsqr(entries.values))
         if not found.failures:
             floor = float(np.nextafter(np.sqrt(max(float(found.lower[0]), 0.0)), 0.0))
             at = entries.named(found.points_lower[0])

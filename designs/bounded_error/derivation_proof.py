@@ -54,17 +54,7 @@ def prove_derivation(
 
 def covers(outer: AffineFamily, inner: AffineFamily) -> bool:
     """Whether one family with the same directions holds another."""
-    same = (
-        outer.directions.shape == inner.directions.shape
-        and np.array_equal(outer.directions, inner.directions)
-        and np.array_equal(outer.constant, inner.constant)
-    )
-    return bool(
-        same
-        and np.all(outer.radius >= inner.radius)
-        and np.all(outer.ranges[:, 0] <= inner.ranges[:, 0])
-        and np.all(outer.ranges[:, 1] >= inner.ranges[:, 1])
-    )
+    return outer.covers(inner)
 
 
 def _rounding_of_matrices(design: UioDesign, parts: Split) -> float:

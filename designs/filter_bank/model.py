@@ -11,7 +11,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive import Split, StructureError
-from obsynth.derive.forms.quasi_lpv.measured import Reading, readings
+from obsynth.derive.forms.measured import Reading, readings
 from obsynth.derive.jacobian.slope_signs import Monotone, exact_slope, with_ranges
 from obsynth.derive.rigour.numbers import round_number, substitute
 from obsynth.designs.core.errors import CertificateError

@@ -87,12 +87,6 @@ class VertexData:
 def read_vertices(family: AffineFamily, layout: QPVLayout, Cz: FloatArray) -> VertexData:
     """Take the blocks from a stacked family. Shapes: Cz (V, n_z, n)."""
     corners = QPVVertices(family, layout)
-    n = layout.states
-
-    def radius(name: str, outputs: bool = False) -> FloatArray:
-        rows = layout.measurement if outputs else layout.dynamics
-        return family.radius[rows, layout.columns(name)]
-
     return VertexData(
         A=corners.A,
         G=corners.G,
@@ -100,9 +94,9 @@ def read_vertices(family: AffineFamily, layout: QPVLayout, Cz: FloatArray) -> Ve
         H=corners.H,
         N=corners.N,
         Cz=Cz,
-        A_radius=radius("A"),
-        G_radius=radius("G"),
-        C_radius=radius("A", outputs=True),
-        H_radius=radius("G", outputs=True),
-        N_radius=radius("N").reshape(n, n, n),
+        A_radius=corners.radius("A"),
+        G_radius=corners.radius("G"),
+        C_radius=corners.radius("C"),
+        H_radius=corners.radius("H"),
+        N_radius=corners.radius("N"),
     )

@@ -16,10 +16,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from obsynth.derive.forms.measured import Known, readings
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
-from obsynth.derive.forms.quasi_lpv.known import Known
-from obsynth.derive.forms.quasi_lpv.measured import readings
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.rigour.numbers import substitute
 from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text

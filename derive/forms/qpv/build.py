@@ -4,13 +4,14 @@ from typing import Any, Literal
 
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import FormProof, prove_zero
+from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.qpv.augment import Augmented, augment_plant
 from obsynth.derive.forms.qpv.form import QPV
 from obsynth.derive.forms.qpv.layout import QPVLayout
 from obsynth.derive.forms.qpv.polynomial import read_coefficients
-from obsynth.derive.forms.quasi_lpv.scheduling import make_schedule
+from obsynth.derive.forms.scheduling import make_schedule
+from obsynth.derive.forms.varying import prove_rows
 from obsynth.symbolic.plant import Plant
 
 
@@ -84,7 +85,7 @@ def qpv(
     matrix = sp.ImmutableMatrix(matrix)
     proof = prove_quadratic(plant, layout, matrix)
     schedule = make_schedule(entries, model, rtol, effort)
-    return QPV(plant, form_of_N, matrix, layout, schedule, proof)
+    return QPV(matrix, layout, schedule, proof, plant, form_of_N)
 
 
 def prove_quadratic(plant: Augmented, layout: QPVLayout, matrix: sp.Matrix) -> FormProof:
@@ -95,18 +96,7 @@ def prove_quadratic(plant: Augmented, layout: QPVLayout, matrix: sp.Matrix) -> F
     rest = [s.symbol for group in (model.d, plant.faults, model.w) for s in group]
     column = [sp.Integer(1), *x, *(a * b for a in x for b in x), *(v * a for v in u for a in x)]
     column += [*u, *rest]
+    names = (*(s.name for s in plant.states), *model.output_names)
     kinds = ("u", "p", "rho", "d", "f", "w")
     signals = [*plant.states, *(s for k in kinds for s in getattr(model, k))]
-    box = {s.symbol: (s.lower, s.upper) for s in signals}
-    names = (*(s.name for s in plant.states), *model.output_names)
-    methods = []
-    for i, row in enumerate((*plant.rows, *plant.outputs)):
-        products = [matrix[i, j] * factor for j, factor in enumerate(column)]
-        method = prove_zero(row - sp.Add(*products), box)
-        if not method:
-            raise DerivationError(
-                f"the quadratic form of the row of {names[i]} is not the plant's {row}",
-                row=names[i],
-            )
-        methods.append(method)
-    return FormProof(names, tuple(methods))
+    return prove_rows(matrix, column, (*plant.rows, *plant.outputs), names, signals)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
-from obsynth.derive.forms.quasi_lpv.display import short
+from obsynth.derive.forms.text import short
 
 if TYPE_CHECKING:
     from obsynth.derive.forms.qpv.form import QPV

@@ -5,15 +5,18 @@ from typing import Any
 
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import FormProof, prove_zero
+from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.forms.quasi_lpv.centre import Centre, deviations, read_centre
+from obsynth.derive.forms.quasi_lpv.centre import (
+    Centre,
+    decide_signs,
+    deviations,
+    read_centre,
+)
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, Ranging
-from obsynth.derive.forms.quasi_lpv.kinks import decide_signs
-from obsynth.derive.forms.quasi_lpv.layout import Layout
+from obsynth.derive.forms.quasi_lpv.layout import LinearLayout
 from obsynth.derive.forms.quasi_lpv.options import Option
 from obsynth.derive.forms.quasi_lpv.ranking import choose
-from obsynth.derive.forms.quasi_lpv.scheduling import make_schedule
 from obsynth.derive.forms.quasi_lpv.terms import (
     Term,
     list_terms,
@@ -21,6 +24,8 @@ from obsynth.derive.forms.quasi_lpv.terms import (
     row_names,
     stacked_rows,
 )
+from obsynth.derive.forms.scheduling import make_schedule
+from obsynth.derive.forms.varying import prove_rows
 from obsynth.symbolic.plant import Plant
 
 
@@ -108,7 +113,7 @@ def quasi_lpv(
     terms, chosen, rankings, lifts = choose(
         model, rows, terms, point, alternatives, penalty, "fast"
     )
-    layout = Layout.of(model)
+    layout = LinearLayout.of(model)
     proxy = assemble(model, layout, point, terms, chosen)
     matrix = sp.ImmutableMatrix(proxy.xreplace({k.signal.symbol: k.meaning for k in lifts}))
     proof = prove_form(model, matrix, point, rows)
@@ -122,22 +127,13 @@ def quasi_lpv(
     names = row_names(model)
     left = tuple((names[t.row], t.expression.xreplace(back), t.reason) for t in terms if t.reason)
     schedule = make_schedule(places, model, rtol, effort, lifts)
-    return QuasiLPV(
-        model,
-        matrix,
-        layout,
-        point,
-        schedule,
-        rankings,
-        left,
-        proof,
-        Ranging(proxy, lifts, rtol, effort),
-    )
+    ranging = Ranging(proxy, lifts, rtol, effort)
+    return QuasiLPV(matrix, layout, schedule, proof, model, point, rankings, left, ranging)
 
 
 def assemble(
     model: Plant,
-    layout: Layout,
+    layout: LinearLayout,
     centre: Centre,
     terms: Sequence[Term],
     chosen: Sequence[Option],
@@ -157,19 +153,9 @@ def prove_form(
     model: Plant, matrix: sp.Matrix, centre: Centre, rows: Sequence[sp.Expr]
 ) -> FormProof:
     """Show row by row that a stacked matrix is the plant."""
-    kinds = ("x", "u", "p", "rho", "d", "f", "w")
-    box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
     back = deviations(model, centre)
     signals = [s.symbol for kind in "xudfw" for s in getattr(model, kind)]
     column = [*(back.get(s, s) for s in signals), sp.Integer(1)]
-    names = row_names(model)
-    methods = []
-    for i, row in enumerate(rows):
-        products = [matrix[i, j] * factor for j, factor in enumerate(column)]
-        method = prove_zero(row - sp.Add(*products), box)
-        if not method:
-            raise DerivationError(
-                f"the form of the row of {names[i]} is not the plant's {row}", row=names[i]
-            )
-        methods.append(method)
-    return FormProof(names, tuple(methods))
+    kinds = ("x", "u", "p", "rho", "d", "f", "w")
+    every = [s for kind in kinds for s in getattr(model, kind)]
+    return prove_rows(matrix, column, rows, row_names(model), every)

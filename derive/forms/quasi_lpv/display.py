@@ -5,31 +5,17 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from obsynth.derive.forms.text import short
+
 if TYPE_CHECKING:
     from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 
-
-_DIGITS = 6
 _LONGEST = 60
-_LONG = 10**6
-
-
-def short(expression: sp.Expr) -> sp.Expr:
-    """Write the numbers of an expression with six digits, small integers and fractions as is."""
-    if expression.is_number:
-        plain = expression.is_Rational and abs(expression.p) < _LONG and expression.q < 1000
-        return expression if plain else sp.Float(expression.evalf(_DIGITS), _DIGITS)
-    if expression.is_Pow:
-        exponent = expression.exp if expression.exp.is_Rational else short(expression.exp)
-        return sp.Pow(short(expression.base), exponent, evaluate=expression.base.is_Symbol)
-    if not expression.args:
-        return expression
-    if expression.is_Mul or expression.is_Add:
-        numbers = [a for a in expression.args if a.is_number]
-        rest = [short(a) for a in expression.args if not a.is_number]
-        joined = [short(expression.func(*numbers))] if numbers else []
-        return expression.func(*joined, *rest)
-    return expression.func(*[short(a) if isinstance(a, sp.Expr) else a for a in expression.args])
+UNMEASURED_NOTE = (
+    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
+    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
+    "for every value (vertices, interval)."
+)
 
 
 def form_text(form: "QuasiLPV") -> str:
@@ -59,8 +45,6 @@ def form_text(form: "QuasiLPV") -> str:
 
 def notes(form: "QuasiLPV") -> list[str]:
     """List what a user has to know about a form: choices, terms left over, measurement, proof."""
-    from obsynth.derive.forms.quasi_lpv.form import UNMEASURED_NOTE
-
     result = []
     for ranking in form.ranking:
         if ranking.total > 1:

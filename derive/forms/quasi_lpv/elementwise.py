@@ -13,8 +13,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.forms.quasi_lpv.known import Known
-from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.forms.measured import Known
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import rational
 from obsynth.symbolic.plant import Plant
@@ -151,15 +150,7 @@ class _Bounder:
         if not wanted:
             return result
         slopes = ca.vertcat(*[jacobian.nz[n] for n, _, _ in wanted])
-        found = bound_ranges(
-            slopes,
-            entries.variables,
-            entries.box,
-            entries.constants,
-            entries.constant_box,
-            rtol=_RTOL,
-            effort=_EFFORT,
-        )
+        found = entries.search(_RTOL, _EFFORT, slopes)
         for position, (_, r, c) in enumerate(wanted):
             k = entries.places[r][1]
             signs = result[k]

@@ -5,35 +5,23 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import sympy as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from obsynth.derive.algebra.zero_test import FormProof
-from obsynth.derive.errors import StructureError
+from obsynth.derive.forms.measured import read_measured
 from obsynth.derive.forms.quasi_lpv.centre import Centre
 from obsynth.derive.forms.quasi_lpv.display import form_html, form_latex, form_text
 from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, make_interval_form
-from obsynth.derive.forms.quasi_lpv.known import read_measured
-from obsynth.derive.forms.quasi_lpv.layout import Layout
 from obsynth.derive.forms.quasi_lpv.polytopic import (
     CentredForm,
     PolytopicForm,
     centre_form,
-    make_polytope,
 )
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
-from obsynth.derive.forms.quasi_lpv.scheduling import AffineSchedule, SchedulingVariable
-from obsynth.derive.forms.quasi_lpv.widths import Lift
-from obsynth.derive.rigour.numbers import round_number
+from obsynth.derive.forms.scheduling import Lift, SchedulingVariable
+from obsynth.derive.forms.varying import VaryingForm, casadi_elements
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
-
-UNMEASURED_NOTE = (
-    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
-    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
-    "for every value (vertices, interval)."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +41,7 @@ class Ranging:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class QuasiLPV:
+class QuasiLPV(VaryingForm):
     """x+ = A(rho) (x - x_c) + B(rho) (u - u_c) + D d + B_f f + W1 w + offset, and the outputs.
 
     For a continuous plant x+ stands for the time derivative; x_c = 0 and u_c = 0 by default. The
@@ -61,22 +49,22 @@ class QuasiLPV:
 
     Attributes
     ----------
-    model : Plant
-        The plant.
     matrix : sympy.Matrix, shape (n + m, n + n_u + n_d + n_f + n_w + 1)
         All blocks in one matrix, exact, as functions of the plant's signals.
-    layout : Layout
+    layout : LinearLayout
         Where the blocks are; see `block`.
-    centre : Centre
-        The point (x_c, u_c) about which deviations are taken.
     schedule : AffineSchedule
         The same matrix, affine in the scheduling variables.
+    proof : FormProof
+        That the form is the plant.
+    model : Plant
+        The plant.
+    centre : Centre
+        The point (x_c, u_c) about which deviations are taken.
     ranking : tuple of RowRanking
         The ways to write every row, the chosen one first.
     unfactored : tuple of (str, sympy.Expr, str)
         Terms that stay in the offset although they vary: row, term, reason.
-    proof : FormProof
-        That the form is the plant.
     ranging : Ranging
         How ranges of entries are found.
 
@@ -88,56 +76,15 @@ class QuasiLPV:
     """
 
     model: Plant
-    matrix: sp.Matrix
-    layout: Layout
     centre: Centre
-    schedule: AffineSchedule
     ranking: tuple[RowRanking, ...]
     unfactored: tuple[tuple[str, sp.Expr, str], ...]
-    proof: FormProof
     ranging: Ranging
-
-    def block(self, name: str) -> sp.Matrix:
-        """Return a block of the form, exactly.
-
-        Parameters
-        ----------
-        name : str
-            ``"A"``, ``"B"``, ``"D"``, ``"B_f"``, ``"W1"``, ``"offset"``, ``"C"``,
-            ``"feedthrough"``, ``"D_y"``, ``"D_f"``, ``"W2"`` or ``"output_offset"``.
-
-        Returns
-        -------
-        sympy.Matrix
-            As a function of the plant's signals.
-        """
-        rows, columns = self.layout.place(name)
-        return self.matrix[rows, columns]
-
-    @property
-    def A(self) -> sp.Matrix:
-        """State matrix A(rho), shape (n, n)."""
-        return self.block("A")
-
-    @property
-    def B(self) -> sp.Matrix:
-        """Input matrix B(rho), shape (n, n_u)."""
-        return self.block("B")
-
-    @property
-    def C(self) -> sp.Matrix:
-        """Output matrix, shape (m, n)."""
-        return self.block("C")
 
     @property
     def offset(self) -> sp.Matrix:
         """What is left of the dynamics at the centre, shape (n, 1)."""
         return self.block("offset")
-
-    @property
-    def scheduling(self) -> tuple[SchedulingVariable, ...]:
-        """The scheduling variables with their ranges."""
-        return self.schedule.variables
 
     @property
     def unmeasured(self) -> tuple[SchedulingVariable, ...]:
@@ -148,48 +95,6 @@ class QuasiLPV:
     def scheduled(self) -> sp.Matrix:
         """All blocks, affine in the symbols of the scheduling variables."""
         return sp.ImmutableMatrix(self.schedule.matrix(self.layout.shape))
-
-    def constant(self, name: str) -> NDArray[np.float64]:
-        """Return a block that does not vary as doubles.
-
-        Parameters
-        ----------
-        name : str
-            As for `block`.
-
-        Returns
-        -------
-        ndarray
-            The nearest doubles.
-
-        Raises
-        ------
-        StructureError
-            An entry varies; row, column and signals are named.
-
-        Examples
-        --------
-        >>> from obsynth.derive import quasi_lpv
-        >>> from obsynth.symbolic.plants import quadruple_tank
-        >>> quasi_lpv(quadruple_tank()).constant("C")[2].tolist()
-        [0.0, 0.0, 1.0, 0.0]
-        """
-        block = self.block(name)
-        values = np.zeros(block.shape)
-        for i in range(block.rows):
-            for j in range(block.cols):
-                entry = block[i, j]
-                if entry.free_symbols:
-                    signals = ", ".join(sorted(map(str, entry.free_symbols)))
-                    raise StructureError(
-                        f"{name}[{i + 1},{j + 1}] = {entry} varies with {signals}; a constant "
-                        f"{name} is needed here",
-                        entry=(i, j),
-                        symbols=tuple(sorted(map(str, entry.free_symbols))),
-                        condition="constant block",
-                    )
-                values[i, j] = round_number(entry)[0]
-        return values
 
     def vertices(self) -> PolytopicForm:
         """Polytopic form: vertex matrices over the ranges of the scheduling variables.
@@ -212,7 +117,8 @@ class QuasiLPV:
         >>> form.A.shape, form.exact
         ((16, 4, 4), True)
         """
-        return make_polytope(self.schedule, self.layout)
+        family = self.schedule.family(self.layout.shape)
+        return PolytopicForm(family, self.layout, dict(self.schedule.methods))
 
     def centred(self, nominal: ArrayLike | None = None) -> CentredForm:
         """Nominal matrices plus a remainder, for interval observers.
@@ -289,13 +195,8 @@ class QuasiLPV:
         casadi.Function
             (x, u, p, rho, d, f, w) -> (A, B, offset, C).
         """
-        kinds = ("x", "u", "p", "rho", "d", "f", "w")
-        columns, table = [], {}
-        for kind in kinds:
-            elements = [ca.SX.sym(name) for name in self.model.names(kind)]
-            columns.append(ca.vertcat(*elements) if elements else ca.SX(0, 1))
-            signals = getattr(self.model, kind)
-            table.update({s.symbol: e for s, e in zip(signals, elements, strict=True)})
+        kinds, sx = ("x", "u", "p", "rho", "d", "f", "w"), self.model.sx()
+        columns, table = [getattr(sx, kind) for kind in kinds], casadi_elements(self.model)
         names = ("A", "B", "offset", "C")
         values = []
         for name in names:

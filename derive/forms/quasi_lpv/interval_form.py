@@ -9,9 +9,9 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive.errors import DerivationError
+from obsynth.derive.forms.measured import Known
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
-from obsynth.derive.forms.quasi_lpv.known import Known
-from obsynth.derive.forms.quasi_lpv.widths import Lift
+from obsynth.derive.forms.scheduling import Lift
 from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.ranges import bound_ranges

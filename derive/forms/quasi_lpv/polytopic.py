@@ -1,23 +1,20 @@
 """Polytopic and centred versions of a linear form whose matrices are affine in scalars."""
 
 from dataclasses import dataclass, replace
+from html import escape
 
 import numpy as np
-import sympy as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.forms.quasi_lpv.layout import Layout
-from obsynth.derive.forms.quasi_lpv.scheduling import AffineSchedule
-from obsynth.derive.jacobian.dependence import AffineDependence
-from obsynth.derive.jacobian.family import AffineFamily, build_family
+from obsynth.derive.errors import DerivationError
+from obsynth.derive.forms.varying import Vertices
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
-class PolytopicForm:
+class PolytopicForm(Vertices):
     """Vertex matrices whose convex hull holds the matrices of a form at every point of the box.
 
     Attributes
@@ -37,49 +34,7 @@ class PolytopicForm:
     rounding costs.
     """
 
-    family: AffineFamily
-    layout: Layout
     affinity: dict[tuple[int, int], str]
-
-    @property
-    def exact(self) -> bool:
-        """True for the hull itself, False for an outer polytope."""
-        return self.family.exact
-
-    @property
-    def count(self) -> int:
-        """Number of vertices."""
-        return self.family.vertex_count
-
-    def block(self, name: str) -> Array:
-        """Vertices of a block.
-
-        Parameters
-        ----------
-        name : str
-            ``"A"``, ``"B"``, ``"offset"``, ``"C"``, ...
-
-        Returns
-        -------
-        ndarray, shape (N, rows, columns)
-            One matrix per vertex.
-        """
-        rows, columns = self.layout.place(name)
-        return self.family.vertices()[:, rows, columns]
-
-    def radius(self, name: str) -> Array:
-        """Elementwise bound of the rounding of a block, shape (rows, columns)."""
-        return self.family.radius[self.layout.place(name)]
-
-    @property
-    def A(self) -> Array:
-        """Vertices of A, shape (N, n, n)."""
-        return self.block("A")
-
-    @property
-    def B(self) -> Array:
-        """Vertices of B, shape (N, n, n_u)."""
-        return self.block("B")
 
     def __str__(self) -> str:
         kind = "exact" if self.exact else "outer"
@@ -88,8 +43,6 @@ class PolytopicForm:
         return f"{self.count} vertices ({kind}) over {scalars}; affine dependence proved ({ways})"
 
     def _repr_html_(self) -> str:
-        from html import escape
-
         rows = "".join(
             f"<tr><td>{escape(label)}</td><td>{low:.8g}</td><td>{high:.8g}</td></tr>"
             for label, (low, high) in zip(self.family.labels, self.family.ranges, strict=True)
@@ -118,16 +71,16 @@ class CentredForm:
         Whether the vertices are those of the hull itself.
     """
 
-    A: Array
-    B: Array
-    A_vertices: Array
-    B_vertices: Array
-    A_lower: Array
-    A_upper: Array
-    B_lower: Array
-    B_upper: Array
-    A_radius: Array
-    B_radius: Array
+    A: FloatArray
+    B: FloatArray
+    A_vertices: FloatArray
+    B_vertices: FloatArray
+    A_lower: FloatArray
+    A_upper: FloatArray
+    B_lower: FloatArray
+    B_upper: FloatArray
+    A_radius: FloatArray
+    B_radius: FloatArray
     exact: bool
 
     def __str__(self) -> str:
@@ -137,55 +90,6 @@ class CentredForm:
             f"{float(width.max(initial=0.0)):.6g}, "
             f"{len(self.A_vertices)} vertices ({'exact' if self.exact else 'outer'})"
         )
-
-
-def make_polytope(schedule: AffineSchedule, layout: Layout) -> PolytopicForm:
-    """Turn an affine schedule into vertices."""
-    return PolytopicForm(family_of(schedule, layout.shape), layout, dict(schedule.methods))
-
-
-def family_of(schedule: AffineSchedule, shape: tuple[int, int]) -> AffineFamily:
-    """Round an affine schedule to a family of matrices. Shapes: shape (int, int)."""
-    for variable in schedule.variables:
-        if not (np.isfinite(variable.lower) and np.isfinite(variable.upper)):
-            raise UnboundedError(
-                f"the scheduling variable {variable.symbol} = {variable.expression} has no finite "
-                f"range over the box; give {', '.join(variable.signals)} a range that keeps away "
-                "from its singularity, or choose another centre= or another factorisation "
-                "with prefer=",
-                entries=(str(variable.symbol),),
-                operation=str(variable.expression),
-                sub_box={},
-            )
-    # the variables stand in a row of their own below the matrix, as entries that define scalars
-    rows, columns = shape
-    basis = [(rows, k) for k in range(len(schedule.variables))]
-    dependences = [
-        AffineDependence(
-            place,
-            {basis[k]: coefficient for k, coefficient in terms.items()},
-            constant,
-            schedule.methods.get(place, "constant"),
-            (),
-        )
-        for place, (constant, terms) in schedule.entries.items()
-    ]
-    ranges = {basis[k]: (v.lower, v.upper) for k, v in enumerate(schedule.variables)}
-    supports = {basis[k]: v.signals for k, v in enumerate(schedule.variables)}
-    wide = max(columns, len(basis))
-    family = build_family((rows + 1, wide), basis, dependences, ranges, supports)
-    return replace(
-        family,
-        constant=family.constant[:rows, :columns],
-        directions=family.directions[:, :rows, :columns],
-        radius=family.radius[:rows, :columns],
-        labels=tuple(_label(v.symbol, v.expression) for v in schedule.variables),
-        exact=schedule.exact,
-    )
-
-
-def _label(symbol: sp.Symbol, expression: sp.Expr) -> str:
-    return str(symbol) if symbol == expression else f"{symbol} = {sp.sstr(expression)}"
 
 
 def centre_form(polytope: PolytopicForm, nominal: ArrayLike | None = None) -> CentredForm:

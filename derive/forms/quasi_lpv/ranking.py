@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.forms.measured import known_signals
 from obsynth.derive.forms.quasi_lpv.centre import Centre, deviations
-from obsynth.derive.forms.quasi_lpv.display import short
-from obsynth.derive.forms.quasi_lpv.measured import known_signals
 from obsynth.derive.forms.quasi_lpv.options import Option, kept
 from obsynth.derive.forms.quasi_lpv.terms import Term, row_names
-from obsynth.derive.forms.quasi_lpv.widths import Lift, Widths
+from obsynth.derive.forms.quasi_lpv.widths import Widths
+from obsynth.derive.forms.scheduling import Lift
+from obsynth.derive.forms.text import short
 from obsynth.symbolic.plant import Plant
 
 Combination = tuple[int, ...]

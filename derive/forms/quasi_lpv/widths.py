@@ -1,13 +1,13 @@
 """Guaranteed ranges of coefficients, directly or as means of derivatives."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import sympy as sp
 
 from obsynth.derive.forms.quasi_lpv.options import Share
-from obsynth.derive.intervals.ranges import bound_ranges
+from obsynth.derive.forms.scheduling import Lift
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.symbolic.functions import phi1, tanhc
 from obsynth.symbolic.plant import Plant
@@ -17,18 +17,6 @@ _RTOL = 1e-2
 _QUOTIENTS = (sp.sinc, phi1, tanhc)
 _LONG = 150
 _MANY = 2
-
-
-@dataclass(frozen=True, eq=False)
-class Lift:
-    """A secant that is bounded through the derivative whose mean it is.
-
-    signal: A symbol with the range of the derivative
-    meaning: the secant, in the signals of the plant
-    """
-
-    signal: Signal
-    meaning: sp.Expr
 
 
 class Widths:
@@ -49,15 +37,7 @@ class Widths:
         """Bound expressions in deviations from the centre."""
         places = {(0, k): c.xreplace(self.back) for k, c in enumerate(expressions)}
         entries = matrix_entries(places, self.model, [lift.signal for lift in self.lifts])
-        found = bound_ranges(
-            entries.values,
-            entries.variables,
-            entries.box,
-            entries.constants,
-            entries.constant_box,
-            rtol=_RTOL,
-            effort=self.effort,
-        )
+        found = entries.search(_RTOL, self.effort)
         result = [(0.0, 0.0)] * len(expressions)
         for k, (_, column) in enumerate(entries.places):
             result[column] = (float(found.lower[k]), float(found.upper[k]))

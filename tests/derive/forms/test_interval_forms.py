@@ -8,11 +8,10 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, UnboundedError
+from obsynth.derive.forms.measured import read_measured, readings
 from obsynth.derive.forms.quasi_lpv import elementwise as elementwise_module
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
-from obsynth.derive.forms.quasi_lpv.known import read_measured
-from obsynth.derive.forms.quasi_lpv.measured import readings
 from obsynth.symbolic import Plant, plants
 
 REFERENCE = Path(__file__).parents[2] / "reference"

@@ -1,5 +1,7 @@
 """Affine dependences and families: found, proved, and never claimed without proof."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -225,3 +227,20 @@ def test_constants_left_by_rounding_are_not_written_as_terms(bounds):
     assert str(AffineDependence((0, 0), {(1, 1): sp.Integer(2)}, sp.Float(1e-9), "", ("x",))) == (
         "m11 = 2 m22 + 1e-09: both depend on x only; difference proved zero ()"
     )
+
+
+def test_a_family_covers_one_with_narrower_ranges_and_no_other():
+    family = AffineFamily(
+        np.eye(2), np.ones((1, 2, 2)), np.array([[0.0, 1.0]]), np.zeros((2, 2)), ("s",), True
+    )
+    assert family.covers(family)
+    assert family.covers(replace(family, ranges=np.array([[0.25, 0.5]])))
+    for mistake in (
+        {"ranges": np.array([[0.0, np.nextafter(1.0, 2.0)]])},
+        {"ranges": np.array([[-1e-300, 1.0]])},
+        {"radius": np.full((2, 2), 1e-300)},
+        {"constant": np.zeros((2, 2))},
+        {"directions": 2 * np.ones((1, 2, 2))},
+        {"directions": np.ones((2, 2, 2)), "ranges": np.array([[0.0, 1.0]] * 2)},
+    ):
+        assert not family.covers(replace(family, **mistake)), mistake

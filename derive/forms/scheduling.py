@@ -1,26 +1,39 @@
 """Scheduling variables: the functions through which the matrices of a form vary, affinely."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.zero_test import prove_zero
-from obsynth.derive.errors import DerivationError
-from obsynth.derive.forms.quasi_lpv.measured import known_signals
-from obsynth.derive.forms.quasi_lpv.widths import Lift
+from obsynth.derive.errors import DerivationError, UnboundedError
+from obsynth.derive.forms.measured import known_signals
 from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.dependence import AffineDependence, find_dependences
+from obsynth.derive.jacobian.family import AffineFamily, build_family
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Signal
 
 Entry = tuple[int, int]
 Affine = tuple[sp.Expr, dict[int, sp.Expr]]
 _SAMPLES = 96
 _PREFIXES = ("rho", "sigma", "zeta", "varrho")
+
+
+@dataclass(frozen=True, eq=False)
+class Lift:
+    """A secant that is bounded through the derivative whose mean it is.
+
+    signal: A symbol with the range of the derivative
+    meaning: the secant, in the signals of the plant
+    """
+
+    signal: Signal
+    meaning: sp.Expr
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +64,15 @@ class SchedulingVariable:
         """True when its value is known on line, up to the noise of the outputs."""
         return not self.unmeasured
 
+    @property
+    def label(self) -> str:
+        """The symbol, and what it stands for."""
+        own = "" if self.symbol == self.expression else f" = {sp.sstr(self.expression)}"
+        return f"{self.symbol}{own}"
+
     def __str__(self) -> str:
         known = "" if self.measured else f", unmeasured: {', '.join(self.unmeasured)}"
-        own = "" if self.symbol == self.expression else f" = {sp.sstr(self.expression)}"
-        return f"{self.symbol}{own} in [{_tidy(self.lower)}, {_tidy(self.upper)}]{known}"
+        return f"{self.label} in [{_tidy(self.lower)}, {_tidy(self.upper)}]{known}"
 
 
 def _tidy(value: float) -> str:
@@ -86,6 +104,45 @@ class AffineSchedule:
                 (c * self.variables[k].symbol for k, c in coefficients.items()), sp.Integer(0)
             )
         return result
+
+    def family(self, shape: tuple[int, int]) -> AffineFamily:
+        """Round the matrix to a family."""
+        for variable in self.variables:
+            if not (np.isfinite(variable.lower) and np.isfinite(variable.upper)):
+                raise UnboundedError(
+                    f"the scheduling variable {variable.symbol} = {variable.expression} has no "
+                    f"finite range over the box; give {', '.join(variable.signals)} a range that "
+                    "keeps away from its singularity, or choose another centre= or another "
+                    "factorisation with prefer=",
+                    entries=(str(variable.symbol),),
+                    operation=str(variable.expression),
+                    sub_box={},
+                )
+        # the variables stand in a row of their own below the matrix, as entries that define scalars
+        rows, columns = shape
+        basis = [(rows, k) for k in range(len(self.variables))]
+        dependences = [
+            AffineDependence(
+                place,
+                {basis[k]: coefficient for k, coefficient in terms.items()},
+                constant,
+                self.methods.get(place, "constant"),
+                (),
+            )
+            for place, (constant, terms) in self.entries.items()
+        ]
+        ranges = {basis[k]: (v.lower, v.upper) for k, v in enumerate(self.variables)}
+        supports = {basis[k]: v.signals for k, v in enumerate(self.variables)}
+        wide = max(columns, len(basis))
+        rounded = build_family((rows + 1, wide), basis, dependences, ranges, supports)
+        return replace(
+            rounded,
+            constant=rounded.constant[:rows, :columns],
+            directions=rounded.directions[:, :rows, :columns],
+            radius=rounded.radius[:rows, :columns],
+            labels=tuple(v.label for v in self.variables),
+            exact=self.exact,
+        )
 
 
 def make_schedule(
@@ -253,15 +310,7 @@ def _ranges(
     hidden = {lift.signal.symbol: lift.meaning for lift in lifts}
     more = [lift.signal for lift in lifts]
     entries = matrix_entries({(0, k): e for k, e in enumerate(scalars)}, model, more)
-    found = bound_ranges(
-        entries.values,
-        entries.variables,
-        entries.box,
-        entries.constants,
-        entries.constant_box,
-        rtol=rtol,
-        effort=effort,
-    )
+    found = entries.search(rtol, effort)
     meanings = [scalar.xreplace(hidden) for scalar in scalars]
     through = matrix_entries({(0, k): e for k, e in enumerate(meanings)}, model)
     attained = _attained(through) if hidden else {}

@@ -1,0 +1,253 @@
+"""What quasi-LPV and quadratic forms share: one stacked matrix, affine in scheduling variables."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+import sympy as sp
+
+from obsynth.derive.algebra.zero_test import FormProof, prove_zero
+from obsynth.derive.errors import DerivationError, StructureError
+from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.rigour.numbers import round_number
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Signal
+
+
+class Layout(ABC):
+    """Where the blocks of a form stand in one matrix, the rows of the dynamics first.
+
+    BLOCKS: every block, whether it stands in the dynamics or in the outputs, and its columns
+    """
+
+    BLOCKS: ClassVar[dict[str, tuple[str, str]]]
+
+    @property
+    @abstractmethod
+    def heights(self) -> tuple[int, int]:
+        """Number of states and of outputs."""
+
+    @property
+    @abstractmethod
+    def widths(self) -> dict[str, int]:
+        """Columns by what they multiply, from left to right."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the stacked matrix."""
+        return sum(self.heights), sum(self.widths.values())
+
+    def place(self, block: str) -> tuple[slice, slice]:
+        """Rows and columns of a block."""
+        if block not in self.BLOCKS:
+            raise DerivationError(
+                f"there is no block {block!r}; there are {', '.join(self.BLOCKS)}", block=block
+            )
+        where, factor = self.BLOCKS[block]
+        n, m = self.heights
+        start = 0
+        for name, width in self.widths.items():
+            if name == factor:
+                break
+            start += width
+        rows = slice(0, n) if where == "dynamics" else slice(n, n + m)
+        return rows, slice(start, start + self.widths[factor])
+
+    def unfold(self, block: str, values: FloatArray) -> FloatArray:
+        """Give a block whose columns are several matrices the shape of these matrices."""
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """The blocks of a form at the vertices of its scheduling variables.
+
+    Attributes
+    ----------
+    family : AffineFamily
+        The stacked matrix, affine in the scheduling variables; its radius bounds the rounding.
+    layout : Layout
+        Where the blocks are.
+
+    Notes
+    -----
+    The last scheduling variable changes fastest, the lower end comes first: (0, 0), (0, 1),
+    (1, 0), (1, 1) for two of them.
+    """
+
+    family: AffineFamily
+    layout: Layout
+
+    @property
+    def count(self) -> int:
+        """Number of vertices V."""
+        return self.family.vertex_count
+
+    @property
+    def exact(self) -> bool:
+        """True when the hull of the vertices is that of the matrices that occur."""
+        return self.family.exact
+
+    def block(self, name: str) -> FloatArray:
+        """Vertices of a block.
+
+        Parameters
+        ----------
+        name : str
+            ``"A"``, ``"B"``, ``"C"``, ...
+
+        Returns
+        -------
+        ndarray, shape (V, rows, columns)
+            One matrix per vertex.
+        """
+        rows, columns = self.layout.place(name)
+        return self.layout.unfold(name, self.family.vertices()[:, rows, columns])
+
+    def radius(self, name: str) -> FloatArray:
+        """Elementwise bound of the rounding of a block, shape (rows, columns)."""
+        return self.layout.unfold(name, self.family.radius[self.layout.place(name)])
+
+    @property
+    def A(self) -> FloatArray:
+        """Vertices of A, shape (V, n, n)."""
+        return self.block("A")
+
+    @property
+    def B(self) -> FloatArray:
+        """Vertices of B, shape (V, n, n_u)."""
+        return self.block("B")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class VaryingForm:
+    """A plant as constant plus varying matrices, stacked in one.
+
+    Attributes
+    ----------
+    matrix : sympy.Matrix
+        All blocks stacked, exact, as functions of the plant's signals; see `block`.
+    layout : Layout
+        Where the blocks are.
+    schedule : AffineSchedule
+        The same matrix, affine in the scheduling variables.
+    proof : FormProof
+        That the form is the plant.
+    """
+
+    matrix: sp.Matrix
+    layout: Layout
+    schedule: AffineSchedule
+    proof: FormProof
+
+    def block(self, name: str) -> sp.Matrix:
+        """Return a block of the form, exactly.
+
+        Parameters
+        ----------
+        name : str
+            One of ``layout.BLOCKS``: ``"A"``, ``"B"``, ``"C"``, ...
+
+        Returns
+        -------
+        sympy.Matrix
+            As a function of the plant's signals.
+        """
+        return self.matrix[self.layout.place(name)]
+
+    @property
+    def A(self) -> sp.Matrix:
+        """State matrix, shape (n, n)."""
+        return self.block("A")
+
+    @property
+    def B(self) -> sp.Matrix:
+        """Input matrix, shape (n, n_u)."""
+        return self.block("B")
+
+    @property
+    def C(self) -> sp.Matrix:
+        """Output matrix, shape (m, n)."""
+        return self.block("C")
+
+    @property
+    def scheduling(self) -> tuple[SchedulingVariable, ...]:
+        """The scheduling variables with their ranges."""
+        return self.schedule.variables
+
+    def constant(self, name: str) -> FloatArray:
+        """Return a block that does not vary as doubles.
+
+        Parameters
+        ----------
+        name : str
+            As for `block`; ``"N"`` and ``"M"`` of a quadratic form are stacked, shapes (n, n, n)
+            and (n_u, n, n).
+
+        Returns
+        -------
+        ndarray
+            The nearest doubles.
+
+        Raises
+        ------
+        StructureError
+            An entry varies; row, column and signals are named.
+
+        Examples
+        --------
+        >>> from obsynth.derive import quasi_lpv
+        >>> from obsynth.symbolic.plants import quadruple_tank
+        >>> quasi_lpv(quadruple_tank()).constant("C")[2].tolist()
+        [0.0, 0.0, 1.0, 0.0]
+        """
+        block = self.block(name)
+        values = np.zeros(block.shape)
+        for i, j in np.ndindex(block.shape):
+            entry = block[i, j]
+            free = tuple(sorted(map(str, entry.free_symbols)))
+            if free:
+                raise StructureError(
+                    f"{name}[{i + 1},{j + 1}] = {entry} varies with {', '.join(free)}; a constant "
+                    f"{name} is needed here: fix {', '.join(free)}, or use vertices()",
+                    entry=(i, j),
+                    symbols=free,
+                    condition="constant block",
+                )
+            values[i, j] = round_number(entry)[0]
+        return self.layout.unfold(name, values)
+
+
+def casadi_elements(model: Plant) -> dict[sp.Symbol, ca.SX]:
+    """Every signal of a plant as it stands in ``model.sx()``."""
+    sx = model.sx()
+    kinds = ("x", "u", "d", "f", "w", "p", "rho")
+    elements = ca.vertsplit(ca.vertcat(*[getattr(sx, kind) for kind in kinds]))
+    symbols = [s.symbol for kind in kinds for s in getattr(model, kind)]
+    return dict(zip(symbols, elements, strict=True))
+
+
+def prove_rows(
+    matrix: sp.Matrix,
+    column: Sequence[sp.Expr],
+    rows: Sequence[sp.Expr],
+    names: tuple[str, ...],
+    signals: Iterable[Signal],
+) -> FormProof:
+    """Show that matrix times column is the plant, row by row, on the box of its signals."""
+    box = {s.symbol: (s.lower, s.upper) for s in signals}
+    methods = []
+    for i, row in enumerate(rows):
+        products = [matrix[i, j] * factor for j, factor in enumerate(column)]
+        method = prove_zero(row - sp.Add(*products), box)
+        if not method:
+            raise DerivationError(
+                f"the form of the row of {names[i]} is not the plant's {row}", row=names[i]
+            )
+        methods.append(method)
+    return FormProof(names, tuple(methods))
