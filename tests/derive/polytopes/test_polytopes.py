@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, jacobian_bounds
+from obsynth.derive.jacobian.entries import JacobianEntries
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes import fewer, support
 from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
@@ -243,25 +244,30 @@ def test_membership_of_a_polytope():
     assert not found.contains(mixed)
 
 
-def too_small_support(monkeypatch):
-    real = support.bound_ranges
+def change_supports(monkeypatch, change):
+    """Falsify what branch and bound says of directions, but not of the single entries."""
+    real = JacobianEntries.search
 
-    def wrong(*given, **options):
-        found = real(*given, **options)
+    def wrong(self, rtol, effort, values=None):
+        found = real(self, rtol, effort, values)
+        return found if values is None else change(found)
+
+    monkeypatch.setattr(JacobianEntries, "search", wrong)
+
+
+def too_small_support(monkeypatch):
+    def shrink(found):
         width = found.upper - found.lower
         return replace(found, lower=found.lower + 0.1 * width, upper=found.upper - 0.1 * width)
 
-    monkeypatch.setattr(support, "bound_ranges", wrong)
+    change_supports(monkeypatch, shrink)
 
 
 def shifted_directions(monkeypatch):
-    real = support.bound_ranges
-
-    def wrong(*given, **options):
-        found = real(*given, **options)
+    def shift(found):
         return replace(found, lower=np.roll(found.lower, 1), upper=np.roll(found.upper, 1))
 
-    monkeypatch.setattr(support, "bound_ranges", wrong)
+    change_supports(monkeypatch, shift)
 
 
 def forgotten_vertex(monkeypatch):
