@@ -23,20 +23,19 @@ from obsynth.derive.polytopes.polytope import (
     polytope_from_halfspaces,
     polytope_from_vertices,
 )
-from obsynth.derive.polytopes.sampled import sampled_hull
 from obsynth.derive.polytopes.support import JacobianPolytope, jacobian_polytope
 from obsynth.derive.remainder.certify import discretisation_remainder
 from obsynth.derive.remainder.flow import FlowError
 from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.split import Split, split
-from obsynth.derive.structure.conditions import (
+from obsynth.derive.structure.decoupling import Decoupling, decouple, unknown_input_condition
+from obsynth.derive.structure.detectability import (
     Detectability,
+    WeakestMember,
     augmented_pair,
     detectability,
-    unknown_input_condition,
+    weakest_member,
 )
-from obsynth.derive.structure.decoupling import Decoupling, decouple
-from obsynth.derive.structure.detectability import WeakestMember, weakest_member
 from obsynth.derive.structure.excitation import Excitation, excitation
 from obsynth.derive.structure.isolability import FaultIsolability, fault_isolability
 from obsynth.derive.structure.report import Check, StructureReport, analyse
@@ -96,7 +95,6 @@ __all__ = [
     "principal_family",
     "qpv",
     "quasi_lpv",
-    "sampled_hull",
     "split",
     "system_zeros",
     "unknown_input_condition",

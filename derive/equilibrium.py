@@ -5,15 +5,15 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 _STARTS = 32
 _ITERATIONS = 60
-_NO_VALUES: Array = np.zeros(0)
+_NO_VALUES: FloatArray = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +33,14 @@ class Equilibrium:
         Values of uncertain parameters and scheduling variables that belong to it.
     """
 
-    x: Array
-    u: Array
+    x: FloatArray
+    u: FloatArray
     residual: float
-    p: Array = field(default_factory=lambda: _NO_VALUES)
-    rho: Array = field(default_factory=lambda: _NO_VALUES)
+    p: FloatArray = field(default_factory=lambda: _NO_VALUES)
+    rho: FloatArray = field(default_factory=lambda: _NO_VALUES)
 
 
-def operating_values(model: Plant, kind: str) -> Array:
+def operating_values(model: Plant, kind: str) -> FloatArray:
     """Nominal values of one kind of signal: declared, else the middle of the range, else zero."""
     values = []
     for signal in getattr(model, kind):
@@ -55,7 +55,7 @@ def operating_values(model: Plant, kind: str) -> Array:
     return np.array(values, dtype=float)
 
 
-def _inputs(model: Plant, u: ArrayLike | None) -> Array:
+def _inputs(model: Plant, u: ArrayLike | None) -> FloatArray:
     names = model.names("u")
     if u is None:
         for signal in model.u:
@@ -88,8 +88,8 @@ def _residual_function(model: Plant) -> ca.Function:
     return ca.Function("residual", arguments, [residual, ca.jacobian(residual, sx.x)])
 
 
-def _newton(function: ca.Function, start: Array, given: list[Any]) -> tuple[Array, float]:
-    def at(x: Array) -> tuple[Array, Array]:
+def _newton(function: ca.Function, start: FloatArray, given: list[Any]) -> tuple[FloatArray, float]:
+    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         value, slope = function(x, *given)
         return np.array(value).ravel(), np.array(slope)
 
@@ -154,7 +154,7 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
         finite, np.where(finite, box[:, 1], 0.0) - np.where(finite, box[:, 0], 0.0), 2.0
     )
     rng = np.random.default_rng(0)
-    outside: Array | None = None
+    outside: FloatArray | None = None
     for attempt in range(_STARTS):
         start = first if attempt == 0 else first + width * (rng.random(len(first)) - 0.5)
         start = np.clip(start, box[:, 0], box[:, 1])

@@ -8,7 +8,6 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.identity import IdentityProof, prove_identity
@@ -16,10 +15,10 @@ from obsynth.derive.algebra.linear_parts import constant_columns
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.rigour.numbers import is_zero, rational, round_number, substitute
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 LinearForm = Literal["frozen", "terms", "jacobian"]
 _FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 
@@ -50,14 +49,14 @@ class Split:
     """
 
     model: Plant
-    A: Array
-    B: Array
-    D: Array
-    B_f: Array
-    C: Array
-    W1: Array
-    W2: Array
-    D_f: Array
+    A: FloatArray
+    B: FloatArray
+    D: FloatArray
+    B_f: FloatArray
+    C: FloatArray
+    W1: FloatArray
+    W2: FloatArray
+    D_f: FloatArray
     g: sp.Matrix
     linear: LinearForm
     at: Equilibrium
@@ -256,14 +255,14 @@ def split(
     )
 
 
-def _exact(matrix: Array) -> sp.Matrix:
+def _exact(matrix: FloatArray) -> sp.Matrix:
     """Return the rational numbers that the doubles of a matrix are."""
     return sp.Matrix(*matrix.shape, [rational(value) for value in matrix.ravel()])
 
 
 def _matrices(
     model: Plant, rows: sp.Matrix, point: Equilibrium, linear: str
-) -> tuple[Array, Array]:
+) -> tuple[FloatArray, FloatArray]:
     """Evaluate A and B at the point of operation."""
     x, u = _symbols(model, "x"), _symbols(model, "u")
     numbers = {

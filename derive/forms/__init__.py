@@ -1,1 +1,1 @@
-"""Varying-parameter forms of a plant: quasi-LPV and QPV."""
+"""How does the plant look as matrices that vary? Quasi-LPV and quadratic forms, with proof."""

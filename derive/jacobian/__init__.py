@@ -1,1 +1,1 @@
-"""Jacobians over a box: entries, bounds, dependences, affine families."""
+"""How much does the plant change between two points? Jacobians over the box, as a family."""

@@ -14,9 +14,8 @@ from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries, s
 from obsynth.derive.jacobian.family import AffineFamily, build_family
 from obsynth.derive.rigour.numbers import enclose_number
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +46,19 @@ class JacobianBounds:
         Vertices of the entrywise box, 2 to the number of varying entries.
     """
 
-    min: Array
-    max: Array
-    attained_min: Array
-    attained_max: Array
-    gap: Array
-    attained_at: Array
+    min: FloatArray
+    max: FloatArray
+    attained_min: FloatArray
+    attained_max: FloatArray
+    gap: FloatArray
+    attained_at: FloatArray
     status: NDArray[np.object_]
     variables: tuple[str, ...]
     family: AffineFamily
     dependences: tuple[AffineDependence, ...]
     naive_vertex_count: int
 
-    def vertices(self) -> Array:
+    def vertices(self) -> FloatArray:
         """Vertices of the family, shape (N, n, k); every Jacobian lies in their hull."""
         return self.family.vertices()
 
@@ -72,7 +71,7 @@ class JacobianBounds:
         return np.asarray(self.attained_max > self.attained_min)
 
     @property
-    def vertex_radius(self) -> Array:
+    def vertex_radius(self) -> FloatArray:
         """Elementwise rounding of the vertices, shape (n, k)."""
         return self.family.radius
 

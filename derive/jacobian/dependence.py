@@ -11,12 +11,11 @@ from fractions import Fraction
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.rigour.numbers import is_zero
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _RANK_TOLERANCE = 1e-8
 _LARGEST_DENOMINATOR = 1000
@@ -120,7 +119,7 @@ def _solve(
 
 def find_dependences(
     entries: Mapping[Entry, sp.Expr],
-    samples: Mapping[Entry, Array],
+    samples: Mapping[Entry, FloatArray],
     variables: Sequence[sp.Symbol],
     name: str = "m",
 ) -> tuple[list[Entry], list[AffineDependence]]:
@@ -129,7 +128,7 @@ def find_dependences(
     if any(len(values) <= len(entries) for values in samples.values()):
         return sorted(entries), []
     basis: list[Entry] = []
-    columns: list[Array] = []
+    columns: list[FloatArray] = []
     dependences: list[AffineDependence] = []
     prover = _Prover(entries, known, name)
     for entry in sorted(entries, key=lambda e: _preferred(e, entries[e], known)):

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.common_factors import cancel_common_factors
 from obsynth.derive.algebra.products_to_sums import products_to_sums
@@ -16,11 +15,11 @@ from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.rewriting.removable import remove_singularities
 from obsynth.derive.rigour.numbers import enclose_number, rational, substitute
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import nearest_double, to_sx
 from obsynth.symbolic.parity import ParityError, check_parity, sample_box
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _SAMPLES = 96
 # Expanding a longer entry costs more than the zeros it may show.
@@ -52,7 +51,7 @@ class JacobianEntries:
     variables: ca.SX
     names: tuple[str, ...]
     symbols: list[sp.Symbol]
-    box: Array
+    box: FloatArray
     constants: ca.SX
     constant_box: list[tuple[float, float]]
     symbolic: dict[Entry, sp.Expr]
@@ -139,7 +138,7 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
     )
 
 
-def _all_variables(model: Plant) -> tuple[ca.SX, Array]:
+def _all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:
     sx = model.sx(constants="symbol")
     variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
     return variables, np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
@@ -195,7 +194,7 @@ def _preferred_rows(
     return rows, ca.vertcat(*rhs)
 
 
-def _ends(box: Array) -> tuple[Array, Array]:
+def _ends(box: FloatArray) -> tuple[FloatArray, FloatArray]:
     return box[:, :1], box[:, 1:]
 
 
@@ -219,9 +218,9 @@ def _mean_widths(
     forms: list[ca.SX],
     variables: ca.SX,
     extra: ca.SX,
-    box: Array,
+    box: FloatArray,
     constants: list[tuple[float, float]],
-) -> list[Array]:
+) -> list[FloatArray]:
     """Widths of natural enclosures over some small boxes, shape (entries, boxes) for each form."""
     function = ca.Function("forms", [variables, extra], [ca.densify(form.T) for form in forms])
     program = Program.from_casadi(function, {1: constants})
@@ -237,7 +236,7 @@ def _mean_widths(
         return list(np.split(upper - lower, 2))
 
 
-def _is_narrower(one: Array, other: Array) -> bool:
+def _is_narrower(one: FloatArray, other: FloatArray) -> bool:
     """Whether widths are smaller than others, on the geometric mean of what can be compared."""
     with np.errstate(invalid="ignore", divide="ignore"):
         known = np.isfinite(one) & np.isfinite(other) & (np.maximum(one, other) > 0.0)
@@ -250,7 +249,7 @@ def _is_narrower(one: Array, other: Array) -> bool:
     return bool(known.any() and float(ratio[known].mean()) < np.log(_GAIN))
 
 
-def sample_entries(entries: JacobianEntries) -> dict[Entry, Array]:
+def sample_entries(entries: JacobianEntries) -> dict[Entry, FloatArray]:
     """Evaluate all entries at fixed random points of the box."""
     rng = np.random.default_rng(0)
     lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name
 from obsynth.derive.rigour.numbers import round_number
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _UNIT = 2.0**-53
 _MOST_SCALARS = 16
@@ -47,20 +47,20 @@ class AffineFamily:
     function in two rows would no longer go together.)
     """
 
-    constant: Array
-    directions: Array
-    ranges: Array
-    radius: Array
+    constant: FloatArray
+    directions: FloatArray
+    ranges: FloatArray
+    radius: FloatArray
     labels: tuple[str, ...]
     exact: bool
 
     @property
-    def midpoint(self) -> Array:
+    def midpoint(self) -> FloatArray:
         """Matrix at the middle of all ranges, shape (n, k)."""
         return self.constant + np.tensordot(self.ranges.mean(axis=1), self.directions, axes=1)
 
     @property
-    def half_ranges(self) -> Array:
+    def half_ranges(self) -> FloatArray:
         """Half widths of the ranges, shape (K,)."""
         return 0.5 * (self.ranges[:, 1] - self.ranges[:, 0])
 
@@ -70,11 +70,11 @@ class AffineFamily:
         return 1 << int((self.ranges[:, 1] > self.ranges[:, 0]).sum())
 
     @property
-    def vertex_radius(self) -> Array:
+    def vertex_radius(self) -> FloatArray:
         """How far a matrix of the family may lie from the hull of the vertices, elementwise."""
         return self.radius
 
-    def at(self, scalars: Sequence[float] | Array) -> Array:
+    def at(self, scalars: Sequence[float] | FloatArray) -> FloatArray:
         """Matrix for given scalars.
 
         Parameters
@@ -92,7 +92,7 @@ class AffineFamily:
             matrix = matrix + value * direction
         return matrix
 
-    def vertices(self) -> Array:
+    def vertices(self) -> FloatArray:
         """Matrices at the corners of the ranges.
 
         Returns
@@ -117,7 +117,7 @@ class AffineFamily:
         corners = [self.at(corner) for corner in product(*ends)]
         return np.array(corners).reshape(-1, *self.constant.shape)
 
-    def contains(self, matrix: Array) -> bool:
+    def contains(self, matrix: FloatArray) -> bool:
         """Whether a matrix belongs to the family, up to the radius.
 
         The scalars are read off the entries that define them; a linear program looks for them
@@ -163,7 +163,7 @@ class AffineFamily:
             and np.all(self.ranges[:, 1] >= other.ranges[:, 1])
         )
 
-    def _reaches(self, matrix: Array) -> bool:
+    def _reaches(self, matrix: FloatArray) -> bool:
         """Look for scalars that reproduce a matrix where no entry defines them."""
         from scipy.optimize import linprog
 
@@ -179,7 +179,7 @@ class AffineFamily:
         )
         return bool(found.status == 0)
 
-    def _defining(self, direction: Array) -> NDArray[np.bool_]:
+    def _defining(self, direction: FloatArray) -> NDArray[np.bool_]:
         alone = np.abs(self.directions).sum(axis=0) == np.abs(direction)
         return np.asarray(alone & (self.constant == 0.0) & (self.radius == 0.0))
 

@@ -12,7 +12,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import UnboundedError
@@ -21,11 +20,11 @@ from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.rigour.numbers import enclose_number, substitute
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
-Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _KINDS = ("x", "u", "p", "rho", "d", "f", "w")
 _EXACT_BITS = 24
@@ -50,7 +49,7 @@ class MatrixEntries:
     variables: ca.SX
     names: tuple[str, ...]
     symbols: tuple[sp.Symbol, ...]
-    box: Array
+    box: FloatArray
     constants: ca.SX
     constant_box: list[tuple[float, float]]
     model: Plant
@@ -124,7 +123,7 @@ class MatrixEntries:
         expression = self.exact[place]
         return tuple(n for n, s in zip(self.names, self.symbols, strict=True) if expression.has(s))
 
-    def named(self, point: Array) -> dict[str, float]:
+    def named(self, point: FloatArray) -> dict[str, float]:
         """Return the values at a point by name, without signals on which nothing depends."""
         present = {s for expression in self.exact.values() for s in expression.free_symbols}
         return {
@@ -133,7 +132,7 @@ class MatrixEntries:
             if symbol in present
         }
 
-    def sample(self, count: int) -> dict[Entry, Array]:
+    def sample(self, count: int) -> dict[Entry, FloatArray]:
         """Evaluate the entries at fixed random points and corners, those in their domain."""
         rng = np.random.default_rng(0)
         lower = np.where(np.isfinite(self.box[:, 0]), self.box[:, 0], -1.0)

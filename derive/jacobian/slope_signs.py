@@ -14,11 +14,12 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.derive import StructureError
+from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import rational, substitute
-from obsynth.symbolic import Plant, Role, Signal
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Role, Signal
 
 Signs = NDArray[np.int64]
 

@@ -1,1 +1,1 @@
-"""Polytopes of matrices and of parameters, with fewer vertices."""
+"""How few vertices will do? Smaller polytopes of Jacobians, and what they give up."""

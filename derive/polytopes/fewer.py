@@ -6,7 +6,6 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.jacobian.bounds import jacobian_bounds
@@ -14,14 +13,14 @@ from obsynth.derive.jacobian.entries import jacobian_entries, sample_entries
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes.support import basis_entries
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 _UNIT = 2.0**-53
 _ROUND = 1.0 + 2.0**-44
 
 
-def _above(value: Array) -> Array:
+def _above(value: FloatArray) -> FloatArray:
     """Push up what was computed with some hundred roundings of nonnegative terms."""
     return np.where(value > 0.0, np.nextafter(value * _ROUND, np.inf), 0.0)
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.polytopes.pivoting import Degenerate, walk_vertices
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 # Faces are moved outwards by so much of the size, each by a different multiple, until no more than
 # n of them meet in a vertex.
 _NUDGES = (2.0**-44, 2.0**-40, 2.0**-34)
@@ -21,7 +21,6 @@ class Label(StrEnum):
 
     EXACT = "exact: the hull of the set, up to the tolerance of its ranges"
     OUTER = "outer: holds the set, with proof, and may be larger"
-    SAMPLED = "sampled: hull of samples, which the set may leave; no guarantee"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +45,10 @@ class Polytope:
     from `polytope_from_vertices` it is the other way round.
     """
 
-    normals: Array
-    offsets: Array
-    vertices: Array
-    radius: Array
+    normals: FloatArray
+    offsets: FloatArray
+    vertices: FloatArray
+    radius: FloatArray
 
     @property
     def dimension(self) -> int:
@@ -70,7 +69,7 @@ class Polytope:
         return hull_volume(self.vertices)
 
 
-def hull_volume(points: Array) -> float:
+def hull_volume(points: FloatArray) -> float:
     """Return the volume of the hull of points, 0 when it is flat."""
     if points.shape[1] == 1:
         return float(np.ptp(points[:, 0])) if len(points) else 0.0
@@ -220,7 +219,7 @@ def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
     return Polytope(normals, np.array(offsets), kept[order], np.zeros(n))
 
 
-def _foremost(points: Array, normal: Array) -> NDArray[np.int64]:
+def _foremost(points: FloatArray, normal: FloatArray) -> NDArray[np.int64]:
     """Points that may be the furthest in a direction, as far as rounding leaves that open."""
     values = points @ normal
     error = 2.0 * (points.shape[1] + 2) * np.finfo(float).eps * (np.abs(points) @ np.abs(normal))

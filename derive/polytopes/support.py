@@ -13,7 +13,6 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
@@ -28,9 +27,9 @@ from obsynth.derive.polytopes.polytope import (
 )
 from obsynth.derive.polytopes.thinning import thin
 from obsynth.derive.split import Split
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 Entry = tuple[int, int]
 _UNIT = 2.0**-53
 _MOST_VERTICES = 2**16
@@ -57,7 +56,7 @@ class Group:
     places: tuple[Entry, ...]
     polytope: Polytope
     label: Label
-    attained: Array
+    attained: FloatArray
 
     @property
     def fill(self) -> float:
@@ -102,7 +101,7 @@ class JacobianPolytope:
 
     family: AffineFamily
     groups: tuple[Group, ...]
-    radius: Array
+    radius: FloatArray
     naive_vertex_count: int
 
     @property
@@ -112,7 +111,7 @@ class JacobianPolytope:
         return Label.EXACT if exact else Label.OUTER
 
     @property
-    def vertex_radius(self) -> Array:
+    def vertex_radius(self) -> FloatArray:
         """The same as ``radius``, under the name it has in a family."""
         return self.radius
 
@@ -129,7 +128,7 @@ class JacobianPolytope:
         """Vertices of the family with the box of ranges."""
         return self.family.vertex_count
 
-    def vertices(self) -> Array:
+    def vertices(self) -> FloatArray:
         """Matrices at the combinations of the groups' vertices.
 
         Returns
@@ -155,7 +154,7 @@ class JacobianPolytope:
             matrices.append(self.family.at(scalars))
         return np.array(matrices).reshape(-1, *self.family.constant.shape)
 
-    def contains(self, matrix: Array) -> bool:
+    def contains(self, matrix: FloatArray) -> bool:
         """Whether a matrix belongs to the polytope, up to the radius.
 
         Parameters
@@ -261,7 +260,7 @@ def jacobian_polytope(
     return JacobianPolytope(bounds.family, tuple(groups), radius, bounds.naive_vertex_count)
 
 
-def _radius(family: AffineFamily, groups: Sequence[Group]) -> Array:
+def _radius(family: AffineFamily, groups: Sequence[Group]) -> FloatArray:
     """Add up what rounding costs: in the family, in the vertices, in sums formed with them."""
     size, reach = np.zeros(len(family.ranges)), np.zeros(len(family.ranges))
     for group in groups:
@@ -277,7 +276,9 @@ def _radius(family: AffineFamily, groups: Sequence[Group]) -> Array:
     return np.where(total > 0.0, np.nextafter(total * (1.0 + 2.0**-40), np.inf), 0.0)
 
 
-def scalar_values(entries: JacobianEntries, places: Sequence[Entry], points: Array) -> Array:
+def scalar_values(
+    entries: JacobianEntries, places: Sequence[Entry], points: FloatArray
+) -> FloatArray:
     """Evaluate entries at points of the box, in doubles."""
     columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
     expressions = ca.vertcat(*[columns[place] for place in places])
@@ -303,7 +304,7 @@ def basis_entries(bounds: JacobianBounds) -> list[Entry]:
     return found
 
 
-def _box(ranges: Array) -> Polytope:
+def _box(ranges: FloatArray) -> Polytope:
     """Polytope of a box; coordinates without width have one end only."""
     unit = np.eye(len(ranges))
     ends = [sorted(set(pair)) for pair in ranges.tolist()]

@@ -4,17 +4,16 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.polytopes.polytope import hull_volume
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 _NOTHING = 1e-9
 # Polygons of up to so many faces are searched for among all of them.
 _EXHAUSTIVE = 4
 
 
-def corners(normals: Array, offsets: Array, inside: Array) -> Array | None:
+def corners(normals: FloatArray, offsets: FloatArray, inside: FloatArray) -> FloatArray | None:
     """Approximate vertices of a polytope around a point, None if it is not bounded."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -35,7 +34,9 @@ def corners(normals: Array, offsets: Array, inside: Array) -> Array | None:
     return np.unique(np.round(points / size, 12), axis=0) * size
 
 
-def thin(normals: Array, offsets: Array, inside: Array, most: int | None = None) -> list[int]:
+def thin(
+    normals: FloatArray, offsets: FloatArray, inside: FloatArray, most: int | None = None
+) -> list[int]:
     """Choose the faces that matter."""
     kept = list(range(len(offsets)))
     points = corners(normals, offsets, inside)
@@ -59,7 +60,9 @@ def thin(normals: Array, offsets: Array, inside: Array, most: int | None = None)
     return kept
 
 
-def _best_few(normals: Array, offsets: Array, inside: Array, count: int) -> list[int]:
+def _best_few(
+    normals: FloatArray, offsets: FloatArray, inside: FloatArray, count: int
+) -> list[int]:
     """Find the polygon of so many faces with the smallest area."""
     best, chosen = np.inf, list(range(len(offsets)))
     for some in combinations(range(len(offsets)), count):
@@ -72,7 +75,7 @@ def _best_few(normals: Array, offsets: Array, inside: Array, count: int) -> list
 
 
 def _without(
-    normals: Array, offsets: Array, inside: Array, kept: Sequence[int], face: int
-) -> Array | None:
+    normals: FloatArray, offsets: FloatArray, inside: FloatArray, kept: Sequence[int], face: int
+) -> FloatArray | None:
     rest = [k for k in kept if k != face]
     return corners(normals[rest], offsets[rest], inside)

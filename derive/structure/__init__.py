@@ -1,1 +1,1 @@
-"""What structure allows: ranks, zeros, detectability, isolability, excitation."""
+"""What can be seen and told apart at all? Decoupling, zeros, detectability, faults."""

@@ -1,4 +1,4 @@
-"""Decoupling of the unknown input: the matrices E, T and Pi, computed exactly."""
+"""Decoupling of the unknown inputs: when there is one, and the matrices E, T, Pi, exactly."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.errors import StructureError
+from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
+
+_RANK_TOLERANCE = 1e-9
 
 
 def _exact(values: Any) -> Any:
@@ -117,3 +120,94 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     residual = float(np.max(np.abs(_rounded(exact_T * exact_D)), initial=0.0))
     projector = exact_T * exact_T == exact_T and _exact(T) == exact_T
     return Decoupling(E, T, Pi, q, residual, bool(projector))
+
+
+def _rank(matrix: FloatArray) -> int:
+    if matrix.size == 0:
+        return 0
+    size = np.linalg.norm(matrix, axis=0)
+    scaled = matrix / np.where(size > 0.0, size, 1.0)
+    return int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE))
+
+
+def listed(names: list[str] | tuple[str, ...]) -> str:
+    """Join names."""
+    return ", ".join(names)
+
+
+def unknown_input_condition(split: Split) -> Decoupling:
+    """Check rank(D) = rank(C D) = q and return the matrices that decouple the unknown inputs.
+
+    Assumption 4 and equation (13) of Buciakowski et al.
+
+    Parameters
+    ----------
+    split : Split
+        The plant's matrices.
+
+    Returns
+    -------
+    Decoupling
+        E, T and Pi.
+
+    Raises
+    ------
+    StructureError
+        The unknown inputs cannot be decoupled; ``symbols`` names those concerned, ``states`` what
+        they act on, ``rank_D`` and ``rank_CD`` are the numbers.
+
+    Examples
+    --------
+    >>> from obsynth.derive.split import split
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
+    >>> np.diag(unknown_input_condition(parts).T).tolist()
+    [1.0, 1.0, 0.0, 1.0]
+    """
+    model, D, C = split.model, split.D, split.C
+    n, m, q = len(D), len(C), D.shape[1]
+    if q == 0:
+        return decouple(C, D)
+    names, states = model.names("d"), model.names("x")
+    CD = C @ D
+    rank_D, rank_CD = _rank(D), _rank(CD)
+    if rank_D < q:
+        dead = [names[j] for j in range(q) if not D[:, j].any()]
+        what = (
+            f"{listed(dead)} enters no equation"
+            if dead
+            else f"{listed(names)} act on the states in the same way and cannot be told apart"
+        )
+        raise StructureError(
+            f"rank(D) = {rank_D} for {q} unknown inputs: {what}; merge or remove them",
+            condition="rank(D) = q",
+            rank_D=rank_D,
+            rank_CD=rank_CD,
+            q=q,
+            symbols=tuple(dead) or names,
+        )
+    if rank_CD < q:
+        lost = _null_vectors(CD)
+        symbols = [s for j, s in enumerate(names) if np.abs(lost[j]).max() > 1e-6]
+        acts = [states[i] for i in range(n) if np.abs(D[i] @ lost).max() > 1e-9]
+        more = f"; {q} unknown inputs need at least {q} outputs" if m < q else ""
+        raise StructureError(
+            f"rank(C D) = {rank_CD} but rank(D) = {q}: the unknown input {listed(symbols)} acts "
+            f"on {listed(acts)}, and no output ({listed(model.output_names)}) shows it one step "
+            f"later{more}. Measure {acts[0]}, or treat {symbols[0]} as a bounded disturbance",
+            condition="rank(C D) = rank(D)",
+            rank_D=rank_D,
+            rank_CD=rank_CD,
+            q=q,
+            symbols=tuple(symbols),
+            states=tuple(acts),
+        )
+    return decouple(C, D)
+
+
+def _null_vectors(matrix: FloatArray) -> FloatArray:
+    _, values, vectors = np.linalg.svd(matrix, full_matrices=True)
+    full = np.zeros(matrix.shape[1])
+    full[: len(values)] = values
+    chosen = full <= _RANK_TOLERANCE * max(float(full.max(initial=0.0)), 1.0)
+    return np.asarray(vectors[chosen].T)

@@ -1,4 +1,4 @@
-"""Detectability between the vertices of a Jacobian family."""
+"""Detectability of state and faults, at the vertices of a Jacobian family and between them."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,186 @@ from numpy.typing import NDArray
 from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
-from obsynth.derive.structure.conditions import augmented_pair, unknown_input_condition
+from obsynth.derive.structure.decoupling import Decoupling, listed, unknown_input_condition
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
+Modes = NDArray[np.complex128]
+_RANK_TOLERANCE = 1e-9
 _STARTS = 2
 _RANDOM = 64
 _HIDDEN = 1e-9
 _MODE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Detectability:
+    """Outcome of the test of Popov, Belevitch and Hautus at every vertex.
+
+    Attributes
+    ----------
+    vertices : int
+        Number of vertices tested.
+    margin : float
+        Smallest singular value found, with the columns scaled to norm one; 1 when no vertex has
+        a mode that does not decay by itself.
+    hidden_modes : tuple of complex
+        Modes that no output sees at some vertex but that decay, the slowest last.
+    """
+
+    vertices: int
+    margin: float
+    hidden_modes: tuple[complex, ...]
+
+
+def augmented_pair(
+    split: Split, decoupling: Decoupling, M: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """State and faults after the unknown inputs are removed.
+
+    Equations (14)-(17) of Buciakowski et al. with M added to A; sensor faults, which the paper
+    does not have, enter through D_f.
+
+    Parameters
+    ----------
+    split : Split
+        The plant's matrices.
+    decoupling : Decoupling
+        From `unknown_input_condition`.
+    M : ndarray, shape (n, n)
+        A matrix of the Jacobian family of g.
+
+    Returns
+    -------
+    (ndarray, ndarray)
+        [T (A + M), T B_f + E D_f; 0, I] (0 in place of I in continuous time) and [C, D_f].
+    """
+    n, n_f = split.B_f.shape
+    keep = np.eye(n_f) if split.model.Ts is not None else np.zeros((n_f, n_f))
+    top = np.hstack(
+        [decoupling.T @ (split.A + M), decoupling.T @ split.B_f + decoupling.E @ split.D_f]
+    )
+    return np.vstack([top, np.hstack([np.zeros((n_f, n)), keep])]), np.hstack([split.C, split.D_f])
+
+
+def _modes(matrix: FloatArray, n: int, discrete: bool) -> tuple[list[complex], list[complex]]:
+    """Eigenvalues that do not decay, and the others; the faults' own mode is exact."""
+    values = [complex(v) for v in np.linalg.eigvals(matrix[:n, :n])]
+    stays = [
+        v
+        for v in values
+        if (abs(v) >= 1.0 - _MODE_TOLERANCE if discrete else v.real >= -_MODE_TOLERANCE)
+    ]
+    decays = [v for v in values if v not in stays]
+    if len(matrix) > n:
+        stays.insert(0, complex(1.0 if discrete else 0.0))
+    return stays, decays
+
+
+def _hidden(matrix: FloatArray, outputs: FloatArray, mode: complex) -> tuple[float, Modes]:
+    """Smallest singular value of [mode I - A; C] with scaled columns, and the null vectors."""
+    pencil = np.vstack([mode * np.eye(len(matrix)) - matrix, outputs.astype(complex)])
+    size = np.linalg.norm(pencil, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    _, values, vectors = np.linalg.svd(pencil / size)
+    null = vectors[values <= _RANK_TOLERANCE].conj().T / size[:, None]
+    return float(values[-1]), np.asarray(null, dtype=np.complex128)
+
+
+def detectability(split: Split, bounds: JacobianBounds) -> Detectability:
+    """Test that state and faults can be detected at every vertex of the Jacobian family.
+
+    The pair [T (A + M), T B_f; 0, I], [C, 0] must not have a mode of modulus >= 1 (real part >= 0
+    in continuous time) that leaves all outputs at zero. Necessary for a design; the matrix
+    inequalities are what suffices.
+
+    Parameters
+    ----------
+    split : Split
+        The plant's matrices.
+    bounds : JacobianBounds
+        Bounds of dg/dx.
+
+    Returns
+    -------
+    Detectability
+        Number of vertices, smallest margin, hidden modes that decay.
+
+    Raises
+    ------
+    StructureError
+        Faults or states that cannot be detected, in ``symbols``, with the mode and the vertex; or
+        unknown inputs that cannot be decoupled.
+
+    Examples
+    --------
+    >>> from obsynth.derive.jacobian.bounds import jacobian_bounds
+    >>> from obsynth.derive.split import split
+    >>> from obsynth.symbolic.plants import quadruple_tank
+    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
+    >>> detectability(parts, jacobian_bounds(parts)).vertices
+    16
+    """
+    decoupling = unknown_input_condition(split)
+    model = split.model
+    discrete = model.Ts is not None
+    states, faults = model.names("x"), model.names("f")
+    vertices = bounds.vertices()
+    margin = 1.0
+    decaying: set[complex] = set()
+    for index, M in enumerate(vertices):
+        matrix, outputs = augmented_pair(split, decoupling, M)
+        stays, decays = _modes(matrix, len(states), discrete)
+        for mode in stays:
+            smallest, null = _hidden(matrix, outputs, mode)
+            if null.shape[1]:
+                raise _undetectable(mode, null, states, faults, index, M, model.output_names)
+            margin = min(margin, smallest)
+        for mode in decays:
+            if abs(mode) > _MODE_TOLERANCE and _hidden(matrix, outputs, mode)[1].shape[1]:
+                decaying.add(complex(round(mode.real, 9), round(mode.imag, 9)))
+    ordered = sorted(decaying, key=lambda v: abs(v) if discrete else v.real)
+    return Detectability(len(vertices), margin, tuple(ordered))
+
+
+def _undetectable(
+    mode: complex,
+    null: Modes,
+    states: tuple[str, ...],
+    faults: tuple[str, ...],
+    index: int,
+    M: FloatArray,
+    outputs: tuple[str, ...],
+) -> StructureError:
+    names = (*states, *faults)
+    n = len(states)
+    size = np.abs(null).max(axis=1)
+    wrong_faults = [faults[k] for k in range(len(faults)) if size[n + k] > 1e-6 * size.max()]
+    moving = [states[k] for k in range(n) if size[k] > 1e-6 * size.max()]
+    blamed = wrong_faults or moving
+    kind = "fault" if wrong_faults else "state"
+    value = f"{mode.real:.6g}" if abs(mode.imag) < 1e-12 else f"{mode:.6g}"
+    column = null[:, int(np.argmax(np.abs(null).max(axis=0)))]
+    pivot = names.index(blamed[0])
+    ratio = column / column[pivot] if abs(column[pivot]) > 0.0 else column
+    motion = ", ".join(
+        f"{name} = {r.real:.4g} {blamed[0]}"
+        for name, r in zip(names, ratio, strict=True)
+        if name != blamed[0] and abs(r) > 1e-6
+    )
+    hidden = f" together with {motion}" if motion else ""
+    return StructureError(
+        f"the {kind} {listed(blamed)} cannot be detected: a motion of {blamed[0]}{hidden} (mode "
+        f"{value}, which does not decay) leaves the outputs {listed(outputs)} unchanged once the "
+        f"unknown inputs are removed (vertex {index + 1} of the Jacobian family). Measure "
+        f"{moving[0] if moving else blamed[0]} as well, or declare {blamed[0]} differently",
+        condition="detectability",
+        symbols=tuple(blamed),
+        symbol=blamed[0],
+        states=tuple(moving),
+        mode=mode,
+        vertex=M,
+        vertex_index=index,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +211,7 @@ class WeakestMember:
 
     margin: float
     scalars: dict[str, float]
-    matrix: Array
+    matrix: FloatArray
     mode: complex | None
     members: int
 
@@ -52,7 +225,7 @@ class WeakestMember:
         )
 
 
-def pair_margin(A: Array, C: Array, discrete: bool) -> tuple[float, complex | None]:
+def pair_margin(A: FloatArray, C: FloatArray, discrete: bool) -> tuple[float, complex | None]:
     """Distance of a pair from a hidden mode that does not decay."""
     margin, where = 1.0, None
     for mode in np.linalg.eigvals(A).tolist():
@@ -109,7 +282,7 @@ def weakest_member(split: Split, bounds: JacobianBounds) -> WeakestMember:
     discrete = split.model.Ts is not None
     looked = 0
 
-    def margin(scalars: Array) -> tuple[float, complex | None]:
+    def margin(scalars: FloatArray) -> tuple[float, complex | None]:
         nonlocal looked
         looked += 1
         inside = np.clip(scalars, low, high)

@@ -8,7 +8,8 @@ import numpy as np
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
-from obsynth.derive.structure.conditions import detectability, unknown_input_condition
+from obsynth.derive.structure.decoupling import unknown_input_condition
+from obsynth.derive.structure.detectability import detectability
 from obsynth.designs.bounded_error.noise import noise_box
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.symbolic import Plant, Role

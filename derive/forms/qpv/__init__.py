@@ -1,1 +1,1 @@
-"""Quadratic parameter-varying forms."""
+"""What is the plant when products of states are kept? Its quadratic form."""

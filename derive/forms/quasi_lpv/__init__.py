@@ -1,1 +1,1 @@
-"""Quasi-LPV forms: A(rho), B(rho) with scheduling ranges and an exact identity."""
+"""What is the plant as A(rho) x + B(rho) u? Its quasi-LPV form, with scheduling ranges."""

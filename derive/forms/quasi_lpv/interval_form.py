@@ -17,11 +17,11 @@ from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour.numbers import enclose_number, rational
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
-Bounds = tuple[Array, Array]
+Bounds = tuple[FloatArray, FloatArray]
 _BLOCKS = ("A", "B", "offset")
 
 
@@ -46,8 +46,8 @@ class IntervalForm:
     lower: dict[str, sp.Matrix]
     upper: dict[str, sp.Matrix]
     how: dict[str, NDArray[np.object_]]
-    minimum: dict[str, Array]
-    maximum: dict[str, Array]
+    minimum: dict[str, FloatArray]
+    maximum: dict[str, FloatArray]
     _program: dict[str, Program] = field(default_factory=dict, repr=False)
 
     @property
@@ -61,12 +61,12 @@ class IntervalForm:
         return self.upper["A"]
 
     @property
-    def A_min(self) -> Array:
+    def A_min(self) -> FloatArray:
         """Least lower bound of A over the domain, shape (n, n)."""
         return self.minimum["A"]
 
     @property
-    def A_max(self) -> Array:
+    def A_max(self) -> FloatArray:
         """Largest upper bound of A over the domain, shape (n, n)."""
         return self.maximum["A"]
 
@@ -76,7 +76,7 @@ class IntervalForm:
         return tuple(k.argument for k in self.known)
 
     @property
-    def domain(self) -> Array:
+    def domain(self) -> FloatArray:
         """Where the bounds are guaranteed, shape (number of arguments, 2)."""
         return np.array([(k.lower, k.upper) for k in self.known], dtype=float).reshape(-1, 2)
 
@@ -258,7 +258,7 @@ def _constant_form(
 
 
 def _extremes(
-    matrix: sp.Matrix, arguments: list[sp.Symbol], domain: Array, rtol: float, effort: str
+    matrix: sp.Matrix, arguments: list[sp.Symbol], domain: FloatArray, rtol: float, effort: str
 ) -> Bounds:
     symbols = [ca.SX.sym(str(a)) for a in arguments]
     table = dict(zip(arguments, symbols, strict=True))
