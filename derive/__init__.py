@@ -17,7 +17,7 @@ from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.dependence import AffineDependence
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
+from obsynth.derive.polytopes.fewer import principal_family
 from obsynth.derive.polytopes.polytope import (
     Polytope,
     polytope_from_halfspaces,
@@ -28,18 +28,9 @@ from obsynth.derive.remainder.certify import discretisation_remainder
 from obsynth.derive.remainder.flow import FlowError
 from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.split import Split, split
-from obsynth.derive.structure.decoupling import Decoupling, decouple, unknown_input_condition
-from obsynth.derive.structure.detectability import (
-    Detectability,
-    WeakestMember,
-    augmented_pair,
-    detectability,
-    weakest_member,
-)
 from obsynth.derive.structure.excitation import Excitation, excitation
 from obsynth.derive.structure.isolability import FaultIsolability, fault_isolability
 from obsynth.derive.structure.report import Check, StructureReport, analyse
-from obsynth.derive.structure.zeros import PolytopeZeros, system_zeros, zeros_over_polytope
 
 __all__ = [
     "QPV",
@@ -47,9 +38,7 @@ __all__ = [
     "AffineFamily",
     "CentredForm",
     "Check",
-    "Decoupling",
     "DerivationError",
-    "Detectability",
     "Equilibrium",
     "Excitation",
     "FaultIsolability",
@@ -63,7 +52,6 @@ __all__ = [
     "Majorant",
     "Maximum",
     "Polytope",
-    "PolytopeZeros",
     "PolytopicForm",
     "QPVVertices",
     "QuasiLPV",
@@ -75,14 +63,9 @@ __all__ = [
     "StructureError",
     "StructureReport",
     "UnboundedError",
-    "WeakestMember",
     "analyse",
-    "augmented_pair",
     "bound_ranges",
-    "decouple",
-    "detectability",
     "discretisation_remainder",
-    "drop_scalars",
     "equilibrium",
     "excitation",
     "fault_isolability",
@@ -96,8 +79,4 @@ __all__ = [
     "qpv",
     "quasi_lpv",
     "split",
-    "system_zeros",
-    "unknown_input_condition",
-    "weakest_member",
-    "zeros_over_polytope",
 ]

@@ -30,35 +30,8 @@ def drop_scalars(
 ) -> AffineFamily:
     """Fix scalars at the middle of their ranges and keep their variation as an interval.
 
-    Parameters
-    ----------
-    family : AffineFamily
-        Matrices affine in scalars.
-    drop : sequence of int, optional
-        Positions of the scalars to be dropped.
-    most_vertices : int, optional
-        In place of ``drop``: drop the scalars that move the matrix least until the family has no
-        more vertices than this.
-
-    Returns
-    -------
-    AffineFamily
-        With fewer scalars and a larger ``radius``; it holds every matrix of the given one.
-
-    Raises
-    ------
-    DerivationError
-        Positions that do not exist, or neither or both of the options.
-
-    Examples
-    --------
-    >>> one = np.eye(2)
-    >>> family = AffineFamily(
-    ...     np.zeros((2, 2)), np.array([np.diag(e) for e in one]),
-    ...     np.array([[0.0, 4.0], [1.0, 1.5]]), np.zeros((2, 2)), ("a", "b"), True)
-    >>> fewer = drop_scalars(family, most_vertices=2)
-    >>> fewer.labels, fewer.constant[1, 1], round(fewer.radius[1, 1], 12)
-    (('a',), np.float64(1.25), np.float64(0.25))
+    drop: positions; most_vertices: in place of them, drop what moves the matrix least. The family
+    found has a larger ``radius`` and holds every matrix of the given one.
     """
     count = len(family.ranges)
     if (drop is None) == (most_vertices is None):

@@ -37,22 +37,13 @@ def _rounded(matrix: Any) -> FloatArray:
 class Decoupling:
     """Matrices that remove the unknown input from the estimation error.
 
-    Attributes
-    ----------
-    E : ndarray of shape (n, m)
-        Eq. (13), as stored.
-    T : ndarray of shape (n, n)
-        ``I + E C`` rounded to doubles.
-    Pi : ndarray of shape (m, m)
-        ``I + C E`` rounded to doubles.
-    rank : int
-        Rank of D and of C D: the number q of unknown inputs.
-    residual : float
-        Largest entry of ``|(I + E C) D|`` for the stored doubles, computed
-        exactly: 0 where the decoupling is exact.
-    projector : bool
-        Whether ``I + E C`` of the stored doubles is exactly a projector and
-        equal to `T`.
+    E: eq. (13), as stored
+    T: ``I + E C`` rounded to doubles
+    Pi: ``I + C E`` rounded to doubles
+    rank: rank of D and of C D: the number q of unknown inputs
+    residual: largest entry of ``|(I + E C) D|`` for the stored doubles, computed exactly: 0 where
+        the decoupling is exact
+    projector: whether ``I + E C`` of the stored doubles is exactly a projector and equal to `T`
     """
 
     E: FloatArray
@@ -66,31 +57,7 @@ class Decoupling:
 def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     """Compute E, T and Pi in exact arithmetic and round them to doubles.
 
-    Parameters
-    ----------
-    C : ndarray of shape (m, n)
-    D : ndarray of shape (n, q)
-        With ``rank(C D) = q``; q = 0 gives E = 0.
-
-    Returns
-    -------
-    Decoupling
-
-    Raises
-    ------
-    StructureError
-        If C D has no full column rank.
-
-    Notes
-    -----
-    Buciakowski et al., eqs. (13)-(14).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> d = decouple(np.eye(2), np.array([[0.0], [1.0]]))
-    >>> d.T.tolist(), d.residual
-    ([[1.0, 0.0], [0.0, 0.0]], 0.0)
+    Buciakowski et al., eqs. (13)-(14); C (m, n), D (n, q). Refuses a C D without full column rank.
     """
     from flint import fmpq_mat
 
@@ -139,30 +106,6 @@ def unknown_input_condition(split: Split) -> Decoupling:
     """Check rank(D) = rank(C D) = q and return the matrices that decouple the unknown inputs.
 
     Assumption 4 and equation (13) of Buciakowski et al.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-
-    Returns
-    -------
-    Decoupling
-        E, T and Pi.
-
-    Raises
-    ------
-    StructureError
-        The unknown inputs cannot be decoupled; ``symbols`` names those concerned, ``states`` what
-        they act on, ``rank_D`` and ``rank_CD`` are the numbers.
-
-    Examples
-    --------
-    >>> from obsynth.derive.split import split
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
-    >>> np.diag(unknown_input_condition(parts).T).tolist()
-    [1.0, 1.0, 0.0, 1.0]
     """
     model, D, C = split.model, split.D, split.C
     n, m, q = len(D), len(C), D.shape[1]

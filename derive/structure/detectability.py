@@ -23,15 +23,10 @@ _MODE_TOLERANCE = 1e-9
 class Detectability:
     """Outcome of the test of Popov, Belevitch and Hautus at every vertex.
 
-    Attributes
-    ----------
-    vertices : int
-        Number of vertices tested.
-    margin : float
-        Smallest singular value found, with the columns scaled to norm one; 1 when no vertex has
-        a mode that does not decay by itself.
-    hidden_modes : tuple of complex
-        Modes that no output sees at some vertex but that decay, the slowest last.
+    vertices: number of vertices tested
+    margin: smallest singular value found, with the columns scaled to norm one; 1 when no vertex has
+        a mode that does not decay by itself
+    hidden_modes: modes that no output sees at some vertex but that decay, the slowest last
     """
 
     vertices: int
@@ -45,21 +40,8 @@ def augmented_pair(
     """State and faults after the unknown inputs are removed.
 
     Equations (14)-(17) of Buciakowski et al. with M added to A; sensor faults, which the paper
-    does not have, enter through D_f.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    decoupling : Decoupling
-        From `unknown_input_condition`.
-    M : ndarray, shape (n, n)
-        A matrix of the Jacobian family of g.
-
-    Returns
-    -------
-    (ndarray, ndarray)
-        [T (A + M), T B_f + E D_f; 0, I] (0 in place of I in continuous time) and [C, D_f].
+    does not have, enter through D_f. M (n, n) is a Jacobian of g; the pair is [T (A + M),
+    T B_f + E D_f; 0, I] (0 in place of I in continuous time) and [C, D_f].
     """
     n, n_f = split.B_f.shape
     keep = np.eye(n_f) if split.model.Ts is not None else np.zeros((n_f, n_f))
@@ -99,33 +81,6 @@ def detectability(split: Split, bounds: JacobianBounds) -> Detectability:
     The pair [T (A + M), T B_f; 0, I], [C, 0] must not have a mode of modulus >= 1 (real part >= 0
     in continuous time) that leaves all outputs at zero. Necessary for a design; the matrix
     inequalities are what suffices.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    bounds : JacobianBounds
-        Bounds of dg/dx.
-
-    Returns
-    -------
-    Detectability
-        Number of vertices, smallest margin, hidden modes that decay.
-
-    Raises
-    ------
-    StructureError
-        Faults or states that cannot be detected, in ``symbols``, with the mode and the vertex; or
-        unknown inputs that cannot be decoupled.
-
-    Examples
-    --------
-    >>> from obsynth.derive.jacobian.bounds import jacobian_bounds
-    >>> from obsynth.derive.split import split
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
-    >>> detectability(parts, jacobian_bounds(parts)).vertices
-    16
     """
     decoupling = unknown_input_condition(split)
     model = split.model
@@ -194,19 +149,12 @@ def _undetectable(
 class WeakestMember:
     """The member of a Jacobian family that is hardest to observe, as far as a search finds it.
 
-    Attributes
-    ----------
-    margin : float
-        Smallest singular value of [z I - A; C] with columns of size one, over the modes z that do
-        not decay.
-    scalars : dict of str to float
-        The scalars of the family there.
-    matrix : ndarray, shape (n, n)
-        The Jacobian there.
-    mode : complex or None
-        The mode; None when all modes decay by themselves everywhere.
-    members : int
-        How many were looked at.
+    margin: smallest singular value of [z I - A; C] with columns of size one, over the modes z that
+        do not decay
+    scalars: the scalars of the family there
+    matrix: the Jacobian there
+    mode: the mode; None when all modes decay by themselves everywhere
+    members: how many were looked at
     """
 
     margin: float
@@ -246,33 +194,6 @@ def weakest_member(split: Split, bounds: JacobianBounds) -> WeakestMember:
     Detectable vertices do not make a detectable polytope: with x2 seen through s x2 only, both
     s = -1 and s = 1 are fine and s = 0 is not. The search looks at the middle, at scalars that
     pass through zero, at random members, and improves the worst of them.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    bounds : JacobianBounds
-        Bounds of dg/dx.
-
-    Returns
-    -------
-    WeakestMember
-        What was found.
-
-    Raises
-    ------
-    StructureError
-        A member with a hidden mode that does not decay; ``scalars`` says which. Or unknown inputs
-        that cannot be decoupled.
-
-    Examples
-    --------
-    >>> from obsynth.derive.jacobian.bounds import jacobian_bounds
-    >>> from obsynth.derive.split import split
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
-    >>> weakest_member(parts, jacobian_bounds(parts)).margin > 1e-3
-    True
     """
     from scipy.optimize import minimize
 

@@ -23,36 +23,17 @@ def system_zeros(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> 
 
     The algorithm of Emami-Naeini and Van Dooren removes from the pencil everything that is
     infinite or singular by orthogonal transformations, for any number of inputs and outputs and
-    any normal rank; what is left has an invertible D, and its zeros are eigenvalues.
+    any normal rank; what is left has an invertible D, and its zeros are eigenvalues. A (n, n),
+    B (n, k), C (m, n), D (m, k); the largest modulus first, a multiple zero as often as it occurs,
+    hidden modes as far as they lower the rank.
 
-    Parameters
-    ----------
-    A, B, C, D : ndarray, shapes (n, n), (n, k), (m, n), (m, k)
-        The system.
-
-    Returns
-    -------
-    ndarray of complex
-        The largest modulus first, a multiple zero as often as it occurs. Modes that the outputs do
-        not see or the inputs do not reach are among them as far as they lower the rank.
-
-    Notes
-    -----
     Rounding the entries of a system splits a zero of multiplicity k by about eps^(1/k), 1e-4 for
     k = 4, in exact arithmetic too: the doubles next to 3.6, 4.32 and 1.728 are not the
     coefficients of a cube. What a relative change of the entries of 1e-12 makes coincide is
     returned as one zero, their mean, which rounding hardly moves.
 
-    References
-    ----------
     A. Emami-Naeini, P. Van Dooren, Computation of zeros of linear multivariable systems,
     Automatica 18(4), 1982.
-
-    Examples
-    --------
-    >>> A, B = np.array([[-1.0, 0.0], [0.0, -2.0]]), np.array([[1.0], [1.0]])
-    >>> system_zeros(A, B, np.array([[1.0, 1.0]]), np.zeros((1, 1))).real.round(12).tolist()
-    [-1.5]
     """
     size = float(np.abs(A).max(initial=0.0)) or 1.0
     B, D = _unit_columns(B / size, D)
@@ -137,19 +118,12 @@ def _reduce(
 class PolytopeZeros:
     """Zeros from some signals to the outputs, at every vertex of the Jacobian family.
 
-    Attributes
-    ----------
-    signals : tuple of str
-        The inputs of the system: unknown inputs, or these and the faults.
-    zeros : tuple of ndarray of complex
-        At every vertex.
-    worst : complex or None
-        The zero that decays least: largest modulus, or real part in continuous time.
-    decays : bool
-        True when all of them decay, so that no motion of the signals can go on without a trace in
-        the outputs.
-    vertex : int or None
-        Where the worst one was found.
+    signals: the inputs of the system: unknown inputs, or these and the faults
+    zeros: at every vertex
+    worst: the zero that decays least: largest modulus, or real part in continuous time
+    decays: true when all of them decay, so that no motion of the signals can go on without a trace
+        in the outputs
+    vertex: where the worst one was found
     """
 
     signals: tuple[str, ...]
@@ -239,30 +213,6 @@ def zeros_over_polytope(
     From the unknown inputs to the outputs, zeros that decay are what an observer that decouples
     them needs (strong detectability, Hautus 1983). From unknown inputs and faults together, they
     are what reconstructing the faults with a stable inverse needs.
-
-    Parameters
-    ----------
-    split : Split
-        The plant's matrices.
-    bounds : JacobianBounds
-        Bounds of dg/dx.
-    signals : {"unknown", "all"}
-        Unknown inputs only, or unknown inputs and faults.
-
-    Returns
-    -------
-    PolytopeZeros
-        Zeros at every vertex and the worst of them. Between the vertices they can be worse.
-
-    Examples
-    --------
-    >>> from obsynth.derive.jacobian.bounds import jacobian_bounds
-    >>> from obsynth.derive.split import split
-    >>> from obsynth.symbolic.plants import quadruple_tank
-    >>> parts = split(quadruple_tank().discretise("euler", Ts=1.0))
-    >>> found = zeros_over_polytope(parts, jacobian_bounds(parts), "all")
-    >>> round(found.worst.real, 6), found.decays
-    (0.99647, True)
     """
     model = split.model
     names = model.names("d") + (model.names("f") if signals == "all" else ())

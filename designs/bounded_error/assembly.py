@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive import JacobianBounds, Split, decouple
+from obsynth.derive import JacobianBounds, Split
+from obsynth.derive.structure.decoupling import decouple
 from obsynth.designs.bounded_error.claims import prove_ellipsoid
 from obsynth.designs.bounded_error.derivation_proof import prove_derivation
 from obsynth.designs.bounded_error.noise import noise_box

@@ -10,12 +10,12 @@ from obsynth.derive import (
     StructureError,
     UnboundedError,
     analyse,
-    detectability,
     equilibrium,
     jacobian_bounds,
     split,
-    unknown_input_condition,
 )
+from obsynth.derive.structure.decoupling import unknown_input_condition
+from obsynth.derive.structure.detectability import detectability
 
 CORRECT = {
     (0, 0): (0.002596, 0.006490),

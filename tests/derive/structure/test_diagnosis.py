@@ -7,9 +7,10 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive import StructureError, analyse, jacobian_bounds, split, unknown_input_condition
+from obsynth.derive import StructureError, analyse, jacobian_bounds, split
 from obsynth.derive.structure import isolability
 from obsynth.derive.structure import zeros as zeros_module
+from obsynth.derive.structure.decoupling import unknown_input_condition
 from obsynth.derive.structure.detectability import pair_margin, weakest_member
 from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.frozen import balls, precision, rank
