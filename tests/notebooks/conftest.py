@@ -3,9 +3,7 @@
 import json
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 
@@ -36,6 +34,10 @@ class Executed:
 @pytest.fixture(scope="session")
 def execute(tmp_path_factory):
     """Return a function of a notebook's name and of an expression to be evaluated at its end."""
+
+    # Half of what collecting all tests takes, if it stood above.
+    import nbformat
+    from nbclient import NotebookClient
 
     def run(name, question):
         notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
