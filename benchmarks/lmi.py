@@ -31,7 +31,7 @@ def proof_of_many() -> dict[str, Any]:
     """Prove 2^14 random blocks of 28 x 28 with a radius."""
     import numpy as np
 
-    from obsynth.designs.lmi import prove_positive_definite
+    from obsynth.derive.rigour import prove_positive_definite
 
     roots = np.random.default_rng(0).normal(size=(2**14, 28, 56))
     matrices = roots @ np.swapaxes(roots, 1, 2)

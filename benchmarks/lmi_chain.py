@@ -15,15 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import Enclosure, prove_positive_definite
 from obsynth.designs.lmi import (
-    Enclosure,
     Problem,
     RowMultipliers,
     UncertainRow,
     corner_block,
     full,
     prove_family,
-    prove_positive_definite,
     row_multipliers,
     solve_with_margin,
     split_common,

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.lmi import (
-    Enclosure,
-    ExactMatrix,
     Problem,
     extreme_points,
     full,

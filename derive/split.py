@@ -12,9 +12,10 @@ import sympy as sp
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.identity import IdentityProof, prove_identity
 from obsynth.derive.algebra.linear_parts import constant_columns
+from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.rigour.numbers import is_zero, rational, round_number, substitute
+from obsynth.derive.rigour import rational, round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.linear_parts import LinearPart
-from obsynth.derive.rigour.numbers import is_zero, substitute
+from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.rigour import substitute
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,7 @@ class IdentityProof:
     """
 
     methods: tuple[str, ...]
-    rounding: dict[str, Array]
+    rounding: dict[str, FloatArray]
 
     @property
     def holds(self) -> bool:

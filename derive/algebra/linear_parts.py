@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
+from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour.numbers import is_zero, round_number, substitute
+from obsynth.derive.rigour import round_number, substitute
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
 
@@ -22,8 +23,8 @@ class LinearPart:
     """
 
     exact: sp.Matrix
-    value: NDArray[np.float64]
-    rounding: NDArray[np.float64]
+    value: FloatArray
+    rounding: FloatArray
 
 
 def rounded(exact: sp.Matrix) -> LinearPart:

@@ -26,6 +26,25 @@ _LARGEST_SIMPLIFY = 600
 _GRID = 10**6
 
 
+def is_zero(expression: sp.Expr) -> str:
+    """Prove that an expression is identically zero, without looking at numbers; empty where not."""
+    expression = sp.sympify(expression)
+    if expression == 0:
+        return "syntactic"
+    expression = sp.expand(expression)
+    if expression == 0:
+        return "expand"
+    if expression.is_number and abs(expression.evalf(30)) > sp.Float("1e-20"):
+        return ""
+    for name, attempt in (("cancel", sp.cancel), ("simplify", sp.simplify)):
+        try:
+            if attempt(expression) == 0:
+                return name
+        except (sp.PolynomialError, NotImplementedError):
+            continue
+    return ""
+
+
 @dataclass(frozen=True, eq=False)
 class FormProof:
     """Proof that the parts of a form add up to the plant, row by row.

@@ -18,14 +18,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.constants.interval_matrix import sign_patterns
 from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
 from obsynth.derive.intervals.ranges import Status
-from obsynth.derive.rigour.eigenvalues import UNIT, finite, largest_eigenvalue, perron_bound, rotate
+from obsynth.derive.rigour import (
+    UNIT_ROUNDOFF,
+    down,
+    finite,
+    largest_eigenvalue,
+    perron_bound,
+    rotate,
+    up,
+)
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
-Array = NDArray[np.float64]
 EIGENVALUE_BUDGETS = {"fast": 500, "normal": 20_000, "tight": 400_000}
 _MOST_NUMBERS = 2_000_000
 _FEW_SIGNS = 3
@@ -80,11 +87,11 @@ class Maximum:
 
 @dataclass(frozen=True, eq=False)
 class _Boxes:
-    lower: Array
-    upper: Array
-    bound: Array
+    lower: FloatArray
+    upper: FloatArray
+    bound: FloatArray
 
-    def take(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "_Boxes":
+    def take(self, which: IntArray | BoolArray) -> "_Boxes":
         return _Boxes(self.lower[:, which], self.upper[:, which], self.bound[which])
 
     def join(self, other: "_Boxes") -> "_Boxes":
@@ -95,18 +102,20 @@ class _Boxes:
         )
 
 
-def interval_bound(field: SymmetricField, centre: Array, radius: Array) -> Array:
+def interval_bound(field: SymmetricField, centre: FloatArray, radius: FloatArray) -> FloatArray:
     """Bound the largest eigenvalue over a batch of interval matrices."""
     coupled = np.zeros((field.size, field.size), dtype=bool)
     coupled[field.rows, field.columns] = True
     patterns = sign_patterns(coupled | coupled.T, _FEW_SIGNS)
     if patterns is None:
-        return np.nextafter(largest_eigenvalue(centre)[1] + perron_bound(radius), np.inf)
+        return up(largest_eigenvalue(centre)[1] + perron_bound(radius))
     known = np.where(np.isfinite(radius), radius, 0.0)
     bound = np.full(len(centre), -np.inf)
     for signs in patterns:
         corner = centre + signs[:, None] * known * signs
-        bound = np.maximum(bound, largest_eigenvalue(corner, 2.0 * UNIT * np.abs(corner))[1])
+        bound = np.maximum(
+            bound, largest_eigenvalue(corner, 2.0 * UNIT_ROUNDOFF * np.abs(corner))[1]
+        )
     return np.where(finite(radius), bound, np.inf)
 
 
@@ -114,13 +123,13 @@ def interval_bound(field: SymmetricField, centre: Array, radius: Array) -> Array
 class _Expansion:
     """Second-order bound of a batch of boxes, and what it learnt."""
 
-    bound: Array
-    attained: Array
-    anchor: Array
-    loss: Array
+    bound: FloatArray
+    attained: FloatArray
+    anchor: FloatArray
+    loss: FloatArray
 
 
-def _anchor(boxes: _Boxes, found: FieldRange) -> Array:
+def _anchor(boxes: _Boxes, found: FieldRange) -> FloatArray:
     """Pick the point where the top eigenvalue seems largest: a corner where slopes have a sign."""
     top = np.linalg.eigh(np.where(np.isfinite(found.centre), found.centre, 0.0))[1][:, :, -1]
     slope = np.einsum("na,nvab,nb->vn", top, found.slope_centre, top)
@@ -136,14 +145,14 @@ def expansion_bound(
     anchor = _anchor(boxes, found)
     centre, radius = field.over(anchor, anchor)
     turned = rotate(centre, radius)
-    attained = turned.lower(np.nextafter(turned.values[:, -1] - turned.error, -np.inf))
+    attained = turned.lower(down(turned.values[:, -1] - turned.error))
     k, size = field.size, np.abs(turned.vectors)
     across, back = turned.vectors.transpose(0, 2, 1)[:, None], turned.vectors[:, None]
     slopes = across @ found.slope_centre @ back
-    spread = found.slope_radius + 1.01 * (2 * k + 6) * UNIT * np.abs(found.slope_centre)
+    spread = found.slope_radius + 1.01 * (2 * k + 6) * UNIT_ROUNDOFF * np.abs(found.slope_centre)
     doubt = np.swapaxes(size, 1, 2)[:, None] @ spread @ size[:, None] * (1.0 + 1e-14)
-    rise = np.where(boxes.upper > anchor, np.nextafter(boxes.upper - anchor, np.inf), 0.0).T
-    fall = np.where(anchor > boxes.lower, np.nextafter(anchor - boxes.lower, np.inf), 0.0).T
+    rise = np.where(boxes.upper > anchor, up(boxes.upper - anchor), 0.0).T
+    fall = np.where(anchor > boxes.lower, up(anchor - boxes.lower), 0.0).T
     reach = np.maximum(rise, fall)
     bound = np.full(len(anchor.T), np.inf)
     loss = reach * (np.abs(slopes) + doubt).max(axis=(2, 3))
@@ -152,11 +161,11 @@ def expansion_bound(
         for r in blocks:
             inner, outer = slice(k - r, k), slice(0, k - r)
             if r == 1:
-                up = slopes[:, :, -1, -1] + doubt[:, :, -1, -1]
-                down = -slopes[:, :, -1, -1] + doubt[:, :, -1, -1]
+                ahead = slopes[:, :, -1, -1] + doubt[:, :, -1, -1]
+                behind = -slopes[:, :, -1, -1] + doubt[:, :, -1, -1]
             else:
-                up = _top(slopes[:, :, inner, inner], doubt[:, :, inner, inner])
-                down = _top(-slopes[:, :, inner, inner], doubt[:, :, inner, inner])
+                ahead = _top(slopes[:, :, inner, inner], doubt[:, :, inner, inner])
+                behind = _top(-slopes[:, :, inner, inner], doubt[:, :, inner, inner])
             coupling = np.zeros_like(reach)
             price = np.zeros(len(bound))
             apart = np.ones(len(bound), dtype=bool)
@@ -171,10 +180,10 @@ def expansion_bound(
                 apart = room > 0.0
                 price = np.where(apart, total / room, np.inf) * (1.0 + 1e-13)
             push = np.where(coupling > 0.0, price[:, None] * coupling, 0.0)
-            excess = np.maximum(np.maximum(rise * (up + push), fall * (down + push)), 0.0)
+            excess = np.maximum(np.maximum(rise * (ahead + push), fall * (behind + push)), 0.0)
             value = turned.values[:, -1] + excess.sum(axis=1) * (1.0 + 1e-13)
             value = np.maximum(value, best) + turned.error
-            value = turned.upper(value + 4.0 * UNIT * np.abs(value))
+            value = turned.upper(value + 4.0 * UNIT_ROUNDOFF * np.abs(value))
             better = np.asarray(apart & (value < bound), dtype=np.bool_)
             bound = np.where(better, value, bound)
             loss = np.where(better[:, None], excess, loss)
@@ -182,7 +191,7 @@ def expansion_bound(
     return _Expansion(bound, attained, anchor, np.where(np.isfinite(loss), loss, np.inf))
 
 
-def _top(slopes: Array, doubt: Array) -> Array:
+def _top(slopes: FloatArray, doubt: FloatArray) -> FloatArray:
     n, v, r = slopes.shape[:3]
     symmetric = 0.5 * (slopes + np.swapaxes(slopes, 2, 3))
     wide = np.maximum(doubt, np.swapaxes(doubt, 2, 3)) + np.abs(symmetric - slopes)
@@ -195,7 +204,7 @@ def largest_over_box(
     names: Sequence[str],
     known: float = np.inf,
     known_method: str = "",
-    pieces: Sequence[tuple[Sequence[int], Array]] = (),
+    pieces: Sequence[tuple[Sequence[int], FloatArray]] = (),
     level: float = -np.inf,
     rtol: float = 1e-6,
     effort: str = "normal",
@@ -218,7 +227,7 @@ def largest_over_box(
             bound, known_method = found, "branch and bound over the box"
     status = Status.BUDGET
     reached = max(best, level)
-    if bound - reached <= max(64.0 * UNIT * field.size * scale, 1e-300):
+    if bound - reached <= max(64.0 * UNIT_ROUNDOFF * field.size * scale, 1e-300):
         status = Status.EXACT
     elif bound - reached <= tolerance:
         status = Status.CONVERGED
@@ -227,8 +236,8 @@ def largest_over_box(
 
 
 def _sample(
-    field: SymmetricField, pieces: Sequence[tuple[Sequence[int], Array]]
-) -> tuple[float, Array, float]:
+    field: SymmetricField, pieces: Sequence[tuple[Sequence[int], FloatArray]]
+) -> tuple[float, FloatArray, float]:
     """Best value over the middle, corners and random points; scale of the values.
 
     The best point is then improved by the pieces, one after the other while that helps.
@@ -260,7 +269,7 @@ def _sample(
     return best, where, scale
 
 
-def _values(field: SymmetricField, points: Array) -> tuple[Array, Array]:
+def _values(field: SymmetricField, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Attained largest eigenvalues, and the moduli of all eigenvalues."""
     centre, radius = field.over(points.T, points.T)
     usable = finite(radius)
@@ -271,11 +280,11 @@ def _values(field: SymmetricField, points: Array) -> tuple[Array, Array]:
 def _search(
     field: SymmetricField,
     best: float,
-    where: Array,
+    where: FloatArray,
     level: float,
     tolerance: float,
     budget: int,
-) -> tuple[float, float, Array, int]:
+) -> tuple[float, float, FloatArray, int]:
     v = max(field.variables, 1)
     chunk = max(8, min(1024, _MOST_NUMBERS // (v * field.size**2)))
     low, high = field.problem.lower, field.problem.upper
@@ -313,7 +322,7 @@ def _search(
     return max(closed, float(boxes.bound.max(initial=-np.inf))), attained, where, count
 
 
-def _halves(boxes: _Boxes, axis: NDArray[np.int64]) -> _Boxes:
+def _halves(boxes: _Boxes, axis: IntArray) -> _Boxes:
     columns = np.arange(len(axis))
     if not len(axis):
         return boxes

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from obsynth.derive.rigour.eigenvalues import UNIT, largest_eigenvalue, perron_bound
+from obsynth.derive.rigour import UNIT_ROUNDOFF, largest_eigenvalue, perron_bound, up
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
-Array = NDArray[np.float64]
 MOST_SIGNS = 16
 
 
@@ -32,11 +31,11 @@ class IntervalExtreme:
 
     upper: float
     attained: float
-    matrix: Array
+    matrix: FloatArray
     exact: bool
 
 
-def augment(matrix: Array) -> Array:
+def augment(matrix: FloatArray) -> FloatArray:
     """Return [0 A; A' 0], whose largest eigenvalue is the norm of A."""
     *front, m, n = matrix.shape
     result = np.zeros((*front, m + n, m + n))
@@ -45,7 +44,7 @@ def augment(matrix: Array) -> Array:
     return result
 
 
-def sign_patterns(coupled: NDArray[np.bool_], most: int = MOST_SIGNS) -> Array | None:
+def sign_patterns(coupled: BoolArray, most: int = MOST_SIGNS) -> FloatArray | None:
     """List the sign vectors that can make a difference."""
     k = len(coupled)
     free: list[int] = []
@@ -68,7 +67,7 @@ def sign_patterns(coupled: NDArray[np.bool_], most: int = MOST_SIGNS) -> Array |
     return patterns
 
 
-def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
+def eigenvalue_over_interval(centre: FloatArray, radius: FloatArray) -> IntervalExtreme:
     """Bound the largest eigenvalue of all symmetric matrices of an interval.
 
     D. Hertz, The extreme eigenvalues and stability of real symmetric interval matrices, IEEE
@@ -77,12 +76,12 @@ def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
     patterns = sign_patterns(radius > 0.0)
     if patterns is None:
         lower, upper = largest_eigenvalue(centre[None])
-        wide = float(np.nextafter(upper[0] + perron_bound(radius[None])[0], np.inf))
+        wide = float(up(upper[0] + perron_bound(radius[None])[0]))
         return IntervalExtreme(wide, float(lower[0]), centre, False)
     best, attained, matrix = -np.inf, -np.inf, centre
     for block in np.array_split(patterns, max(1, len(patterns) // 4096)):
         corners = centre + block[:, :, None] * radius * block[:, None, :]
-        rounding = UNIT * np.abs(corners) * 1.01
+        rounding = UNIT_ROUNDOFF * np.abs(corners) * 1.01
         lower, upper = largest_eigenvalue(corners, rounding)
         best = max(best, float(upper.max()))
         k = int(np.argmax(lower))
@@ -91,7 +90,7 @@ def eigenvalue_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
     return IntervalExtreme(best, attained, matrix, True)
 
 
-def norm_over_interval(centre: Array, radius: Array) -> IntervalExtreme:
+def norm_over_interval(centre: FloatArray, radius: FloatArray) -> IntervalExtreme:
     """Bound the norm of all matrices of an interval.
 
     J. Rohn, Bounds on eigenvalues of interval matrices, ZAMM 78(S3), 1998; M. Hladik, D. Daney,

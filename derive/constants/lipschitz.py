@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.interval_matrix import augment
@@ -14,11 +13,10 @@ from obsynth.derive.constants.matrix_maximum import EntryRanges, Hull, matrix_ma
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
+from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
-_UNIT = 2.0**-53
 _MOST_VERTICES = 4096
 _SAMPLES = 96
 
@@ -180,7 +178,7 @@ def lipschitz(
 
 
 def _inner(ball: Maximum, shift: float) -> InnerBound:
-    margin = 4.0 * _UNIT * (ball.upper**2 + shift**2)
+    margin = 4.0 * UNIT_ROUNDOFF * (ball.upper**2 + shift**2)
     beta = Maximum(
         ball.upper**2 - shift**2 + margin,
         max(ball.attained, 0.0) ** 2 - shift**2 - margin,
@@ -240,7 +238,9 @@ def _hull(bounds: JacobianBounds) -> Hull:
     if family.vertex_count > _MOST_VERTICES:
         return Hull(np.zeros((0, *bounds.min.shape)), np.zeros(bounds.min.shape))
     vertices = bounds.vertices()
-    rounding = 2.0 * (len(family.ranges) + 2) * _UNIT * np.abs(vertices).max(axis=0, initial=0.0)
+    rounding = (
+        2.0 * (len(family.ranges) + 2) * UNIT_ROUNDOFF * np.abs(vertices).max(axis=0, initial=0.0)
+    )
     return Hull(vertices, bounds.vertex_radius + rounding)
 
 

@@ -6,7 +6,6 @@ from html import escape
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.majorant_parts import (
@@ -22,9 +21,9 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
+from obsynth.derive.rigour import up
 from obsynth.derive.split import Split
-
-Array = NDArray[np.float64]
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +46,19 @@ class Majorant:
         Where g comes from.
     """
 
-    diagonal: Array
+    diagonal: FloatArray
     rows: tuple[RowMajorant, ...]
     groups: tuple[tuple[tuple[int, ...], tuple[int, ...], Maximum], ...]
-    rounding: Array
+    rounding: FloatArray
     split: Split
 
     @property
-    def matrix(self) -> Array:
+    def matrix(self) -> FloatArray:
         """M'M as a matrix, shape (n, n)."""
         return np.diag(self.diagonal)
 
     @property
-    def entry_bounds(self) -> Array:
+    def entry_bounds(self) -> FloatArray:
         """Guaranteed bounds of |dg_i/dx_j|, shape (n, n): one multiplier per entry."""
         bounds = np.zeros((len(self.diagonal), len(self.diagonal)))
         for part in self.rows:
@@ -217,7 +216,7 @@ def majorant(
                 total = total * (largest.upper * UP)
                 ratio = 1.0 / (largest.upper * UP)
                 largest = scaled(largest, ratio)
-        diagonal[list(columns)] = np.nextafter(total[list(columns)], np.inf)
+        diagonal[list(columns)] = up(total[list(columns)])
         groups.append((members, columns, largest))
     for j, value in given.items():
         diagonal[j] = value
@@ -250,7 +249,12 @@ def _fixed(
 
 
 def _scalar(
-    split: Split, entries: MatrixEntries, sizes: Array, rounding: Array, rtol: float, effort: str
+    split: Split,
+    entries: MatrixEntries,
+    sizes: FloatArray,
+    rounding: FloatArray,
+    rtol: float,
+    effort: str,
 ) -> Majorant:
     """Bound J'J by one number times the identity."""
     n = len(sizes)
@@ -258,7 +262,7 @@ def _scalar(
     if not rows:
         return Majorant(np.zeros(n), (), (), rounding, split)
     found = largest_together(entries, sizes, rows, np.ones(n), rtol, effort)
-    value = float(np.nextafter(found.upper, np.inf))
+    value = float(up(found.upper))
     columns = tuple(np.flatnonzero(sizes.any(axis=0)).tolist())
     parts = []
     for i in rows:

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.matrix_maximum import EntryRanges, matrix_maximum
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
-from obsynth.derive.rigour.numbers import rational
+from obsynth.derive.rigour import rational, up
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 UP = 1.0 + 2.0**-50
 """Covers the rounding of a few operations."""
 
@@ -37,8 +36,8 @@ class RowMajorant:
     """
 
     row: int
-    diagonal: Array
-    entries: Array
+    diagonal: FloatArray
+    entries: FloatArray
     largest: Maximum
 
 
@@ -49,7 +48,7 @@ def is_rounding(entry: sp.Expr, coefficient: float) -> bool:
     return bool(abs(sp.N(entry, 30)) <= 2.0**-52 * abs(coefficient))
 
 
-def connected_groups(sizes: Array) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def connected_groups(sizes: FloatArray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """Collect rows and columns that hang together."""
     groups: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
     left = set(np.flatnonzero(sizes.any(axis=1)).tolist())
@@ -91,7 +90,7 @@ def largest_value(
 
 def row_majorant(
     entries: MatrixEntries,
-    sizes: Array,
+    sizes: FloatArray,
     row: int,
     fixed: Mapping[int, float],
     names: tuple[str, ...],
@@ -126,7 +125,7 @@ def row_majorant(
         wanted = wanted / (1 - taken)
     found = largest_value(wanted, chosen, rtol, effort, "range of sum_j a_j^2 / d_j")
     for j in free:
-        diagonal[j] = np.nextafter(found.upper * direction[j] * UP, np.inf)
+        diagonal[j] = up(found.upper * direction[j] * UP)
     # with S the free part and B the fixed one, S / (1 - B) = t at the point of the largest value
     # gives S / t + B = 1 for t itself, and at least attained / t for what is attained
     return RowMajorant(row, diagonal, sizes, scaled(found, 1.0 / (found.upper * UP)))
@@ -146,9 +145,9 @@ def scaled(found: Maximum, factor: float) -> Maximum:
 
 def largest_together(
     entries: MatrixEntries,
-    sizes: Array,
+    sizes: FloatArray,
     rows: tuple[int, ...],
-    diagonal: Array,
+    diagonal: FloatArray,
     rtol: float,
     effort: str,
 ) -> Maximum:

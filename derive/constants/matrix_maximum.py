@@ -4,17 +4,15 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.constants.eigenvalue_search import Maximum, largest_over_box
 from obsynth.derive.constants.interval_matrix import augment, eigenvalue_over_interval
 from obsynth.derive.constants.symmetric_field import SymmetricField
 from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries
-from obsynth.derive.rigour.eigenvalues import largest_eigenvalue, perron_bound
+from obsynth.derive.rigour import UNIT_ROUNDOFF, down, largest_eigenvalue, perron_bound, up
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
-_UNIT = 2.0**-53
 _TINY = 1e-13
 
 
@@ -27,10 +25,10 @@ class EntryRanges:
         the entries
     """
 
-    lower: Array
-    upper: Array
-    points_lower: Array
-    points_upper: Array
+    lower: FloatArray
+    upper: FloatArray
+    points_lower: FloatArray
+    points_upper: FloatArray
 
     @classmethod
     def of(cls, entries: MatrixEntries, rtol: float, effort: str, what: str) -> "EntryRanges":
@@ -47,15 +45,17 @@ class Hull:
     radius: elementwise
     """
 
-    vertices: Array
-    radius: Array
+    vertices: FloatArray
+    radius: FloatArray
 
-    def moved(self, by: Array) -> "Hull":
+    def moved(self, by: FloatArray) -> "Hull":
         """Add a matrix to all."""
         if not by.any():
             return self
         moved = self.vertices + by
-        return Hull(moved, self.radius + 2.0 * _UNIT * np.abs(moved).max(axis=0, initial=0.0))
+        return Hull(
+            moved, self.radius + 2.0 * UNIT_ROUNDOFF * np.abs(moved).max(axis=0, initial=0.0)
+        )
 
     def augmented(self) -> "Hull":
         """Return [0 M; M' 0] of all."""
@@ -63,7 +63,7 @@ class Hull:
 
     def symmetric(self) -> "Hull":
         """Return (M + M')/2 of all."""
-        rounding = _UNIT * np.abs(self.vertices).max(axis=0, initial=0.0)
+        rounding = UNIT_ROUNDOFF * np.abs(self.vertices).max(axis=0, initial=0.0)
         return Hull(
             0.5 * (self.vertices + np.swapaxes(self.vertices, 1, 2)),
             0.5 * (self.radius + self.radius.T) + np.maximum(rounding, rounding.T),
@@ -77,7 +77,7 @@ class Hull:
 def matrix_maximum(
     entries: MatrixEntries,
     ranges: EntryRanges,
-    fixed: Array,
+    fixed: FloatArray,
     hull: Hull | None = None,
     rtol: float = 1e-6,
     effort: str = "normal",
@@ -111,12 +111,12 @@ def matrix_maximum(
         return best
     return replace(
         best,
-        upper=float(np.nextafter(best.upper + moved, np.inf)),
-        attained=float(np.nextafter(best.attained - moved, -np.inf)),
+        upper=float(up(best.upper + moved)),
+        attained=float(down(best.attained - moved)),
     )
 
 
-def _blocks(size: int, places: list[tuple[int, int]], fixed: Array) -> list[list[int]]:
+def _blocks(size: int, places: list[tuple[int, int]], fixed: FloatArray) -> list[list[int]]:
     """Collect sets of rows that entries couple, those with the widest reach first."""
     linked = fixed != 0.0
     for i, j in places:
@@ -150,7 +150,7 @@ def _larger(a: Maximum, b: Maximum, rtol: float) -> Maximum:
 def _block(
     entries: MatrixEntries,
     ranges: EntryRanges,
-    fixed: Array,
+    fixed: FloatArray,
     hull: Hull | None,
     block: list[int],
     inside: list[int],
@@ -160,8 +160,8 @@ def _block(
 ) -> Maximum:
     part = fixed[np.ix_(block, block)]
     if not inside:
-        low, up = (float(v[0]) for v in largest_eigenvalue(part[None]))
-        return Maximum(up, low, {}, Status.EXACT, "a constant block")
+        low, high = (float(v[0]) for v in largest_eigenvalue(part[None]))
+        return Maximum(high, low, {}, Status.EXACT, "a constant block")
     at = {k: position for position, k in enumerate(block)}
     places = [entries.places[k] for k in inside]
     centre_row = _common(places)
@@ -182,7 +182,7 @@ def _block(
         kept = hull.part(block)
         radius = np.broadcast_to(kept.radius, kept.vertices.shape)
         upper = float(largest_eigenvalue(kept.vertices, radius)[1].max())
-        if upper < known * (1.0 - 16.0 * _UNIT) or upper < known < 0.0:
+        if upper < known * (1.0 - 16.0 * UNIT_ROUNDOFF) or upper < known < 0.0:
             known, method = upper, f"{len(kept.vertices)} vertices of the Jacobian family"
     index = {name: k for k, name in enumerate(chosen.names)}
     pieces = []
@@ -216,7 +216,7 @@ def _root_of_squares(
         rtol=rtol,
         effort=effort,
     )
-    upper = float(np.nextafter(np.sqrt(max(found.upper[0], 0.0)), np.inf))
+    upper = float(up(np.sqrt(max(found.upper[0], 0.0))))
     attained = float(np.nextafter(np.sqrt(max(found.attained_upper[0], 0.0)), 0.0))
     at = chosen.named(found.points_upper[0])
     status = found.status_upper[0]

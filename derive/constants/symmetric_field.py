@@ -4,14 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.search.batch import Problem
-from obsynth.derive.rigour.eigenvalues import UNIT
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from obsynth.derive.rigour import UNIT_ROUNDOFF, middle_and_radius
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +20,11 @@ class FieldRange:
     smooth: where the derivatives say how the matrices change over the box
     """
 
-    centre: Array
-    radius: Array
-    slope_centre: Array
-    slope_radius: Array
-    smooth: Mask
+    centre: FloatArray
+    radius: FloatArray
+    slope_centre: FloatArray
+    slope_radius: FloatArray
+    smooth: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +40,9 @@ class SymmetricField:
     problem: Problem
     rows: Sequence[int]
     columns: Sequence[int]
-    fixed: Array
-    lower: Array
-    upper: Array
+    fixed: FloatArray
+    lower: FloatArray
+    upper: FloatArray
 
     @property
     def size(self) -> int:
@@ -57,7 +54,7 @@ class SymmetricField:
         """Number of variables of the box."""
         return len(self.problem.lower)
 
-    def _place(self, values: Array) -> Array:
+    def _place(self, values: FloatArray) -> FloatArray:
         """Put values, shape (m, ...), at both places of every expression."""
         k = self.size
         result = np.zeros((k, k, *values.shape[1:]))
@@ -66,25 +63,25 @@ class SymmetricField:
             result[j, i] = value
         return np.moveaxis(result, (0, 1), (-2, -1))
 
-    def over(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+    def over(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Enclose the matrices over boxes."""
         m = len(self.rows)
         found = enclose(self.problem.program, lower, upper, range(m), 0)
         return self._matrices(found.lower, found.upper)
 
-    def matrix_of_ranges(self) -> tuple[Array, Array]:
+    def matrix_of_ranges(self) -> tuple[FloatArray, FloatArray]:
         """Return centre and radius, shape (k, k), of the entrywise ranges over the whole box."""
         centre, radius = self._matrices(self.lower[:, None], self.upper[:, None])
         return centre[0], radius[0]
 
-    def _matrices(self, low: Array, high: Array) -> tuple[Array, Array]:
+    def _matrices(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
         low = np.maximum(low, self.lower[:, None])
         high = np.minimum(high, self.upper[:, None])
-        centre, radius = _split(low, high)
+        centre, radius = middle_and_radius(low, high)
         centre, radius = self._place(centre) + self.fixed, self._place(radius)
-        return centre, radius + 2.0 * UNIT * (np.abs(centre) + np.abs(self.fixed))
+        return centre, radius + 2.0 * UNIT_ROUNDOFF * (np.abs(centre) + np.abs(self.fixed))
 
-    def with_slopes(self, lower: Array, upper: Array) -> FieldRange:
+    def with_slopes(self, lower: FloatArray, upper: FloatArray) -> FieldRange:
         """Enclose matrices and derivatives over boxes."""
         problem, m = self.problem, len(self.rows)
         used = sorted({k for k in problem.gradient.ravel().tolist() if k >= 0})
@@ -101,7 +98,7 @@ class SymmetricField:
         finite = np.isfinite(slope_lower) & np.isfinite(slope_upper)
         smooth = np.asarray(finite.all(axis=(0, 1)) & ~found.rough[:m].any(axis=0), dtype=np.bool_)
         slope_lower, slope_upper = slope_lower * smooth, slope_upper * smooth
-        slope_centre, slope_radius = _split(
+        slope_centre, slope_radius = middle_and_radius(
             np.where(smooth, slope_lower, 0.0), np.where(smooth, slope_upper, 0.0)
         )
         return FieldRange(
@@ -111,13 +108,3 @@ class SymmetricField:
             np.swapaxes(self._place(slope_radius), 0, 1),
             smooth,
         )
-
-
-def _split(low: Array, high: Array) -> tuple[Array, Array]:
-    """Middle and radius of intervals, rounded outwards; infinite radius for the whole line."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        centre = 0.5 * low + 0.5 * high
-        radius = np.maximum(high - centre, centre - low)
-    known = np.isfinite(centre) & np.isfinite(radius)
-    outward = np.where(radius > 0.0, np.nextafter(radius, np.inf), 0.0)
-    return np.where(known, centre, 0.0), np.where(known, outward, np.inf)

@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.rigour.numbers import rational, substitute
+from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 

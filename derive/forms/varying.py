@@ -13,7 +13,7 @@ from obsynth.derive.algebra.zero_test import FormProof, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.rigour.numbers import round_number
+from obsynth.derive.rigour import round_number
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal

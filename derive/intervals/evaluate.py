@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.schedule import Schedule
-from obsynth.derive.rigour.interval import Array
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
-class Enclosure:
+class OutputRanges:
     """Ranges of outputs over a batch, and where their derivatives can be relied upon.
 
     lower, upper: the ranges
@@ -20,14 +19,14 @@ class Enclosure:
         neither monotonicity nor the mean-value form says anything
     """
 
-    lower: Array
-    upper: Array
-    rough: NDArray[np.bool_]
+    lower: FloatArray
+    upper: FloatArray
+    rough: BoolArray
 
 
 def evaluate(
-    program: Program, lower: Array, upper: Array, outputs: Sequence[int] | None = None
-) -> tuple[Array, Array]:
+    program: Program, lower: FloatArray, upper: FloatArray, outputs: Sequence[int] | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Enclose outputs of a program over every box of a batch."""
     chosen = range(len(program.outputs)) if outputs is None else outputs
     result = enclose(program, lower, upper, chosen, 0)
@@ -35,8 +34,8 @@ def evaluate(
 
 
 def enclose(
-    program: Program, lower: Array, upper: Array, outputs: Sequence[int], judged: int
-) -> Enclosure:
+    program: Program, lower: FloatArray, upper: FloatArray, outputs: Sequence[int], judged: int
+) -> OutputRanges:
     """Enclose outputs as `evaluate` does and judge the smoothness of the first few."""
     schedule = program.schedule(outputs, judged)
     values = schedule.run(lower, upper)
@@ -45,7 +44,7 @@ def enclose(
     rough[:judged] = schedule.rough(values)
     unknown = np.isnan(lo) | np.isnan(hi)
     lo[unknown], hi[unknown] = -np.inf, np.inf
-    return Enclosure(lo, hi, rough)
+    return OutputRanges(lo, hi, rough)
 
 
 _SENTENCES = {
@@ -64,7 +63,7 @@ _SENTENCES = {
 }
 
 
-def first_failure(program: Program, lower: Array, upper: Array, output: int) -> str:
+def first_failure(program: Program, lower: FloatArray, upper: FloatArray, output: int) -> str:
     """Name the first operation without a finite result in one box."""
     nodes = program.decisive(output)
     values = Schedule(program, program.live([output]), nodes).run(lower[:, None], upper[:, None])

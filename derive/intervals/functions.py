@@ -10,7 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from obsynth.derive.rigour.interval import Array, Interval, Mask, absolute, hull, negate, up, widen
+from obsynth.derive.rigour import Interval, up
+from obsynth.derive.rigour.interval import absolute, hull, negate, widen
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 ULPS = 8
 _HALF_PI = 0.5 * np.pi
@@ -19,7 +21,7 @@ _LARGE_ANGLE = 1e8
 
 
 def increasing(
-    function: Callable[[Array], Array],
+    function: Callable[[FloatArray], FloatArray],
     bottom: float = -np.inf,
     top: float = np.inf,
     domain: tuple[float, float] = (-np.inf, np.inf),
@@ -37,14 +39,16 @@ def increasing(
     return rule
 
 
-def _crossings(a: Interval, phase: float, period: float) -> Mask:
+def _crossings(a: Interval, phase: float, period: float) -> BoolArray:
     """Tell whether some phase + k period may lie inside; true rather than wrong."""
     margin = 1e-15 * (np.abs(a[0]) + np.abs(a[1]) + 4.0)
     first = np.ceil((a[0] - phase - margin) / period)
     return np.asarray(first * period <= a[1] - phase + margin)
 
 
-def _wave(function: Callable[[Array], Array], a: Interval, crest: float, trough: float) -> Interval:
+def _wave(
+    function: Callable[[FloatArray], FloatArray], a: Interval, crest: float, trough: float
+) -> Interval:
     left, right = function(a[0]), function(a[1])
     lo, hi = widen((np.minimum(left, right), np.maximum(left, right)), ULPS)
     unknown = ~(np.maximum(np.abs(a[0]), np.abs(a[1])) < _LARGE_ANGLE)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.intervals.rules import COMMUTATIVE, RULES
-from obsynth.derive.rigour.interval import Array, Interval, point
+from obsynth.derive.rigour import Interval
+from obsynth.derive.rigour.interval import point
+from obsynth.symbolic.arrays import FloatArray
 
 _RATIONAL: dict[str, Callable[..., Fraction]] = {
     "add": lambda a, b: a + b,
@@ -59,7 +61,7 @@ class Graph:
         self._known[node] = index
         return index
 
-    def _without_rounding(self, node: Node, lo: Array, hi: Array) -> Interval:
+    def _without_rounding(self, node: Node, lo: FloatArray, hi: FloatArray) -> Interval:
         """Replace the enclosure of an operation on numbers by its result where that is a double.
 
         An exponent n - 1 has to stay an integer, or a power loses its negative bases.

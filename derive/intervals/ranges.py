@@ -15,7 +15,7 @@ from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.branch import Budget, Outcome
 from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.intervals.search.stages import staged
-from obsynth.derive.rigour.interval import Array
+from obsynth.symbolic.arrays import FloatArray
 
 
 class Status(StrEnum):
@@ -51,8 +51,8 @@ class Failure:
 
     index: int
     operation: str
-    lower: Array
-    upper: Array
+    lower: FloatArray
+    upper: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +78,13 @@ class Ranges:
         Work done.
     """
 
-    lower: Array
-    upper: Array
-    attained_lower: Array
-    attained_upper: Array
-    points_lower: Array
-    points_upper: Array
-    gap: Array
+    lower: FloatArray
+    upper: FloatArray
+    attained_lower: FloatArray
+    attained_upper: FloatArray
+    points_lower: FloatArray
+    points_upper: FloatArray
+    gap: FloatArray
     status_lower: list[Status]
     status_upper: list[Status]
     failures: tuple[Failure, ...]

@@ -4,14 +4,14 @@ from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals import functions as fn
+from obsynth.derive.rigour import Interval
 from obsynth.derive.rigour import interval as ar
-from obsynth.derive.rigour.interval import Array, Interval
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 
-def _erf(value: Array) -> Array:
+def _erf(value: FloatArray) -> FloatArray:
     from scipy.special import erf
 
     return np.asarray(erf(value), dtype=float)
@@ -169,7 +169,7 @@ JUMPS = frozenset(
 """Operations with a jump, of which CasADi's derivative knows nothing."""
 
 
-def uncertain(op: str, result: Interval, operands: list[Interval]) -> NDArray[np.bool_]:
+def uncertain(op: str, result: Interval, operands: list[Interval]) -> BoolArray:
     """Where an operation may jump or be undefined inside the box."""
     lo, hi = result
     if op in PARTIAL:

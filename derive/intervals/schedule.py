@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.graph import Graph
 from obsynth.derive.intervals.rules import PARTIAL, RULES, uncertain
-from obsynth.derive.rigour.interval import Array, Interval, Mask
+from obsynth.derive.rigour import Interval
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
-Rows = slice | NDArray[np.int64]
+Rows = slice | IntArray
 
 # Numbers in the working memory of a program, and limits of the boxes done together.
 _BLOCK = 1_000_000
@@ -40,7 +40,7 @@ class Values:
     row: row of every node that was asked for
     """
 
-    table: Array
+    table: FloatArray
     row: dict[int, int]
 
     def of(self, node: int) -> Interval:
@@ -107,7 +107,7 @@ class Schedule:
         position = {k: n for n, k in enumerate([*partial, *others])}
         self._under = [np.array([position[k] for k in some], dtype=np.int64) for some in breaks]
 
-    def run(self, lower: Array, upper: Array) -> Values:
+    def run(self, lower: FloatArray, upper: FloatArray) -> Values:
         """Enclose nodes over every box of a batch."""
         n = lower.shape[1]
         size = min(n, self._block)
@@ -125,13 +125,13 @@ class Schedule:
                 table[:, :, columns] = part[:, self._kept]
         return Values(table, self.row)
 
-    def _fill(self, table: Array) -> None:
+    def _fill(self, table: FloatArray) -> None:
         for step in self._steps:
             operands = [table[:, rows] for rows in step.operands]
             found = step.rule(*((a[0], a[1]) for a in operands), *step.extra)
             table[0, step.target], table[1, step.target] = found
 
-    def rough(self, values: Values) -> Mask:
+    def rough(self, values: Values) -> BoolArray:
         """Tell where an output may jump or be undefined in a box."""
         n = values.table.shape[2]
         result = np.zeros((len(self._under), n), dtype=bool)

@@ -12,7 +12,7 @@ from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name, find_dependences
 from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries, sample_entries
 from obsynth.derive.jacobian.family import AffineFamily, build_family
-from obsynth.derive.rigour.numbers import enclose_number
+from obsynth.derive.rigour import enclose_number
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant

@@ -13,9 +13,10 @@ import sympy as sp
 from numpy.typing import NDArray
 from sympy.core.relational import Relational
 
+from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import StructureError
 from obsynth.derive.intervals.ranges import bound_ranges
-from obsynth.derive.rigour.numbers import enclose_number, is_zero, substitute
+from obsynth.derive.rigour import enclose_number, substitute
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
 

@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
-from obsynth.derive.rigour.numbers import is_zero
+from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.symbolic.arrays import FloatArray
 
 Entry = tuple[int, int]

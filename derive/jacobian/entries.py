@@ -13,7 +13,7 @@ from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.rewriting.removable import remove_singularities
-from obsynth.derive.rigour.numbers import enclose_number, rational, substitute
+from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import nearest_double, to_sx

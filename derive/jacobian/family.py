@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name
-from obsynth.derive.rigour.numbers import round_number
+from obsynth.derive.rigour import round_number
 from obsynth.symbolic.arrays import FloatArray
 
 Entry = tuple[int, int]

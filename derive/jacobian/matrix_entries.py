@@ -18,7 +18,7 @@ from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.problem import make_problem
-from obsynth.derive.rigour.numbers import enclose_number, substitute
+from obsynth.derive.rigour import enclose_number, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx

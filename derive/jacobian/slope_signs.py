@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import rational, substitute
+from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Status
@@ -12,11 +11,12 @@ from obsynth.derive.jacobian.continuity import refuse_jumps
 from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.remainder.system import system
 from obsynth.derive.remainder.work import Work
-from obsynth.derive.rigour.interval import Interval, add, multiply
+from obsynth.derive.rigour import Interval
+from obsynth.derive.rigour.interval import add, multiply
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import check_method, sampling_time
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 _ORDER = {"euler": 2, "rk4": 5}
 _RANDOM = 32
 
@@ -119,7 +119,7 @@ def discretisation_remainder(
     )
 
 
-def _bounds(work: Work, rtol: float) -> tuple[Interval, int, Array]:
+def _bounds(work: Work, rtol: float) -> tuple[Interval, int, FloatArray]:
     """Intersect what holds; the order that was reached, and points where extremes may be.
 
     Lower orders come first: where enclosures of higher derivatives grow faster than powers of the
@@ -168,7 +168,9 @@ def _tail(work: Work, order: int) -> Interval:
         return np.full(n, -np.inf), np.full(n, np.inf)
 
 
-def _attained(work: Work, points: Array) -> tuple[Array, Array, tuple[dict[str, float], ...]]:
+def _attained(
+    work: Work, points: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[dict[str, float], ...]]:
     """Enclose the remainder at promising and at random points of the box."""
     dynamics = work.dynamics
     low, high = dynamics.lower[:, None], dynamics.upper[:, None]

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.evaluate import evaluate
@@ -13,8 +12,9 @@ from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.branch import maximise
 from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.remainder.system import System
+from obsynth.derive.rigour import down, up
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
-Array = NDArray[np.float64]
 _ATTEMPTS = 40
 _RTOL = 1e-2
 
@@ -23,7 +23,7 @@ class FlowError(DerivationError):
     """No box could be found that the solutions do not leave within a step."""
 
 
-def flow_box(dynamics: System, step: float) -> tuple[Array, Array]:
+def flow_box(dynamics: System, step: float) -> tuple[FloatArray, FloatArray]:
     """Enclose all solutions over one step that start in the box.
 
     A candidate box Y holds them when, for every state and both sides, Y reaches further out than
@@ -43,8 +43,8 @@ def flow_box(dynamics: System, step: float) -> tuple[Array, Array]:
         wrong = ~(np.isfinite(fall) & np.isfinite(rise))
         if wrong.any():
             raise _failure(dynamics, int(np.argmax(wrong)), bottom, top, step)
-        below = np.nextafter(low - np.nextafter(step * fall, np.inf), -np.inf)
-        above = np.nextafter(high + np.nextafter(step * rise, np.inf), np.inf)
+        below = down(low - up(step * fall))
+        above = up(high + up(step * rise))
         holds = (below > bottom) & (above < top)
         if holds.all():
             # what the slabs of a box that holds allow is an enclosure itself
@@ -62,7 +62,7 @@ def _problem(dynamics: System, row: int) -> Problem:
 
 
 def _rate(
-    problem: Problem, dynamics: System, bottom: Array, top: Array, row: int, side: int
+    problem: Problem, dynamics: System, bottom: FloatArray, top: FloatArray, row: int, side: int
 ) -> float:
     """Bound the outward rate of a state on the slab next to the box; never negative."""
     n = len(dynamics.names)
@@ -76,7 +76,9 @@ def _rate(
     return max(0.0, float(outcome.bound[1 if side > 0 else 0]))
 
 
-def _failure(dynamics: System, row: int, bottom: Array, top: Array, step: float) -> FlowError:
+def _failure(
+    dynamics: System, row: int, bottom: FloatArray, top: FloatArray, step: float
+) -> FlowError:
     name = dynamics.names[row]
     return FlowError(
         f"no box holds the solutions over a step of {step:g} s: next to the range of {name} "
@@ -89,20 +91,20 @@ def _failure(dynamics: System, row: int, bottom: Array, top: Array, step: float)
 
 
 def flow_tubes(
-    dynamics: System, first: Array, last: Array, held: Array, step: float
-) -> tuple[Array, Array]:
+    dynamics: System, first: FloatArray, last: FloatArray, held: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray]:
     """Enclose the solutions over one step from every small box of a batch."""
     program = dynamics.program(dynamics.rhs)
     others = np.vstack([held, np.zeros((1, first.shape[1]))])
     margin = 1e-12 * np.maximum(np.abs(first), np.abs(last)) + 1e-300
     lower, upper = first - margin, last + margin
-    found: NDArray[np.bool_] = np.zeros(first.shape[1], dtype=np.bool_)
+    found: BoolArray = np.zeros(first.shape[1], dtype=np.bool_)
     for attempt in range(_ATTEMPTS):
         with np.errstate(invalid="ignore", over="ignore"):
             low, high = evaluate(program, np.vstack([lower, others]), np.vstack([upper, others]))
-            fall = np.minimum(0.0, np.nextafter(step * low, -np.inf))
-            rise = np.maximum(0.0, np.nextafter(step * high, np.inf))
-            below, above = np.nextafter(first + fall, -np.inf), np.nextafter(last + rise, np.inf)
+            fall = np.minimum(0.0, down(step * low))
+            rise = np.maximum(0.0, up(step * high))
+            below, above = down(first + fall), up(last + rise)
             inside = (below >= lower) & (above <= upper)
             found = np.asarray(inside.all(axis=0), dtype=np.bool_)
             if found.all():

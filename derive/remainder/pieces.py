@@ -7,18 +7,17 @@ pieces costs far less than gradients of a long program.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
+from obsynth.symbolic.arrays import FloatArray
 
-Array = NDArray[np.float64]
 PIECES = {"fast": 256, "normal": 4096, "tight": 65536}
 
 
 def hull_over_pieces(
-    program: Program, box: Array, pieces: int, cuts: Sequence[int] | None = None
-) -> tuple[Array, Array]:
+    program: Program, box: FloatArray, pieces: int, cuts: Sequence[int] | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Enclose all outputs of a program over a box."""
     lower, upper = box[:, :1].copy(), box[:, 1:].copy()
     for axis in plan_cuts(program, box, pieces) if cuts is None else cuts:
@@ -27,7 +26,7 @@ def hull_over_pieces(
     return low.min(axis=1), high.max(axis=1)
 
 
-def plan_cuts(program: Program, box: Array, pieces: int) -> list[int]:
+def plan_cuts(program: Program, box: FloatArray, pieces: int) -> list[int]:
     """Choose which variables to halve.
 
     Every variable is halved once for a trial; the cuts go where they promise most, each one half
@@ -61,7 +60,7 @@ def plan_cuts(program: Program, box: Array, pieces: int) -> list[int]:
     return cuts
 
 
-def _halve(lower: Array, upper: Array, axis: int) -> tuple[Array, Array]:
+def _halve(lower: FloatArray, upper: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
     middle = np.clip(0.5 * (lower[axis] + upper[axis]), lower[axis], upper[axis])
     left, right = upper.copy(), lower.copy()
     left[axis], right[axis] = middle, middle

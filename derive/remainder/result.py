@@ -5,13 +5,11 @@ from html import escape
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +44,13 @@ class Remainder:
     plant: Plant
     method: str
     exact_Ts: sp.Expr
-    lower: Array
-    upper: Array
-    attained_lower: Array
-    attained_upper: Array
+    lower: FloatArray
+    upper: FloatArray
+    attained_lower: FloatArray
+    attained_upper: FloatArray
     attained_at: tuple[dict[str, float], ...]
-    flow_lower: Array
-    flow_upper: Array
+    flow_lower: FloatArray
+    flow_upper: FloatArray
     order: int
     assumed: dict[str, tuple[float, float]]
     status: Status
@@ -63,12 +61,12 @@ class Remainder:
         return float(self.exact_Ts)
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> FloatArray:
         """Largest modulus per state, shape (n,)."""
         return np.maximum(np.abs(self.lower), np.abs(self.upper))
 
     @property
-    def excess(self) -> Array:
+    def excess(self) -> FloatArray:
         """Guaranteed width over attained width, per state; 1 is perfect, 1 too where both are 0."""
         wide, real = self.upper - self.lower, self.attained_upper - self.attained_lower
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -5,18 +5,17 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rules import JUMPS
-from obsynth.derive.rigour.numbers import enclose_number
+from obsynth.derive.rigour import enclose_number
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.plant import Plant
 
-Array = NDArray[np.float64]
 _HELD = ("u", "d", "f", "w", "p", "rho")
 
 
@@ -38,8 +37,8 @@ class System:
     rhs: ca.SX
     names: tuple[str, ...]
     held: tuple[str, ...]
-    lower: Array
-    upper: Array
+    lower: FloatArray
+    upper: FloatArray
     constants: ca.SX
     constant_box: list[tuple[float, float]]
 
@@ -48,7 +47,7 @@ class System:
         """States, held signals and time, as a column."""
         return ca.vertcat(self.x, self.v, self.s)
 
-    def box(self, lower: Array, upper: Array, step: float) -> Array:
+    def box(self, lower: FloatArray, upper: FloatArray, step: float) -> FloatArray:
         """Box for `variables` with other states, and time in [0, step]."""
         n = len(self.names)
         low = np.concatenate([lower[:n], self.lower[n:], [0.0]])
@@ -60,7 +59,7 @@ class System:
         function = ca.Function("column", [self.variables, self.constants], [ca.densify(column)])
         return Program.from_casadi(function, {1: self.constant_box})
 
-    def ranges(self, column: ca.SX, box: Array, what: str, rtol: float, effort: str) -> Ranges:
+    def ranges(self, column: ca.SX, box: FloatArray, what: str, rtol: float, effort: str) -> Ranges:
         """Bound one expression per state over a box."""
         found = bound_ranges(
             column,
@@ -89,7 +88,7 @@ class System:
             )
         return found
 
-    def may_jump(self, column: ca.SX, box: Array) -> bool:
+    def may_jump(self, column: ca.SX, box: FloatArray) -> bool:
         """Tell whether an expression contains an operation that may jump inside the box."""
         program = self.program(column)
         outputs = range(len(program.outputs))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.evaluate import enclose, evaluate
@@ -13,10 +12,10 @@ from obsynth.derive.remainder.flow import flow_box, flow_tubes
 from obsynth.derive.remainder.pieces import PIECES, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.system import System, step_derivatives, time_derivatives
 from obsynth.derive.remainder.trees import difference_term
-from obsynth.derive.rigour.interval import Interval, add, multiply, subtract
-from obsynth.derive.rigour.numbers import enclose_number
+from obsynth.derive.rigour import Interval, enclose_number, up
+from obsynth.derive.rigour.interval import add, multiply, subtract
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
-Array = NDArray[np.float64]
 _QUARTERS = 4
 _PARTS = 16
 _ZERO, _ONE = sp.Integer(0), sp.Integer(1)
@@ -48,7 +47,7 @@ class Work:
     dynamics: System
     method: str
     Ts: sp.Expr
-    flows: list[tuple[Array, Array]]
+    flows: list[tuple[FloatArray, FloatArray]]
     effort: str
 
     @classmethod
@@ -64,12 +63,12 @@ class Work:
         return enclose_number(self.Ts)[1]
 
     @property
-    def whole_box(self) -> Array:
+    def whole_box(self) -> FloatArray:
         """The plant's box, and the time within the step."""
         return self.dynamics.box(self.dynamics.lower, self.dynamics.upper, self.step)
 
     @property
-    def flow(self) -> Array:
+    def flow(self) -> FloatArray:
         """The flow box over the whole step."""
         return self.dynamics.box(*self.flows[-1], self.step)
 
@@ -134,18 +133,18 @@ class Work:
                 )
         return found
 
-    def attained(self, points: Array, order: int) -> Interval:
+    def attained(self, points: FloatArray, order: int) -> Interval:
         """Enclose the remainder at points, by the leading terms and a tail over their solutions."""
         dynamics, level = self.dynamics, order + 2
         n, count = len(dynamics.names), points.shape[1]
         lower, upper = points[:n], points[:n]
         held, zero = points[n:], np.zeros((1, count))
         starts, ends, weights = [], [], []
-        tubes: list[tuple[Array, Array]] = []
+        tubes: list[tuple[FloatArray, FloatArray]] = []
         for part in range(_PARTS):
             first, last = sp.Rational(part, _PARTS), sp.Rational(part + 1, _PARTS)
             early, late = enclose_number(first * self.Ts)[0], enclose_number(last * self.Ts)[1]
-            length = float(np.nextafter(late - early, np.inf))
+            length = float(up(late - early))
             lower, upper = flow_tubes(dynamics, lower, upper, held, length)
             tubes.append((np.vstack([lower, held, zero]), np.vstack([upper, held, zero])))
             starts.append(np.vstack([points, zero + early]))
@@ -171,7 +170,7 @@ class Work:
         return np.where(unknown, -np.inf, total[0]), np.where(unknown, np.inf, total[1])
 
 
-def _rough(dynamics: System, column: ca.SX, boxes: Interval) -> NDArray[np.bool_]:
+def _rough(dynamics: System, column: ca.SX, boxes: Interval) -> BoolArray:
     """Where an expression may jump or be undefined, over a batch of boxes."""
     program = dynamics.program(column)
     outputs = range(len(program.outputs))

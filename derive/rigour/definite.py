@@ -10,9 +10,11 @@ but not for whatever a tuned library may do.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.enclosure import UNIT_ROUNDOFF, Enclosure, gamma_bound
+from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.derive.rigour.rounding import UNIT_ROUNDOFF, down, gamma_bound
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 from obsynth.symbolic.errors import ObsynthError
 
 # Generous bound on all underflow errors of one factorisation of a matrix scaled to a unit
@@ -25,8 +27,6 @@ _SMALLEST = 2.0**-1022
 # Entries treated at a time, so that the work arrays stay in the cache.
 _CHUNK_ENTRIES = 2**17
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class ProofResult:
@@ -37,16 +37,16 @@ class ProofResult:
     relative: the same after scaling the diagonal to about one: compare vertices by this
     """
 
-    proved: NDArray[np.bool_]
-    margin: NDArray[np.float64]
-    relative: NDArray[np.float64]
+    proved: BoolArray
+    margin: FloatArray
+    relative: FloatArray
 
     @property
     def all_proved(self) -> bool:
         """Whether every matrix is proved."""
         return bool(self.proved.all())
 
-    def worst(self, count: int = 1) -> NDArray[np.intp]:
+    def worst(self, count: int = 1) -> IntArray:
         """Find the matrices with the smallest relative margin, worst first."""
         return np.argsort(self.relative, kind="stable")[:count]
 
@@ -69,7 +69,7 @@ def prove_positive_definite(
     lower, unscaled = np.concatenate(pieces, axis=1) if pieces else np.zeros((2, 0))
     proved = lower > 0
     # One step down covers the rounding of the sum.
-    bound = np.nextafter(floor + unscaled, -np.inf) if floor else unscaled
+    bound = down(floor + unscaled) if floor else unscaled
     return ProofResult(
         proved=proved,
         margin=np.where(proved, bound, -np.inf),
@@ -77,7 +77,7 @@ def prove_positive_definite(
     )
 
 
-def _prove(mid: Matrix, rad: Matrix, first: int, floor: float, sharp: bool) -> Matrix:
+def _prove(mid: FloatArray, rad: FloatArray, first: int, floor: float, sharp: bool) -> FloatArray:
     """Lower bounds of the smallest eigenvalues, scaled and unscaled, as two rows."""
     n = mid.shape[-1]
     with np.errstate(all="ignore"):
@@ -104,7 +104,9 @@ def _prove(mid: Matrix, rad: Matrix, first: int, floor: float, sharp: bool) -> M
     return np.stack([lower, unscaled])
 
 
-def _scaled(mid: Matrix, rad: Matrix, first: int) -> tuple[Matrix, Matrix, Matrix]:
+def _scaled(
+    mid: FloatArray, rad: FloatArray, first: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Symmetric midpoints with a diagonal near one, bounds of the radii's norms, the scale."""
     mirrored = np.swapaxes(mid, 1, 2)
     gap = np.abs(mid - mirrored)
@@ -130,7 +132,7 @@ def _scaled(mid: Matrix, rad: Matrix, first: int) -> tuple[Matrix, Matrix, Matri
     return mid * factor, _norm_bound(rad, factor), scale
 
 
-def _norm_bound(rad: Matrix, factor: Matrix) -> NDArray[np.float64]:
+def _norm_bound(rad: FloatArray, factor: FloatArray) -> FloatArray:
     """Upper bound of the spectral norm of any symmetric matrix within the scaled radius."""
     count, n = rad.shape[0], rad.shape[-1]
     if rad.strides[0] == 0 and not rad[:1].any():
@@ -147,7 +149,7 @@ def _norm_bound(rad: Matrix, factor: Matrix) -> NDArray[np.float64]:
     return np.broadcast_to(bound, count)
 
 
-def _factorise(centre: Matrix, shift: Matrix, spread: Matrix) -> Matrix:
+def _factorise(centre: FloatArray, shift: FloatArray, spread: FloatArray) -> FloatArray:
     """Proved lower bounds of the smallest eigenvalues, -inf where the factorisation fails."""
     n = centre.shape[-1]
     # The batch runs along the last, contiguous axis; row k of ``work`` becomes row k of R.

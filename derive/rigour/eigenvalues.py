@@ -9,20 +9,15 @@ Rayleigh quotients of A. Nothing is assumed about the quality of Q: a poor one g
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-UNIT = 2.0**-53
+from obsynth.derive.rigour.rounding import UNIT_ROUNDOFF, down, gamma_bound, up
+from obsynth.symbolic.arrays import BoolArray, FloatArray
+
 # What sums of products may lose to underflow; far below every tolerance.
 _UNDERFLOW = 1e-290
 
 
-def _gamma(operations: int) -> float:
-    """Relative error of ``operations`` roundings in a row, with room for the bound's own ones."""
-    return 1.01 * operations * UNIT
-
-
-def finite(matrices: Array) -> NDArray[np.bool_]:
+def finite(matrices: FloatArray) -> BoolArray:
     """Tell which matrices of a batch, shape (N, k, k), have finite entries only."""
     return np.asarray(np.isfinite(matrices).all(axis=(1, 2)), dtype=np.bool_)
 
@@ -37,31 +32,31 @@ class Rotation:
     defect: bound of the norm of Q'Q - I, below 1/2; infinite where LAPACK gave nothing of use
     """
 
-    values: Array
-    vectors: Array
-    error: Array
-    defect: Array
+    values: FloatArray
+    vectors: FloatArray
+    error: FloatArray
+    defect: FloatArray
 
-    def upper(self, value: Array) -> Array:
+    def upper(self, value: FloatArray) -> FloatArray:
         """Turn a bound of the largest eigenvalue of Q'AQ into one of A."""
         with np.errstate(all="ignore"):
             scaled = np.where(
                 value >= 0.0, value / (1.0 - self.defect), value / (1.0 + self.defect)
             )
-            result = np.nextafter(scaled + 4.0 * UNIT * np.abs(scaled), np.inf)
+            result = up(scaled + 4.0 * UNIT_ROUNDOFF * np.abs(scaled))
         return np.where(np.isfinite(self.defect) & np.isfinite(result), result, np.inf)
 
-    def lower(self, value: Array) -> Array:
+    def lower(self, value: FloatArray) -> FloatArray:
         """Turn a lower bound of a diagonal entry of Q'AQ into one of A's largest eigenvalue."""
         with np.errstate(all="ignore"):
             scaled = np.where(
                 value >= 0.0, value / (1.0 + self.defect), value / (1.0 - self.defect)
             )
-            result = np.nextafter(scaled - 4.0 * UNIT * np.abs(scaled), -np.inf)
+            result = down(scaled - 4.0 * UNIT_ROUNDOFF * np.abs(scaled))
         return np.where(np.isfinite(self.defect) & np.isfinite(result), result, -np.inf)
 
 
-def rotate(centre: Array, radius: Array) -> Rotation:
+def rotate(centre: FloatArray, radius: FloatArray) -> Rotation:
     """Diagonalise a batch of symmetric matrices, with a bound of what is left."""
     count, k = centre.shape[:2]
     usable = finite(centre) & finite(radius)
@@ -70,14 +65,14 @@ def rotate(centre: Array, radius: Array) -> Rotation:
     size = np.abs(vectors)
     across = size.transpose(0, 2, 1)
     image = vectors.transpose(0, 2, 1) @ (safe @ vectors)
-    spread = np.where(usable[:, None, None], radius, 0.0) + _gamma(2 * k + 4) * np.abs(safe)
-    charge = across @ (spread @ size) * (1.0 + _gamma(4 * k + 8))
+    spread = np.where(usable[:, None, None], radius, 0.0) + gamma_bound(2 * k + 4) * np.abs(safe)
+    charge = across @ (spread @ size) * (1.0 + gamma_bound(4 * k + 8))
     charge = charge + _UNDERFLOW * spread.any(axis=(1, 2), keepdims=True)
-    rest = np.abs(image - values[:, :, None] * np.eye(k)) * (1.0 + 4.0 * UNIT) + charge
-    error = rest.sum(axis=2).max(axis=1, initial=0.0) * (1.0 + _gamma(k + 4))
+    rest = np.abs(image - values[:, :, None] * np.eye(k)) * (1.0 + 4.0 * UNIT_ROUNDOFF) + charge
+    error = rest.sum(axis=2).max(axis=1, initial=0.0) * (1.0 + gamma_bound(k + 4))
     gram = np.abs(vectors.transpose(0, 2, 1) @ vectors - np.eye(k))
-    gram = gram + _gamma(k + 4) * (across @ size + 1.0)
-    defect = gram.sum(axis=2).max(axis=1, initial=0.0) * (1.0 + _gamma(k + 4))
+    gram = gram + gamma_bound(k + 4) * (across @ size + 1.0)
+    defect = gram.sum(axis=2).max(axis=1, initial=0.0) * (1.0 + gamma_bound(k + 4))
     good = usable & (defect < 0.5)
     return Rotation(
         values,
@@ -87,7 +82,9 @@ def rotate(centre: Array, radius: Array) -> Rotation:
     )
 
 
-def largest_eigenvalue(centre: Array, radius: Array | None = None) -> tuple[Array, Array]:
+def largest_eigenvalue(
+    centre: FloatArray, radius: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Bound the largest eigenvalue of every matrix of a batch from both sides."""
     radius = np.zeros_like(centre) if radius is None else radius
     if centre.shape[1] == 0:
@@ -97,18 +94,18 @@ def largest_eigenvalue(centre: Array, radius: Array | None = None) -> tuple[Arra
     with np.errstate(invalid="ignore"):
         upper = plain.upper(plain.values[:, -1] + plain.error)
         wide = radius.any(axis=(1, 2))
-        upper = np.where(wide, np.nextafter(upper + perron_bound(radius), np.inf), upper)
+        upper = np.where(wide, up(upper + perron_bound(radius)), upper)
         around = (
             np.where(wide, rotate(centre, radius).error, plain.error) if wide.any() else plain.error
         )
-        lower = plain.lower(np.nextafter(plain.values[:, -1] - around, -np.inf))
+        lower = plain.lower(down(plain.values[:, -1] - around))
     upper = np.where(finite(radius) & ~np.isnan(upper), upper, np.inf)
     lower = np.where(np.isnan(lower), -np.inf, lower)
     zero = ~(centre.any(axis=(1, 2)) | radius.any(axis=(1, 2)))
     return np.where(zero, 0.0, lower), np.where(zero, 0.0, upper)
 
 
-def perron_bound(matrix: Array) -> Array:
+def perron_bound(matrix: FloatArray) -> FloatArray:
     """Bound the largest eigenvalue of nonnegative symmetric matrices.
 
     For every positive vector v it is at most max_i (R v)_i / v_i (Collatz and Wielandt); v is close
@@ -126,7 +123,7 @@ def perron_bound(matrix: Array) -> Array:
         image = (safe @ vector[:, :, None])[:, :, 0]
         largest = np.maximum(image.max(axis=1, keepdims=True), 1e-300)
         vector = np.maximum(0.5 * (vector + image / largest), 1e-12)
-    image = (safe @ vector[:, :, None])[:, :, 0] * (1.0 + _gamma(k + 4)) + _UNDERFLOW
-    bound = (image / vector).max(axis=1) * (1.0 + 4.0 * UNIT)
-    rows = safe.sum(axis=2).max(axis=1) * (1.0 + _gamma(k + 2))
+    image = (safe @ vector[:, :, None])[:, :, 0] * (1.0 + gamma_bound(k + 4)) + _UNDERFLOW
+    bound = (image / vector).max(axis=1) * (1.0 + 4.0 * UNIT_ROUNDOFF)
+    rows = safe.sum(axis=2).max(axis=1) * (1.0 + gamma_bound(k + 2))
     return np.where(usable, np.where(safe.any(axis=(1, 2)), np.minimum(bound, rows), 0.0), np.inf)

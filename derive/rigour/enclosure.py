@@ -9,24 +9,16 @@ multiply-adds (N. J. Higham, Accuracy and Stability, section 3.1).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from obsynth.derive.rigour.exact import ExactMatrix
+from obsynth.derive.rigour.rounding import UNIT_ROUNDOFF, gamma_bound, raised, smallest_above
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-Matrix = NDArray[np.float64]
-
-UNIT_ROUNDOFF = 2.0**-53
-
-# Above any sum of underflow errors (2^-1074 each) of fewer than 2^50 operations.
-_UNDERFLOW = 2.0**-1022
-
-
-def gamma_bound(n: int) -> float:
-    """Upper bound of n u / (1 - n u), the relative error of n roundings."""
-    return n * UNIT_ROUNDOFF * (1.0 + 2.0**-10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +32,18 @@ class Enclosure:
     rad: radii, not negative; one radius for all vertices may be a broadcast view
     """
 
-    mid: Matrix
-    rad: Matrix
+    mid: FloatArray
+    rad: FloatArray
 
     __array_ufunc__ = None
 
     @classmethod
     def of(cls, value: Any, radius: ArrayLike = 0.0) -> Enclosure:
-        """Exact doubles, or doubles with a radius; enclosures pass unchanged."""
+        """Exact doubles, or doubles with a radius; exact matrices are rounded, enclosures pass."""
         if isinstance(value, Enclosure):
             return value
+        if isinstance(value, ExactMatrix):
+            return _rounded(value)
         mid = np.asarray(value, dtype=float)
         if mid.ndim == 0:
             mid = mid.reshape(1, 1)
@@ -75,7 +69,7 @@ class Enclosure:
         largest = np.abs(table).max(axis=0, initial=0.0)
         size = np.abs(centre.mid) + (largest @ np.abs(steps)).reshape(rows, columns)
         rad = centre.rad + (largest @ spread).reshape(rows, columns)
-        bound = _up(rad + gamma_bound(count + 1) * size, count + 8)
+        bound = raised(rad + gamma_bound(count + 1) * size, count + 8)
         return cls(mid, np.broadcast_to(bound, mid.shape))
 
     @property
@@ -117,7 +111,7 @@ class Enclosure:
         if self.shape != right.shape:
             raise ObsynthError(f"enclosures of shapes {self.shape} and {right.shape} do not fit")
         mid = self.mid + right.mid
-        return Enclosure(mid, _up(self.rad + right.rad + UNIT_ROUNDOFF * np.abs(mid), 4))
+        return Enclosure(mid, raised(self.rad + right.rad + UNIT_ROUNDOFF * np.abs(mid), 4))
 
     __radd__ = __add__
 
@@ -132,18 +126,18 @@ class Enclosure:
         mid = self.mid * right.mid
         left_size = np.abs(self.mid) + self.rad
         rad = left_size * right.rad + self.rad * np.abs(right.mid) + UNIT_ROUNDOFF * np.abs(mid)
-        return Enclosure(mid, _up(rad, 8))
+        return Enclosure(mid, raised(rad, 8))
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Enclosure:
         right = Enclosure.of(other)
-        smallest = np.abs(right.mid) * (1 - 2 * UNIT_ROUNDOFF) - _up(right.rad, 1)
+        smallest = np.abs(right.mid) * (1 - 2 * UNIT_ROUNDOFF) - raised(right.rad, 1)
         if not np.all(smallest > 0):
             raise ObsynthError("division by an enclosure that contains zero")
         mid = self.mid / right.mid
         rad = (self.rad + np.abs(mid) * right.rad) / smallest + 2 * UNIT_ROUNDOFF * np.abs(mid)
-        return Enclosure(mid, _up(rad, 12))
+        return Enclosure(mid, raised(rad, 12))
 
     def __rtruediv__(self, other: Any) -> Enclosure:
         return Enclosure.of(other) / self
@@ -159,17 +153,21 @@ class Enclosure:
             spread = spread + (left_size + self.rad) @ right.rad
         if np.any(self.rad):
             spread = spread + self.rad @ np.abs(right.mid)
-        return Enclosure(mid, _up(spread, inner + 8))
+        return Enclosure(mid, raised(spread, inner + 8))
 
     def __rmatmul__(self, other: Any) -> Enclosure:
         return Enclosure.of(other) @ self
 
 
+def _rounded(matrix: ExactMatrix) -> Enclosure:
+    """Nearest doubles, with what is lost."""
+    mid = matrix.to_floats()
+    lost = [
+        [smallest_above(abs(value - Fraction(near))) for value, near in zip(*rows, strict=True)]
+        for rows in zip(matrix.to_fractions(), mid.tolist(), strict=True)
+    ]
+    return Enclosure(mid, np.array(lost).reshape(mid.shape))
+
+
 def _is_zero(value: Any) -> bool:
     return isinstance(value, (int, float)) and value == 0
-
-
-def _up(bound: Matrix, roundings: int) -> Matrix:
-    """At least the exact value of a nonnegative formula computed with so many roundings."""
-    raised: Matrix = bound * (1.0 + 2.0 * gamma_bound(roundings + 2)) + _UNDERFLOW
-    return raised

@@ -13,24 +13,14 @@ operands outside a domain and from a division by an interval with zero inside.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Interval = tuple[Array, Array]
+from obsynth.derive.rigour.rounding import down, up
+from obsynth.symbolic.arrays import BoolArray, FloatArray
+
+Interval = tuple[FloatArray, FloatArray]
 
 _INF = np.inf
 _EPS = float(np.finfo(float).eps)
-
-
-def down(value: Array) -> Array:
-    """Step to the next double towards minus infinity."""
-    return np.nextafter(value, -_INF)
-
-
-def up(value: Array) -> Array:
-    """Step to the next double towards plus infinity; the counterpart of `down`."""
-    return np.nextafter(value, _INF)
 
 
 def point(value: float) -> Interval:
@@ -50,7 +40,9 @@ def hull(a: Interval, b: Interval) -> Interval:
     return np.minimum(a[0], b[0]), np.maximum(a[1], b[1])
 
 
-def _keep_zero(raw: Array, rounded: Array, possible: Callable[[], Mask]) -> Array:
+def _keep_zero(
+    raw: FloatArray, rounded: FloatArray, possible: Callable[[], BoolArray]
+) -> FloatArray:
     """Undo the rounding of an exact zero, unless the zero may come from underflow."""
     zero = raw == 0.0
     if not zero.any():
@@ -63,7 +55,7 @@ def negate(a: Interval) -> Interval:
     return -a[1], -a[0]
 
 
-def _sum(a: Array, b: Array) -> tuple[Array, Array]:
+def _sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Sum and the sign of what rounding took from it, exactly (Knuth); not a number on overflow."""
     total = a + b
     part = total - a
@@ -143,7 +135,7 @@ def power_int(a: Interval, n: int) -> Interval:
     return np.where(lo == 0.0, 0.0, ends[0]), np.where(hi == 0.0, 0.0, ends[1])
 
 
-def _squares_exactly(value: Array) -> Mask:
+def _squares_exactly(value: FloatArray) -> BoolArray:
     """Whether a square needs no rounding: up to 24 significant bits, far from under- and overflow.
 
     Ends of boxes are such numbers more often than not, and 1 - x**2 has to be 0 at x = 1 for a root
@@ -154,7 +146,7 @@ def _squares_exactly(value: Array) -> Mask:
     return np.asarray(short & ((value == 0.0) | (np.abs(value) > 1e-30)))
 
 
-def _powers(lo: Array, hi: Array, n: int) -> Interval:
+def _powers(lo: FloatArray, hi: FloatArray, n: int) -> Interval:
     # pow of the C library is good to an ulp; eight leave room for vectorised versions of it
     return widen((np.power(lo, n), np.power(hi, n)), 8)
 

@@ -1,4 +1,4 @@
-"""Between exact numbers and doubles: rounding with a proven bound, zero tests."""
+"""Between exact numbers of SymPy and doubles: rounding with a proven bound."""
 
 import math
 from collections.abc import Mapping
@@ -7,6 +7,7 @@ from fractions import Fraction
 import sympy as sp
 
 from obsynth.derive.errors import DerivationError
+from obsynth.derive.rigour.rounding import smallest_above
 
 _DIGITS = 60
 
@@ -32,7 +33,7 @@ def round_number(number: sp.Expr) -> tuple[float, float]:
     if number.is_Rational:
         exact = Fraction(int(number.p), int(number.q))
         value = float(exact)
-        return value, _upper(abs(exact - Fraction(value)))
+        return value, smallest_above(abs(exact - Fraction(value)))
     approximation = number.evalf(_DIGITS)
     if not approximation.is_Float or not approximation.is_finite:
         raise DerivationError(f"{number} is not a finite real number", expression=number)
@@ -48,29 +49,3 @@ def enclose_number(number: sp.Expr) -> tuple[float, float]:
     if error == 0.0:
         return value, value
     return math.nextafter(value, -math.inf), math.nextafter(value, math.inf)
-
-
-def _upper(distance: Fraction) -> float:
-    if distance == 0:
-        return 0.0
-    value = float(distance)
-    return value if Fraction(value) >= distance else math.nextafter(value, math.inf)
-
-
-def is_zero(expression: sp.Expr) -> str:
-    """Prove that an expression is identically zero."""
-    expression = sp.sympify(expression)
-    if expression == 0:
-        return "syntactic"
-    expression = sp.expand(expression)
-    if expression == 0:
-        return "expand"
-    if expression.is_number and abs(expression.evalf(30)) > sp.Float("1e-20"):
-        return ""
-    for name, attempt in (("cancel", sp.cancel), ("simplify", sp.simplify)):
-        try:
-            if attempt(expression) == 0:
-                return name
-        except (sp.PolynomialError, NotImplementedError):
-            continue
-    return ""

@@ -1,24 +1,62 @@
-"""Sums and products of nonnegative doubles rounded up, and exact matrices rounded to doubles.
+"""Doubles rounded to a chosen side.
 
-The l1 bounds of this room are sums of nonnegative terms, so one factor above
-the accumulated rounding error turns a computed value into an upper bound. The
-rounding mode is never changed: the factor rests on the error n u / (1 - n u) of
-a sum of n products in any order, with or without fused multiply-adds
-(N. J. Higham, Accuracy and Stability of Numerical Algorithms, section 3.1).
+The rounding mode is never changed. One operation is stepped outwards by one double (`down`, `up`);
+a formula with nonnegative terms only is multiplied by one factor above its accumulated rounding
+error (`raised`, `lowered`), which rests on the error n u / (1 - n u) of a sum of n products in any
+order, with or without fused multiply-adds (N. J. Higham, Accuracy and Stability of Numerical
+Algorithms, section 3.1).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from fractions import Fraction
 
 import numpy as np
 
-from obsynth.derive.rigour.enclosure import Enclosure, gamma_bound
-from obsynth.derive.rigour.exact_matrix import ExactMatrix
 from obsynth.symbolic.arrays import FloatArray
+
+UNIT_ROUNDOFF = 2.0**-53
+UNIT: Mapping[str, float] = {"double": UNIT_ROUNDOFF, "single": 2.0**-24}
+"""Unit roundoff of a precision."""
 
 # Above the underflow of fewer than 2^40 operations, whether or not it is flushed to zero.
 TINY = 2.0**-980
+
+
+def down(value: FloatArray | float) -> FloatArray:
+    """Step to the next double towards minus infinity."""
+    return np.nextafter(value, -np.inf)
+
+
+def up(value: FloatArray | float) -> FloatArray:
+    """Step to the next double towards plus infinity; the counterpart of `down`."""
+    return np.nextafter(value, np.inf)
+
+
+def smallest_above(value: Fraction) -> float:
+    """Return the smallest double that is not below a rational number."""
+    nearest = float(value)
+    return nearest if Fraction(nearest) >= value else math.nextafter(nearest, math.inf)
+
+
+def middle_and_radius(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Split intervals so that middle +- radius holds them; no radius where both ends are equal.
+
+    Intervals that are not finite get the middle 0 and an infinite radius.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        middle = 0.5 * low + 0.5 * high
+        radius = np.maximum(high - middle, middle - low)
+    known = np.isfinite(middle) & np.isfinite(radius)
+    outward = np.where(radius > 0.0, up(radius), 0.0)
+    return np.where(known, middle, 0.0), np.where(known, outward, np.inf)
+
+
+def gamma_bound(n: int) -> float:
+    """Upper bound of n u / (1 - n u), the relative error of n roundings."""
+    return n * UNIT_ROUNDOFF * (1.0 + 2.0**-10)
 
 
 def raised(value: FloatArray, roundings: int) -> FloatArray:
@@ -42,13 +80,11 @@ def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
     return raised(left @ right, left.shape[-1] + 1)
 
 
-def nearest(values: ExactMatrix) -> Enclosure:
-    """Round an exact matrix to doubles and bound what is lost."""
-    mid, rad = np.zeros(values.shape), np.zeros(values.shape)
-    for i, row in enumerate(values.to_fractions()):
-        for j, value in enumerate(row):
-            mid[i, j] = float(value)
-            lost = abs(value - Fraction(mid[i, j]))
-            if lost:
-                rad[i, j] = np.nextafter(float(lost), np.inf)
-    return Enclosure(mid, rad)
+def outward(box: FloatArray, precision: str) -> FloatArray:
+    """Return a box, shape (n, 2), whose ends are numbers of the precision and that holds it."""
+    if precision == "double":
+        return np.array(box, dtype=float)
+    single = np.asarray(box, dtype=np.float32)
+    low = np.where(single[:, 0] > box[:, 0], np.nextafter(single[:, 0], -np.inf), single[:, 0])
+    high = np.where(single[:, 1] < box[:, 1], np.nextafter(single[:, 1], np.inf), single[:, 1])
+    return np.column_stack([low, high]).astype(float)

@@ -9,7 +9,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import substitute
+from obsynth.derive.rigour import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
 from obsynth.symbolic.plant import Plant
 

@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.rigour.numbers import rational, substitute
+from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.plant import Plant
 
 _DIGITS = 40

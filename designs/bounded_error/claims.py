@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
 from obsynth.designs.bounded_error.error_system import (
     Arithmetic,
     ModelData,
@@ -17,12 +18,7 @@ from obsynth.designs.bounded_error.error_system import (
 from obsynth.designs.bounded_error.lmis import fixed_gain_block
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.core.certificate import Claim
-from obsynth.designs.lmi import (
-    Enclosure,
-    is_positive_definite,
-    prove_positive_definite,
-    symmetric_block,
-)
+from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"

@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.designs.lmi import Enclosure, ExactMatrix, block
+from obsynth.derive.rigour import Enclosure, ExactMatrix
+from obsynth.designs.lmi import block
 from obsynth.symbolic.arrays import FloatArray
 
 ErrorKind = Literal["plain", "shifted"]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import Enclosure
 from obsynth.designs.bounded_error.error_system import (
     Arithmetic,
     ErrorSystem,
@@ -17,7 +18,7 @@ from obsynth.designs.bounded_error.error_system import (
     lift,
     plain_error,
 )
-from obsynth.designs.lmi import Enclosure, he, symmetric_block
+from obsynth.designs.lmi import he, symmetric_block
 
 
 def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.error_system import ERRORS, ErrorKind, ModelData
 from obsynth.designs.core.record import plain_fields, read_array, read_family, reading
-from obsynth.designs.lmi import Enclosure
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

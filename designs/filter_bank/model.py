@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from obsynth.derive import Split, StructureError
 from obsynth.derive.forms.measured import Reading, readings
 from obsynth.derive.jacobian.slope_signs import Monotone, exact_slope, with_ranges
-from obsynth.derive.rigour.numbers import round_number, substitute
+from obsynth.derive.rigour import round_number, substitute
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.model import continuous
-from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
+from obsynth.designs.set_adaptive.transition import PRECISIONS, allowance
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -62,7 +62,7 @@ class BankDesign:
     @property
     def precision(self) -> str:
         """``"double"`` or ``"single"``."""
-        return precision_of(self.options)
+        return str(self.options.get("precision", "double"))
 
     @property
     def rounding(self) -> float:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.filter_bank.model import UNKNOWN, BankDesign
 from obsynth.designs.set_adaptive.inputs import known_signals
-from obsynth.designs.set_adaptive.rounding import outward
 from obsynth.symbolic.arrays import FloatArray
 
 _PASSES = 3

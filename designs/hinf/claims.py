@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import ExactMatrix, is_positive_definite, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.hinf.lmis import (
     PrintedLoop,
@@ -18,7 +19,6 @@ from obsynth.designs.hinf.lmis import (
 )
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
-from obsynth.designs.lmi import ExactMatrix, is_positive_definite, prove_positive_definite
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational elimination at the worst vertex"

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive import AffineFamily
+from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.record import plain_fields, read_array, read_family, reading
 from obsynth.designs.hinf.system import Filter, FilterData, Sector
-from obsynth.designs.lmi import Enclosure
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

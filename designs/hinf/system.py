@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.designs.lmi import Enclosure, ExactMatrix
+from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.symbolic.arrays import FloatArray
 
 Arithmetic = Literal["float", "enclosure", "exact"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import Exact, exact, nearest
+from obsynth.derive.rigour import Exact, exact, nearest
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import with_header

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
-from obsynth.derive.rigour.exact_arrays import Exact, exact, nearest
+from obsynth.derive.rigour import UNIT, Exact, exact, nearest
 from obsynth.designs.bounded_error.derivation_proof import covers
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.interval.model import IntervalModel, model_of
 from obsynth.designs.interval.record import IntervalDesign
-from obsynth.designs.interval.rows import UNIT, Rows
+from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.theorem import NEGATIVE
 from obsynth.designs.interval.widths import steady_holds
 

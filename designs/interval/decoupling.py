@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour.exact_arrays import Exact, exact, inverse, nearest
+from obsynth.derive.rigour import Exact, exact, inverse, nearest
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic import ObsynthError
 from obsynth.symbolic.arrays import FloatArray

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour.exact_arrays import nearest
+from obsynth.derive.rigour import nearest
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel, columns_of

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.rigour import UNIT
 from obsynth.designs.interval.decoupling import decouple_exactly, transformation
 from obsynth.designs.interval.gains import Reduced, check_detectable, lp_problem
 from obsynth.designs.interval.model import IntervalModel, model_of
 from obsynth.designs.interval.record import Bound, IntervalDesign
-from obsynth.designs.interval.rows import UNIT, Precision
+from obsynth.designs.interval.rows import Precision
 from obsynth.designs.interval.synthesis import (
     given_gains,
     lp_design,

@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.rigour.exact_arrays import Exact, exact, from_text, to_text
+from obsynth.derive.rigour import Exact, exact, from_text, to_text
 from obsynth.designs.core.record import plain, read_family, reading
 from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import exact, inverse, nearest, negative, positive
+from obsynth.derive.rigour import exact, inverse, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.model import columns_of
 from obsynth.designs.interval.record import IntervalDesign

@@ -9,12 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import Exact, above, exact, inverse, magnitude, nearest
+from obsynth.derive.rigour import UNIT, Exact, above, exact, inverse, magnitude, nearest
 from obsynth.designs.core.record import read_array, reading
 from obsynth.designs.interval.decoupling import Decoupled, Transformation, decouple_exactly
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.designs.interval.rows import (
-    UNIT,
     Part,
     Precision,
     Rows,

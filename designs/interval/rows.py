@@ -14,21 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import (
-    Exact,
-    above,
-    exact,
-    hull,
-    magnitude,
-    negative,
-    positive,
-)
+from obsynth.derive.rigour import UNIT, Exact, above, exact, image, magnitude, negative, positive
 from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel, columns_of
 from obsynth.symbolic.arrays import FloatArray
 
 Precision = Literal["double", "single"]
-UNIT: Mapping[Precision, float] = {"double": 2.0**-53, "single": 2.0**-24}
 SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120}
 """Above what many underflows of a sum can cost."""
 
@@ -144,7 +135,7 @@ class Part:
         upper, lower = [], []
         for vertex in self.model.vertices:
             M, N = self.on_r(vertex[:, a]), self.on_y(vertex[:, a])
-            least, largest = hull(self.on_w(vertex[:, a]), low, high)
+            least, largest = image(self.on_w(vertex[:, a]), low, high)
             rest = self.X @ vertex[:, o]
             known = {"y": N, "u": self.X @ vertex[:, b]}
             up = {"r_upper": positive(M), "r_lower": -negative(M)}
@@ -230,10 +221,10 @@ class Remainder:
         M = part.on_y(nominal)
         M_lower, M_upper = M + change[0], M + change[1]
         w_low, w_high = part.model.box("w").T
-        v_low, v_high = hull(part.model.W2, w_low, w_high)
+        v_low, v_high = image(part.model.W2, w_low, w_high)
         products = [m * v for m in (M_lower, M_upper) for v in (v_low, v_high)]
         stacked = np.stack(products) if products[0].size else np.zeros((1, *M.shape), dtype=object)
-        own = hull(part.X @ part.model.W1, w_low, w_high)
+        own = image(part.X @ part.model.W1, w_low, w_high)
         noise = (
             own[0] - stacked.max(axis=0).sum(axis=1),
             own[1] - stacked.min(axis=0).sum(axis=1),
@@ -281,7 +272,7 @@ def _linear(
 def state_rows(part: Part) -> Rows:
     """Bounds of x from r and y of the same instant, (26)."""
     low, high = part.model.box("w").T
-    noise = hull(-part.plant.Phi @ part.model.W2, low, high)
+    noise = image(-part.plant.Phi @ part.model.W2, low, high)
     sizes = _sizes(part, ("r_upper", "r_lower", "y", "one"))
     return _linear(sizes, part.plant.W @ part.S, part.plant.Phi, noise, {})
 
@@ -290,7 +281,7 @@ def estimate_rows(part: Part, faults: int) -> Rows:
     """Bounds of the first faults from their earlier share and r and y of the next instant, (32)."""
     left = part.plant.F_left[:faults]
     low, high = part.model.box("w").T
-    noise = hull(-left @ part.plant.Phi @ part.model.W2, low, high)
+    noise = image(-left @ part.plant.Phi @ part.model.W2, low, high)
     sizes = {
         "share_upper": faults,
         "share_lower": faults,
@@ -308,5 +299,5 @@ def measured_rows(part: Part, output: int, component: int) -> Rows:
     others = -Q[output : output + 1] / Q[output, component]
     others[0, component] = exact(0.0).item()
     low, high = part.model.box("w").T
-    noise = hull(-row @ part.model.W2, low, high)
+    noise = image(-row @ part.model.W2, low, high)
     return _linear(_sizes(part, ("r_upper", "r_lower", "y", "one")), others, row, noise, {})

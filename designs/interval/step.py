@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import Exact, exact, hull, nearest
+from obsynth.derive.rigour import Exact, exact, image, nearest
 from obsynth.designs.core.stepping import (
     all_finite,
     finite_or,
@@ -112,7 +112,7 @@ def _known(r_lower: ca.SX, r_upper: ca.SX, y: ca.SX, u: ca.SX) -> dict[str, ca.S
 def first_box(design: IntervalDesign, x_range: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return bounds of r for a box of states, rounded outwards in the precision of the step."""
     low, high = exact(np.asarray(x_range, dtype=float)).T
-    lower, upper = hull(exact(design.P) @ design.plant.T2, low, high)
+    lower, upper = image(exact(design.P) @ design.plant.T2, low, high)
     kind = np.float64 if design.precision == "double" else np.float32
     return -_up(-lower, kind), _up(upper, kind)
 

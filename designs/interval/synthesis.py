@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import exact, nearest
+from obsynth.derive.rigour import exact, nearest
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.gains import (
     Reduced,

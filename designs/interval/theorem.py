@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import exact, nearest, negative, positive
+from obsynth.derive.rigour import exact, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.symbolic.arrays import FloatArray

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour.exact_arrays import (
+from obsynth.derive.rigour import (
     Exact,
     above,
     exact,

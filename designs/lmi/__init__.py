@@ -11,6 +11,7 @@ An observer x+ = A x with two vertices, its LMI written once, solved, and proved
 as it is stored:
 
 >>> import numpy as np
+>>> from obsynth.derive.rigour import Enclosure, prove_positive_definite
 >>> A = np.array([[[0.9, 0.2], [0.0, 0.7]], [[0.8, 0.3], [0.1, 0.9]]])
 >>> C = np.array([[1.0, 0.0]])
 >>> def decay(P, H, A, C):
@@ -28,9 +29,6 @@ as it is stored:
 True
 """
 
-from obsynth.derive.rigour.definite import ProofResult, prove_positive_definite
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.blocks import block, he, symmetric_block
 from obsynth.designs.lmi.expression import (
     Affine,
@@ -75,8 +73,6 @@ from obsynth.designs.lmi.statement import Solution
 __all__ = [
     "Affine",
     "Bisection",
-    "Enclosure",
-    "ExactMatrix",
     "ExpressionError",
     "Extremes",
     "FamilyProof",
@@ -85,7 +81,6 @@ __all__ = [
     "Margin",
     "MarginSolution",
     "Problem",
-    "ProofResult",
     "RowMultipliers",
     "Search",
     "Solution",
@@ -101,10 +96,8 @@ __all__ = [
     "extreme_points",
     "full",
     "he",
-    "is_positive_definite",
     "largest_margin",
     "prove_family",
-    "prove_positive_definite",
     "relax_sum",
     "row_multipliers",
     "scalar",

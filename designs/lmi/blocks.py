@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.exact_matrix import ExactMatrix
+from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.lmi.expression import Affine, ExpressionError, constant, is_zero
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
+from obsynth.derive.rigour import ExactMatrix, is_positive_definite
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.lmi.statement import Solution

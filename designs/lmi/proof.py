@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.derive.rigour.definite import prove_positive_definite
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.exact_matrix import ExactMatrix, is_positive_definite
+from obsynth.derive.rigour import (
+    Enclosure,
+    ExactMatrix,
+    is_positive_definite,
+    prove_positive_definite,
+)
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.lmi.expression import IntArray
 

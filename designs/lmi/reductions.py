@@ -219,7 +219,7 @@ def _exact_weights(
     columns: NDArray[np.float64], target: NDArray[np.float64], rows: list[int]
 ) -> dict[int, Fraction] | None:
     """Solve for the weights on a support in rational arithmetic and check their signs."""
-    from obsynth.derive.rigour.exact_matrix import ExactMatrix
+    from obsynth.derive.rigour import ExactMatrix
 
     system = ExactMatrix.of(np.column_stack([columns, target]))
     reduced, rank = system.entries.rref()

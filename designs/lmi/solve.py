@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.rigour.definite import prove_positive_definite
+from obsynth.derive.rigour import prove_positive_definite
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.conic import conic_form, rescaled, solve_form
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy

@@ -7,15 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import Enclosure, ExactMatrix, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
-from obsynth.designs.lmi import (
-    Enclosure,
-    ExactMatrix,
-    FamilyProof,
-    prove_family,
-    prove_positive_definite,
-    symmetric_block,
-)
+from obsynth.designs.lmi import FamilyProof, prove_family, symmetric_block
 from obsynth.designs.qpv.data import VertexData
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (

@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.lmi import Enclosure, extreme_points
+from obsynth.derive.rigour import Enclosure
+from obsynth.designs.lmi import extreme_points
 from obsynth.designs.qpv.polytopes import Shape
 from obsynth.symbolic.arrays import FloatArray
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.derive import polytope_from_halfspaces, polytope_from_vertices
 from obsynth.derive.errors import DerivationError
-from obsynth.designs.lmi import Enclosure
+from obsynth.derive.rigour import Enclosure
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

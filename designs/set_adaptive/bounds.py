@@ -20,7 +20,7 @@ from obsynth.derive.forms.measured import Known, readings
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.intervals.ranges import bound_ranges
-from obsynth.derive.rigour.numbers import substitute
+from obsynth.derive.rigour import substitute
 from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text
 from obsynth.symbolic.arrays import FloatArray
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import ExactMatrix
 from obsynth.designs.core.certificate import Claim, Level
-from obsynth.designs.lmi import ExactMatrix
 from obsynth.designs.set_adaptive.bounds import BLOCKS
 from obsynth.designs.set_adaptive.model import Structure, read_structure
 from obsynth.designs.set_adaptive.record import SetDesign

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.set_adaptive.rounding import PRECISIONS
+from obsynth.designs.set_adaptive.transition import PRECISIONS
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

@@ -9,7 +9,7 @@ import sympy as sp
 
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import round_number, substitute
+from obsynth.derive.rigour import round_number, substitute
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import plain_fields, read_array, reading
 from obsynth.designs.set_adaptive.bounds import EndBounds
-from obsynth.designs.set_adaptive.rounding import PRECISIONS, allowance, precision_of
+from obsynth.designs.set_adaptive.transition import PRECISIONS, allowance
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -68,7 +68,7 @@ class SetDesign:
     @property
     def precision(self) -> str:
         """``"double"`` or ``"single"``."""
-        return precision_of(self.options)
+        return str(self.options.get("precision", "double"))
 
     @property
     def rounding(self) -> float:

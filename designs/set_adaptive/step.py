@@ -13,6 +13,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.set_adaptive.equations import (
     Drive,
@@ -25,8 +26,7 @@ from obsynth.designs.set_adaptive.equations import (
 from obsynth.designs.set_adaptive.inputs import known_signals
 from obsynth.designs.set_adaptive.ode import exact_arguments
 from obsynth.designs.set_adaptive.record import SetDesign
-from obsynth.designs.set_adaptive.rounding import SHOWN, outward
-from obsynth.designs.set_adaptive.transition import apply, uniformisation
+from obsynth.designs.set_adaptive.transition import SHOWN, apply, uniformisation
 from obsynth.symbolic.arrays import FloatArray
 
 

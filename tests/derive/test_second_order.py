@@ -247,13 +247,15 @@ def test_a_parabola_of_half_the_size_is_caught(exactly, at_once, monkeypatch):
 
 
 def test_a_tangent_that_does_not_rise_is_caught(at_once, monkeypatch):
-    from obsynth.derive.intervals import summit
+    from obsynth.derive.intervals.search import curvature
 
     bowl = -((X[0] - 0.1) ** 2) - (X[1] - X[0]) ** 2 - (X[2] + 0.5 * X[1]) ** 2 - X[3] ** 2
     # the top is not at the middle of the box, and the climber is held there
-    monkeypatch.setattr(summit, "_newton", lambda rows, hessians, at, slope: at)
+    monkeypatch.setattr(curvature, "_newton", lambda rows, hessians, at, slope: at)
     assert bound_ranges(bowl, X, ROOM).upper[0] >= 0.0
-    monkeypatch.setattr(summit, "tangent_rise", lambda low, high, at, ends: np.zeros(low.shape[1]))
+    monkeypatch.setattr(
+        curvature, "tangent_rise", lambda low, high, at, ends: np.zeros(low.shape[1])
+    )
     assert bound_ranges(bowl, X, ROOM).upper[0] < -0.01
 
 

@@ -22,7 +22,7 @@ from obsynth.derive.constants.symmetric_field import SymmetricField
 from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.rigour import eigenvalues as symmetric
-from obsynth.derive.rigour.eigenvalues import largest_eigenvalue
+from obsynth.derive.rigour import largest_eigenvalue
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
 

@@ -10,7 +10,8 @@ from obsynth.derive import DerivationError, Split, StructureError, equilibrium, 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.identity import prove_identity
 from obsynth.derive.algebra.linear_parts import rounded
-from obsynth.derive.rigour.numbers import enclose_number, is_zero, rational, round_number
+from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.rigour import enclose_number, rational, round_number
 from obsynth.symbolic import Plant
 
 x1, x2, x3, u1 = sp.symbols("x1:4 u1", real=True)

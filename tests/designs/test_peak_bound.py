@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour.enclosure import Enclosure
+from obsynth.derive.rigour import Enclosure
 from obsynth.designs.bounded_error.peak import bound as peak_bound_module
 from obsynth.designs.bounded_error.peak.attained import attained
 from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak

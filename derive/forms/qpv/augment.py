@@ -9,7 +9,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.rigour.numbers import substitute
+from obsynth.derive.rigour import substitute
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal
 

@@ -10,7 +10,7 @@ import sympy as sp
 from obsynth.derive.equilibrium import Equilibrium, equilibrium
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import rational
+from obsynth.derive.rigour import rational
 from obsynth.symbolic.plant import Plant
 
 

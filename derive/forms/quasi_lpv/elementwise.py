@@ -15,7 +15,7 @@ from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.forms.measured import Known
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import rational
+from obsynth.derive.rigour import rational
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 

@@ -16,7 +16,7 @@ from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour.numbers import enclose_number, rational
+from obsynth.derive.rigour import enclose_number, rational
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant

@@ -10,7 +10,7 @@ from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.quasi_lpv.centre import Centre
 from obsynth.derive.forms.quasi_lpv.options import Option, kept, options
-from obsynth.derive.rigour.numbers import substitute
+from obsynth.derive.rigour import substitute
 from obsynth.symbolic.equations import read_rows
 from obsynth.symbolic.plant import Plant
 

@@ -18,8 +18,8 @@ from obsynth.derive.intervals.evaluate import evaluate
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rewriting.quotients import Quotient, Quotients
 from obsynth.derive.intervals.search.reduction import SxGraph
-from obsynth.derive.rigour.interval import Array
-from obsynth.derive.rigour.numbers import substitute
+from obsynth.derive.rigour import substitute
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_NAME
@@ -37,7 +37,7 @@ def remove_singularities(
     column: ca.SX,
     variables: ca.SX,
     extra: ca.SX,
-    box: Array,
+    box: FloatArray,
     constant_box: Sequence[tuple[float, float]],
 ) -> tuple[ca.SX, Quotients] | None:
     """Replace quotients with removable singularities in the box by symbols."""
@@ -64,7 +64,7 @@ class _Search:
         graph: SxGraph,
         variables: ca.SX,
         extra: ca.SX,
-        box: Array,
+        box: FloatArray,
         constant_box: Sequence[tuple[float, float]],
     ) -> None:
         self.graph, self.extra = graph, extra

@@ -5,13 +5,11 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.evaluate import enclose
 from obsynth.derive.intervals.program import Program
-from obsynth.derive.rigour.interval import Array, Mask, up
-
-Indices = NDArray[np.int64]
+from obsynth.derive.rigour import up
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 # Cost of running a program, in microseconds: of the call, per operation, per operation and box. It
 # decides whether a sweep runs the shared program once or the parts of it one by one.
@@ -41,9 +39,9 @@ class EntryRanges:
     rough: where the first output may jump or be undefined in the box
     """
 
-    lower: Array
-    upper: Array
-    rough: Mask
+    lower: FloatArray
+    upper: FloatArray
+    rough: BoolArray
 
 
 class Entries:
@@ -53,13 +51,15 @@ class Entries:
     outputs: their positions, one row per entry; -1 for none
     """
 
-    def __init__(self, program: Program, outputs: Indices) -> None:
+    def __init__(self, program: Program, outputs: IntArray) -> None:
         self._program, self._outputs = program, outputs
         self._needs = [sorted({k for k in row if k >= 0}) for row in outputs.tolist()]
         self._alone: dict[int, int] = {}
-        self._chosen: dict[tuple[int, ...], tuple[list[int], Indices]] = {}
+        self._chosen: dict[tuple[int, ...], tuple[list[int], IntArray]] = {}
 
-    def enclose(self, entry: Indices, lower: Array, upper: Array, judged: bool) -> EntryRanges:
+    def enclose(
+        self, entry: IntArray, lower: FloatArray, upper: FloatArray, judged: bool
+    ) -> EntryRanges:
         """Enclose, for every box, the outputs that belong to its entry."""
         counts = np.bincount(entry, minlength=len(self._needs))
         some = np.flatnonzero(counts).tolist()
@@ -74,7 +74,7 @@ class Entries:
             result.rough[index] = part.rough
         return result
 
-    def _together(self, some: list[int], counts: Indices) -> bool:
+    def _together(self, some: list[int], counts: IntArray) -> bool:
         """Whether the shared program costs less than the parts of it one by one."""
         rows = int(counts.sum())
         # nothing is gained by parts before the boxes weigh as much as the calls
@@ -86,7 +86,7 @@ class Entries:
         one_by_one = sum(_cost(self._alone[e], int(counts[e])) for e in some)
         return _cost(len(self._program.live(self._choice(tuple(some))[0])), rows) <= one_by_one
 
-    def _choice(self, some: tuple[int, ...]) -> tuple[list[int], Indices]:
+    def _choice(self, some: tuple[int, ...]) -> tuple[list[int], IntArray]:
         """List the outputs of some entries, first the first ones, and where they stand."""
         if some not in self._chosen:
             first = list(dict.fromkeys(self._outputs[list(some), 0].tolist()))
@@ -98,7 +98,12 @@ class Entries:
         return self._chosen[some]
 
     def _enclose(
-        self, some: tuple[int, ...], entry: Indices, lower: Array, upper: Array, judged: bool
+        self,
+        some: tuple[int, ...],
+        entry: IntArray,
+        lower: FloatArray,
+        upper: FloatArray,
+        judged: bool,
     ) -> EntryRanges:
         chosen, row = self._choice(some)
         found = enclose(self._program, lower, upper, chosen, len(some) if judged else 0)
@@ -128,11 +133,11 @@ class Problem:
     """
 
     program: Program
-    gradient: Indices
-    relevant: Mask
-    affine: Mask
-    lower: Array
-    upper: Array
+    gradient: IntArray
+    relevant: BoolArray
+    affine: BoolArray
+    lower: FloatArray
+    upper: FloatArray
     source: Source | None = None
 
     @cached_property
@@ -156,12 +161,12 @@ class Rows:
     bound: upper bound of the goal's expression over the box, so far
     """
 
-    goal: Indices
-    lower: Array
-    upper: Array
-    bound: Array
+    goal: IntArray
+    lower: FloatArray
+    upper: FloatArray
+    bound: FloatArray
 
-    def take(self, which: Mask | Indices) -> "Rows":
+    def take(self, which: BoolArray | IntArray) -> "Rows":
         """Return some of the rows."""
         return Rows(self.goal[which], self.lower[:, which], self.upper[:, which], self.bound[which])
 
@@ -174,7 +179,7 @@ class Rows:
             np.concatenate([self.bound, other.bound]),
         )
 
-    def put(self, which: Indices, other: "Rows") -> "Rows":
+    def put(self, which: IntArray, other: "Rows") -> "Rows":
         """Return these rows with some of them replaced."""
         lower, upper, bound = self.lower.copy(), self.upper.copy(), self.bound.copy()
         lower[:, which], upper[:, which], bound[which] = other.lower, other.upper, other.bound
@@ -196,13 +201,13 @@ class RowRanges:
     rough: where the expression may jump or be undefined in the box
     """
 
-    lower: Array
-    upper: Array
-    slope_lower: Array
-    slope_upper: Array
-    rough: Mask
+    lower: FloatArray
+    upper: FloatArray
+    slope_lower: FloatArray
+    slope_upper: FloatArray
+    rough: BoolArray
 
-    def take(self, which: Indices) -> "RowRanges":
+    def take(self, which: IntArray) -> "RowRanges":
         """Return some of the rows."""
         return RowRanges(
             self.lower[which],
@@ -232,7 +237,9 @@ def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
     return RowRanges(lower[0], upper[0], slope_lower, slope_upper, found.rough)
 
 
-def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, Array]:
+def shrink(
+    rows: Rows, slope_lower: FloatArray, slope_upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Reduce boxes to the facet where a monotone goal has its largest value."""
     falls = slope_upper <= 0.0
     rises = (slope_lower >= 0.0) & ~falls
@@ -240,8 +247,12 @@ def shrink(rows: Rows, slope_lower: Array, slope_upper: Array) -> tuple[Array, A
 
 
 def mean_value_terms(
-    lower: Array, upper: Array, centre: Array, slope_lower: Array, slope_upper: Array
-) -> Array:
+    lower: FloatArray,
+    upper: FloatArray,
+    centre: FloatArray,
+    slope_lower: FloatArray,
+    slope_upper: FloatArray,
+) -> FloatArray:
     """Bound |gradient| times distance from the centre, variable by variable."""
     radius = np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
     size = np.maximum(np.abs(slope_lower), np.abs(slope_upper))

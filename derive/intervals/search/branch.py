@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.search.batch import (
     Problem,
@@ -28,13 +27,14 @@ from obsynth.derive.intervals.search.batch import (
 )
 from obsynth.derive.intervals.search.curvature import (
     Curvatures,
+    concave_bounds,
     is_concave,
     sharpened_slopes,
     taylor_spread,
 )
 from obsynth.derive.intervals.search.progress import Patience
-from obsynth.derive.intervals.summit import concave_bounds
-from obsynth.derive.rigour.interval import Array, Mask, up
+from obsynth.derive.rigour import Interval, up
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 _CHUNK = 8192
 # Second derivatives are worth their price only where the first few sweeps leave something open;
@@ -71,12 +71,12 @@ class Outcome:
     boxes, sweeps: work done
     """
 
-    bound: Array
-    attained: Array
-    points: Array
-    noise: Array
-    finished: Mask
-    singular: dict[int, tuple[Array, Array]]
+    bound: FloatArray
+    attained: FloatArray
+    points: FloatArray
+    noise: FloatArray
+    finished: BoolArray
+    singular: dict[int, Interval]
     boxes: int
     sweeps: int
 
@@ -101,7 +101,7 @@ class Search:
         self.points = np.tile(self.middle, (goals, 1))
         self.closed = np.full(goals, -np.inf)
         self.noise = np.zeros(goals)
-        self.singular: dict[int, tuple[Array, Array]] = {}
+        self.singular: dict[int, Interval] = {}
         self.boxes = self.sweeps = 0
         source = problem.source
         self.curvatures = None if source is None else Curvatures(source, problem.program)
@@ -135,7 +135,7 @@ class Search:
         self.best[rows.goal[better]] = found.lower[better]
         return found
 
-    def sample(self, goals: NDArray[np.int64]) -> None:
+    def sample(self, goals: IntArray) -> None:
         """Try points of a fixed pattern and corners of the box for unsettled goals."""
         problem = self.problem
         rng = np.random.default_rng(0)
@@ -148,7 +148,7 @@ class Search:
         at = np.tile(where, (1, len(goals)))
         self.record(Rows(goal, at, at, np.zeros(len(goal))))
 
-    def tolerance(self) -> Array:
+    def tolerance(self) -> FloatArray:
         """Return the gap that is good enough, goal by goal."""
         width = self.best[0::2] + self.best[1::2]
         share = 0.5 * self.rtol * np.where(np.isfinite(width), np.maximum(width, 0.0), 0.0)
@@ -183,8 +183,12 @@ class Search:
         return self.split(rest.take(keep), terms[:, keep], width[:, keep], facets[:, keep])
 
     def first_order(
-        self, rows: Rows, natural: Array, slopes: tuple[Array, Array], with_slopes: bool
-    ) -> tuple[Rows, Array, RowRanges]:
+        self,
+        rows: Rows,
+        natural: FloatArray,
+        slopes: Interval,
+        with_slopes: bool,
+    ) -> tuple[Rows, FloatArray, RowRanges]:
         """Shrink rows to facets and bound them by values and gradients.
 
         Also returns what was found at the centres, with gradients where they are asked for.
@@ -198,8 +202,12 @@ class Search:
         return Rows(rows.goal, lower, upper, bound), terms, at_centre
 
     def second_order(
-        self, rows: Rows, slopes: tuple[Array, Array], at: RowRanges, curvatures: Curvatures
-    ) -> tuple[Rows, Array, Mask]:
+        self,
+        rows: Rows,
+        slopes: Interval,
+        at: RowRanges,
+        curvatures: Curvatures,
+    ) -> tuple[Rows, FloatArray, BoolArray]:
         """Shrink and bound rows by second derivatives; tell in which variables goals bend up."""
         hessians = curvatures.enclose(rows.goal, rows.lower, rows.upper)
         centre = np.clip(0.5 * (rows.lower + rows.upper), rows.lower, rows.upper)
@@ -230,7 +238,7 @@ class Search:
         convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
         return rows, terms, convex
 
-    def is_open(self, rows: Rows) -> Mask:
+    def is_open(self, rows: Rows) -> BoolArray:
         """Where a row may still hold more than the best value of its goal."""
         return np.asarray(rows.bound > self.best[rows.goal] + self.tolerance()[rows.goal])
 
@@ -240,7 +248,7 @@ class Search:
         gap = (rows.bound - self.best[rows.goal]) / self.tolerance()[rows.goal]
         return float(gap.max(initial=0.0))
 
-    def close(self, rows: Rows, settled: Mask | None = None) -> Mask:
+    def close(self, rows: Rows, settled: BoolArray | None = None) -> BoolArray:
         """Close rows that cannot improve their goal; tell which ones stay open."""
         done = ~self.is_open(rows)
         if settled is not None:
@@ -249,7 +257,7 @@ class Search:
         np.maximum.at(self.closed, rows.goal[done & ~given_up], rows.bound[done & ~given_up])
         return np.asarray(~(done | given_up))
 
-    def split(self, rows: Rows, terms: Array, width: Array, to_facets: Mask) -> Rows:
+    def split(self, rows: Rows, terms: FloatArray, width: FloatArray, to_facets: BoolArray) -> Rows:
         """Cut every row in two where its mean-value form loses most, a small batch in four."""
         if rows.count == 0:
             return rows
@@ -260,8 +268,8 @@ class Search:
         return rows
 
     def cut(
-        self, rows: Rows, terms: Array, width: Array, to_facets: Mask
-    ) -> tuple[Rows, Array, Array]:
+        self, rows: Rows, terms: FloatArray, width: FloatArray, to_facets: BoolArray
+    ) -> tuple[Rows, FloatArray, FloatArray]:
         """Cut rows in two; tell what is left of the terms and widths the cut went by."""
         usable = np.isfinite(terms).all(axis=0) & np.isfinite(rows.bound)
         score = np.where(usable, terms, width)
@@ -283,7 +291,7 @@ class Search:
 
     # -- the loop ----------------------------------------------------------------
 
-    def choose(self, rows: Rows) -> Mask:
+    def choose(self, rows: Rows) -> BoolArray:
         """Select the rows of the next sweep."""
         now = np.ones(rows.count, dtype=bool)
         singular = ~np.isfinite(rows.bound)
@@ -354,7 +362,7 @@ class Search:
         return rows.take(~endless)
 
 
-def _mean_value_bound(at_centre: Array, terms: Array) -> Array:
+def _mean_value_bound(at_centre: FloatArray, terms: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore", over="ignore"):
         # the sum of v nonnegative terms is off by less than v units in the last place
         spread = up(terms.sum(axis=0) * (1.0 + (len(terms) + 2) * 2.3e-16))

@@ -7,17 +7,17 @@ f(x) <= f(c) + f'(c) (x - c) + sup (x - c)' H (x - c) / 2, and, where H is negat
 knowledge that the goal is concave, so that its tangent at any point bounds it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.intervals.program import Program
-from obsynth.derive.intervals.search.batch import Entries, Source
-from obsynth.derive.rigour.interval import Array, Mask, down, up
-
-Indices = NDArray[np.int64]
+from obsynth.derive.intervals.search.batch import Entries, RowRanges, Rows, Source
+from obsynth.derive.rigour import Interval, down, up
+from obsynth.derive.rigour.interval import divide, multiply, subtract
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 # Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
 # quotients with a removable singularity it knows nothing at the singularity.
@@ -45,6 +45,8 @@ _NOT_SMOOTH = frozenset(
 )
 _ULP = 2.3e-16
 _TINY = 1e-300
+# Steps of the climb to the top of a concave goal.
+_CLIMB = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +57,16 @@ class Hessians:
     usable: rows whose goal is twice differentiable all over the box, with finite bounds
     """
 
-    lower: Array
-    upper: Array
-    usable: Mask
+    lower: FloatArray
+    upper: FloatArray
+    usable: BoolArray
 
     @property
-    def size(self) -> Array:
+    def size(self) -> FloatArray:
         """Largest magnitudes, shape (N, v, v)."""
         return np.maximum(np.abs(self.lower), np.abs(self.upper))
 
-    def take(self, which: Indices) -> "Hessians":
+    def take(self, which: IntArray) -> "Hessians":
         """Return some of the rows."""
         return Hessians(self.lower[which], self.upper[which], self.usable[which])
 
@@ -114,7 +116,7 @@ class Curvatures:
         program = Program.from_casadi(function, {1: source.constant_box})
         self._made.append(Entries(program, outputs.reshape(m, v * v)))
 
-    def enclose(self, goal: Indices, lower: Array, upper: Array) -> Hessians:
+    def enclose(self, goal: IntArray, lower: FloatArray, upper: FloatArray) -> Hessians:
         """Enclose the second derivatives of every row's goal over its box."""
         v, n = lower.shape
         low, high = np.zeros((n, v, v)), np.zeros((n, v, v))
@@ -137,18 +139,18 @@ class Curvatures:
         return Hessians(np.where(minus, -high, low), np.where(minus, -low, high), usable)
 
 
-def _radius(lower: Array, upper: Array, centre: Array) -> Array:
+def _radius(lower: FloatArray, upper: FloatArray, centre: FloatArray) -> FloatArray:
     return np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
 
 
 def sharpened_slopes(
-    lower: Array,
-    upper: Array,
-    centre: Array,
-    at_centre: tuple[Array, Array],
-    slopes: tuple[Array, Array],
+    lower: FloatArray,
+    upper: FloatArray,
+    centre: FloatArray,
+    at_centre: Interval,
+    slopes: Interval,
     hessians: Hessians,
-) -> tuple[Array, Array]:
+) -> Interval:
     """Intersect gradients with the mean-value form that starts from the centre.
 
     Shapes: at_centre, slopes (ndarray, ndarray), shape (v, N).
@@ -162,12 +164,12 @@ def sharpened_slopes(
 
 
 def taylor_spread(
-    lower: Array,
-    upper: Array,
-    centre: Array,
-    at_centre: tuple[Array, Array],
+    lower: FloatArray,
+    upper: FloatArray,
+    centre: FloatArray,
+    at_centre: Interval,
     hessians: Hessians,
-) -> Array:
+) -> FloatArray:
     """Bound the rise above the value at the centre by a quadratic, separately in every variable.
 
     Shapes: at_centre (ndarray, ndarray), shape (v, N).
@@ -190,7 +192,7 @@ def taylor_spread(
     return np.where(hessians.usable, total, np.inf)
 
 
-def is_concave(hessians: Hessians, free: Mask) -> Mask:
+def is_concave(hessians: Hessians, free: BoolArray) -> BoolArray:
     """Prove goals strictly concave in their free variables, by elimination in intervals."""
     count = int(free.sum(axis=0).max(initial=0))
     order = np.argsort(~free.T, axis=1, kind="stable")[:, :count]
@@ -208,28 +210,20 @@ def is_concave(hessians: Hessians, free: Mask) -> Mask:
                 break
             pivot = np.where(proved, low[:, k, k], 1.0), np.where(proved, high[:, k, k], 1.0)
             for i in range(k + 1, count):
-                factor = _divide((low[:, i, k], high[:, i, k]), pivot)
+                factor = divide((low[:, i, k], high[:, i, k]), pivot)
                 for j in range(i, count):
-                    product = _multiply(factor, (low[:, j, k], high[:, j, k]))
-                    low[:, j, i] = down(low[:, j, i] - product[1])
-                    high[:, j, i] = up(high[:, j, i] - product[0])
+                    product = multiply(factor, (low[:, j, k], high[:, j, k]))
+                    entry = low[:, j, i], high[:, j, i]
+                    low[:, j, i], high[:, j, i] = subtract(entry, product)
     return proved
 
 
-def _multiply(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-    products = np.stack([a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]])
-    return down(products.min(axis=0)), up(products.max(axis=0))
-
-
-def _divide(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Quotient by a positive interval."""
-    quotients = np.stack([a[0] / b[0], a[0] / b[1], a[1] / b[0], a[1] / b[1]])
-    return down(quotients.min(axis=0)), up(quotients.max(axis=0))
-
-
 def tangent_rise(
-    lower: Array, upper: Array, centre: Array, at_centre: tuple[Array, Array]
-) -> Array:
+    lower: FloatArray,
+    upper: FloatArray,
+    centre: FloatArray,
+    at_centre: Interval,
+) -> FloatArray:
     """Bound the rise of tangents above their point of contact, over boxes.
 
     Shapes: at_centre (ndarray, ndarray), shape (v, N).
@@ -239,3 +233,50 @@ def tangent_rise(
         backwards = np.where(lower < centre, up(at_centre[0] * down(lower - centre)), 0.0)
     along = np.maximum(np.maximum(forwards, backwards), 0.0)
     return np.asarray(up(along.sum(axis=0) * (1.0 + (len(lower) + 2) * _ULP)))
+
+
+def _newton(rows: Rows, hessians: Hessians, at: FloatArray, slope: FloatArray) -> FloatArray:
+    """One step of Newton's method inside the boxes, along the variables that may still move."""
+    pressed = ((at <= rows.lower) & (slope < 0.0)) | ((at >= rows.upper) & (slope > 0.0))
+    still: BoolArray = (pressed | (rows.upper <= rows.lower)).T
+    matrix = 0.5 * (hessians.lower + hessians.upper)
+    matrix[still[:, :, None] | still[:, None, :]] = 0.0
+    diagonal = np.einsum("nii->ni", matrix)
+    diagonal[still] = -1.0
+    diagonal[...] = np.where(diagonal < 0.0, diagonal, -1.0)
+    try:
+        step = np.linalg.solve(matrix, -np.where(still, 0.0, slope.T)[:, :, None])[:, :, 0].T
+    except np.linalg.LinAlgError:
+        return at
+    moved = at + np.where(np.isfinite(step), step, 0.0)
+    return np.clip(moved, rows.lower, rows.upper)
+
+
+def concave_bounds(
+    rows: Rows,
+    hessians: Hessians,
+    start: FloatArray,
+    slope: FloatArray,
+    evaluate: Callable[[Rows], RowRanges],
+    is_open: Callable[[Rows], BoolArray],
+) -> FloatArray:
+    """Bound goals that are concave over their boxes.
+
+    A concave f lies below every tangent, f(x) <= f(c) + f'(c) (x - c). Whatever c is, the bound
+    holds; at the top of the box it is the largest value, up to rounding.
+    """
+    bound, index = rows.bound.copy(), np.arange(rows.count)
+    at = start
+    for _ in range(_CLIMB):
+        at = _newton(rows, hessians, at, slope)
+        found = evaluate(Rows(rows.goal, at, at, rows.bound))
+        ends = found.slope_lower, found.slope_upper
+        top = up(found.upper + tangent_rise(rows.lower, rows.upper, at, ends))
+        bound[index] = np.fmin(bound[index], top)
+        rows = Rows(rows.goal, rows.lower, rows.upper, bound[index])
+        left = np.flatnonzero(is_open(rows))
+        if not len(left):
+            break
+        slope = 0.5 * (ends[0] + ends[1])[:, left]
+        rows, hessians, at, index = rows.take(left), hessians.take(left), at[:, left], index[left]
+    return bound

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from obsynth.derive.rigour.interval import Array
+from obsynth.symbolic.arrays import FloatArray
 
 _Key = tuple[int, tuple[int, ...], float | tuple[int, int] | None]
 
@@ -203,11 +203,11 @@ def reduce_variables(
 
 
 def preimage(
-    function: ca.Function, number: int, value: float, low_at: Array, high_at: Array
-) -> Array:
+    function: ca.Function, number: int, value: float, low_at: FloatArray, high_at: FloatArray
+) -> FloatArray:
     """Find where a quantity takes a value, on the way between its smallest and largest value."""
 
-    def at(share: float) -> Array:
+    def at(share: float) -> FloatArray:
         return low_at + share * (high_at - low_at)
 
     def value_at(share: float) -> float:

@@ -20,8 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.rounding import add_up, lowered, product_up, raised
+from obsynth.derive.rigour import Enclosure, add_up, lowered, product_up, raised
 from obsynth.designs.bounded_error.peak.responses import PowerSum, Response, power_sum, response
 from obsynth.designs.bounded_error.peak.small_gain import (
     contraction,

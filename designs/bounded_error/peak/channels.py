@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.rigour.exact_matrix import ExactMatrix
+from obsynth.derive.rigour import ExactMatrix
 from obsynth.symbolic.arrays import FloatArray
 
 IntArray = NDArray[np.int64]

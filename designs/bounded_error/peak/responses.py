@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from obsynth.derive.rigour.enclosure import Enclosure, gamma_bound
-from obsynth.derive.rigour.rounding import add_up, product_up, raised
+from obsynth.derive.rigour import Enclosure, add_up, gamma_bound, product_up, raised
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.symbolic.arrays import FloatArray
 

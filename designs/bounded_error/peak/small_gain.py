@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.derive.rigour.rounding import TINY, add_up, product_up, raised
+from obsynth.derive.rigour import TINY, add_up, product_up, raised
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.symbolic.arrays import FloatArray
 

@@ -26,9 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.exact_matrix import ExactMatrix
-from obsynth.derive.rigour.rounding import nearest
+from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.bounded_error.peak.channels import Channels, split_channels
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -195,8 +193,8 @@ def peak_system(
         directions=directions,
         ranges=ranges,
         radius=radius,
-        T=nearest(T),
-        residual=_magnitude(nearest(T @ eD)),
+        T=Enclosure.of(T),
+        residual=_magnitude(Enclosure.of(T @ eD)),
         A0=_blocks([[TA - eK @ eC, T @ eB], [-(eF @ eC), of(np.eye(n_f))]]),
         B_w=_blocks([[TA @ (eE @ eW2) + T @ eW1 - eK @ Pi_W2], [-(eF @ Pi_W2)]]),
         B_p=_blocks([[T @ of(channels.columns)], [of(np.zeros((n_f, len(channels))))]]),
@@ -222,7 +220,7 @@ def projected_gains(
     T = of(np.eye(eE.shape[0])) + eE @ eC
     Pi = of(np.eye(eC.shape[0])) + eC @ eE
     F = _array("F", F, 2).reshape(-1, eC.shape[0])
-    return nearest(T @ of(_array("K", K, 2)) @ Pi).mid, nearest(of(F) @ Pi).mid
+    return Enclosure.of(T @ of(_array("K", K, 2)) @ Pi).mid, Enclosure.of(of(F) @ Pi).mid
 
 
 def _array(name: str, value: ArrayLike, dimensions: int) -> FloatArray:
@@ -266,7 +264,7 @@ def _decoupling(C: FloatArray, D: FloatArray) -> FloatArray:
 
 
 def _blocks(rows: Sequence[Sequence[ExactMatrix]]) -> Enclosure:
-    table = [[nearest(cell) for cell in row] for row in rows]
+    table = [[Enclosure.of(cell) for cell in row] for row in rows]
     mid = np.block([[cell.mid for cell in row] for row in table])
     rad = np.block([[cell.rad for cell in row] for row in table])
     return Enclosure(mid, rad)

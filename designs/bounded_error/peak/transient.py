@@ -24,8 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.enclosure import UNIT_ROUNDOFF, Enclosure
-from obsynth.derive.rigour.rounding import add_up, lowered, product_up, raised
+from obsynth.derive.rigour import UNIT_ROUNDOFF, Enclosure, add_up, lowered, product_up, raised
 from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs
 from obsynth.designs.bounded_error.peak.responses import Response, power_sum, response
 from obsynth.designs.bounded_error.peak.small_gain import small_gain_solution, spectral_radius

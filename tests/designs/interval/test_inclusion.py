@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.derive.rigour.exact_arrays import nearest
+from obsynth.derive.rigour import nearest
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.step import build_step

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.derive.rigour.exact_arrays import exact, nearest
+from obsynth.derive.rigour import exact, nearest
 from obsynth.designs.interval.gains import Reduced, lp_problem, sylvester_gain
 from obsynth.designs.interval.printed import FLAWS, printed_faults
 from obsynth.designs.interval.record import IntervalDesign

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.derive.rigour.exact_arrays import exact
+from obsynth.derive.rigour import exact
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.step import build_step, first_box
 

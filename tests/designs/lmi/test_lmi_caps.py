@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.designs.lmi import (
-    Problem,
-    cap_gain,
-    full,
-    symmetric,
-    symmetric_block,
-)
+from obsynth.designs.lmi import Problem, cap_gain, full, symmetric, symmetric_block
 
 
 def design(cap):

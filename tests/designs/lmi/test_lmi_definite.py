@@ -3,17 +3,8 @@
 import numpy as np
 import pytest
 
-from obsynth.derive.rigour import definite
-from obsynth.designs.lmi import (
-    Enclosure,
-    Problem,
-    full,
-    is_positive_definite,
-    prove_positive_definite,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.derive.rigour import Enclosure, definite, is_positive_definite, prove_positive_definite
+from obsynth.designs.lmi import Problem, full, symmetric, symmetric_block, trace
 from obsynth.symbolic.errors import ObsynthError
 
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour import enclosure
-from obsynth.designs.lmi import Enclosure, ExactMatrix
+from obsynth.derive.rigour import Enclosure, ExactMatrix, enclosure
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=40, deadline=None)

@@ -9,7 +9,8 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.designs.lmi import ExactMatrix, block, is_positive_definite
+from obsynth.derive.rigour import ExactMatrix, is_positive_definite
+from obsynth.designs.lmi import block
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=60, deadline=None)

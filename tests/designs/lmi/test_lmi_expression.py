@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.lmi import (
-    Enclosure,
-    ExactMatrix,
     ExpressionError,
     Problem,
     block,

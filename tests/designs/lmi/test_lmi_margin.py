@@ -3,17 +3,19 @@
 import numpy as np
 import pytest
 
-from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import (
+from obsynth.derive.rigour import (
     Enclosure,
     ExactMatrix,
+    is_positive_definite,
+    prove_positive_definite,
+)
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.lmi import (
     Problem,
     full,
-    is_positive_definite,
     largest_margin,
     margin,
     prove_family,
-    prove_positive_definite,
     solve_lazily,
     solve_with_margin,
     symmetric,

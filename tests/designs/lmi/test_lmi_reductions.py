@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from obsynth.derive.rigour import Enclosure
 from obsynth.designs.lmi import (
-    Enclosure,
     Problem,
     RowMultipliers,
     UncertainRow,

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from obsynth.derive.rigour import Enclosure, prove_positive_definite
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
-    Enclosure,
     Knob,
     Problem,
     bisect_feasible,
     full,
     largest_margin,
-    prove_positive_definite,
     smallest_changes,
     solve_with_margin,
     symmetric,

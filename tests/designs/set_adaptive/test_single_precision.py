@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from obsynth.derive.rigour import outward
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
-from obsynth.designs.set_adaptive.rounding import outward
 
 BOUND = 4.5e-3
 A13, A20, S_C, K = 1.329e-4, 1.772e-4, 0.0154, 1.329e-3

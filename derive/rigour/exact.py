@@ -1,7 +1,8 @@
-"""Exact rational matrices: the independent check of a proof of definiteness.
+"""Exact rational matrices and arrays: nothing is lost until somebody asks for doubles.
 
-Every double is a rational with a power of two below, so the blocks of an LMI can be formed
-without any rounding and decided by elimination over the integers.
+Every double is a rational with a power of two below. So the blocks of an LMI can be formed without
+any rounding, with the operators of the other arithmetics (`ExactMatrix`), and decided by
+elimination over the integers; arrays of rationals (`exact`) have the operators of NumPy.
 """
 
 from __future__ import annotations
@@ -12,8 +13,36 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from obsynth.derive.rigour.rounding import smallest_above
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+
+Exact = NDArray[np.object_]
+
+
+def number(value: Any) -> Any:
+    """Read the rational (`flint.fmpq`) that a double, an integer or a fraction of any kind is."""
+    from flint import fmpq
+
+    if isinstance(value, fmpq):
+        return value
+    if isinstance(value, (float, np.floating)):
+        if not np.isfinite(value):
+            raise ObsynthError(f"{value} is no rational number")
+        return fmpq(*float(value).as_integer_ratio())
+    if isinstance(value, (int, np.integer)):
+        return fmpq(int(value))
+    if isinstance(value, Fraction):
+        return fmpq(value.numerator, value.denominator)
+    if hasattr(value, "p") and hasattr(value, "q"):
+        return fmpq(int(value.p), int(value.q))
+    raise ObsynthError(f"{value!r} ({type(value).__name__}) is no exact number")
+
+
+def _fraction(value: Any) -> Fraction:
+    return Fraction(value) if isinstance(value, int) else Fraction(int(value.p), int(value.q))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +71,7 @@ class ExactMatrix:
                 f"an exact matrix of shape {array.shape}: take one vertex of a family at a time",
                 shape=array.shape,
             )
-        return cls(fmpq_mat(*array.shape, [_rational(x) for x in array.ravel()]))
+        return cls(fmpq_mat(*array.shape, [number(x) for x in array.ravel()]))
 
     @classmethod
     def from_blocks(cls, rows: Sequence[Sequence[ExactMatrix]]) -> ExactMatrix:
@@ -68,11 +97,12 @@ class ExactMatrix:
 
     def to_fractions(self) -> list[list[Fraction]]:
         """Nested list of fractions."""
-        return [[Fraction(int(x.p), int(x.q)) for x in row] for row in self.entries.table()]
+        return [[_fraction(x) for x in row] for row in self.entries.table()]
 
-    def to_floats(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def to_floats(self) -> FloatArray:
         """Entries rounded to the nearest double."""
-        return np.array([[float(x) for x in row] for row in self.to_fractions()])
+        floats = [[float(x) for x in row] for row in self.to_fractions()]
+        return np.array(floats, dtype=float).reshape(self.shape)
 
     def inverse(self) -> ExactMatrix:
         """Exact inverse; a singular matrix raises."""
@@ -165,22 +195,6 @@ def is_positive_definite(matrix: Any) -> bool:
     return True
 
 
-def _rational(number: Any) -> Any:
-    from flint import fmpq
-
-    if isinstance(number, (float, np.floating)):
-        if not np.isfinite(number):
-            raise ObsynthError(f"{number} is no rational number")
-        return fmpq(*float(number).as_integer_ratio())
-    if isinstance(number, (int, np.integer)):
-        return fmpq(int(number))
-    if isinstance(number, Fraction):
-        return fmpq(number.numerator, number.denominator)
-    if hasattr(number, "p") and hasattr(number, "q"):
-        return fmpq(int(number.p), int(number.q))
-    raise ObsynthError(f"{number!r} ({type(number).__name__}) is no exact number")
-
-
 def _is_zero(value: Any) -> bool:
     return isinstance(value, (int, float)) and value == 0
 
@@ -188,3 +202,73 @@ def _is_zero(value: Any) -> bool:
 def _check_shapes(left: ExactMatrix, right: ExactMatrix) -> None:
     if left.shape != right.shape:
         raise ObsynthError(f"exact matrices of shapes {left.shape} and {right.shape} do not fit")
+
+
+def exact(values: Any) -> Exact:
+    """Return the rational numbers that doubles, fractions or SymPy rationals are."""
+    array = np.asarray(values)
+    if array.dtype != np.object_:
+        array = array.astype(float)
+    result = np.empty(array.shape, dtype=object)
+    for place, value in np.ndenumerate(array):
+        result[place] = number(value)
+    return result
+
+
+def nearest(values: Exact) -> FloatArray:
+    """Return the nearest doubles."""
+    result = np.zeros(values.shape)
+    for place, value in np.ndenumerate(values):
+        result[place] = float(_fraction(value))
+    return result
+
+
+def above(values: Exact) -> FloatArray:
+    """Return the smallest doubles that are not below the values."""
+    result = np.zeros(values.shape)
+    for place, value in np.ndenumerate(values):
+        result[place] = smallest_above(_fraction(value))
+    return result
+
+
+def inverse(matrix: Exact) -> Exact:
+    """Return the exact inverse of a square matrix; a singular one raises `ObsynthError`."""
+    if matrix.size == 0:
+        return matrix.copy()
+    n = len(matrix)
+    entries = ExactMatrix.of(matrix).inverse().entries.tolist()
+    return np.array(entries, dtype=object).reshape(n, n)
+
+
+def positive(matrix: Any) -> Any:
+    """Return M+ = max(M, 0) elementwise."""
+    return np.maximum(matrix, 0)
+
+
+def negative(matrix: Any) -> Any:
+    """Return M- = max(-M, 0) elementwise, so that M = M+ - M-."""
+    return np.maximum(-matrix, 0)
+
+
+def image(matrix: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
+    """Return the smallest box that holds M a for every a in a box, as (lower, upper)."""
+    plus, minus = positive(matrix), negative(matrix)
+    return plus @ lower - minus @ upper, plus @ upper - minus @ lower
+
+
+def magnitude(matrix: Any) -> Any:
+    """Return |M| elementwise."""
+    return np.abs(matrix)
+
+
+def to_text(values: Exact) -> list[Any]:
+    """Return a nested list of texts as ``-1/3``."""
+    flat = [str(_fraction(value)) for value in values.ravel()]
+    nested: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
+    return nested
+
+
+def from_text(nested: Any, shape: tuple[int, ...]) -> Exact:
+    """Read what `to_text` wrote; empty arrays get their shape from the caller."""
+    flat = np.array(nested, dtype=object).ravel()
+    return exact(np.array([Fraction(str(v)) for v in flat], dtype=object).reshape(shape))
