@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Protocol
 
@@ -16,42 +16,35 @@ BoolArray = NDArray[np.bool_]
 
 
 class RunLike(Protocol):
-    """What the comparison reads of a run."""
+    """What the comparison reads of a run, which a later room defines; arrays are time first."""
 
     @property
     def t(self) -> FloatArray:
         """Time in seconds, (N + 1,)."""
-        ...
 
     @property
     def f(self) -> FloatArray:
         """True faults, (N + 1, n_f)."""
-        ...
 
     @property
     def f_lower(self) -> FloatArray:
         """Lower bounds as returned at each instant, (N + 1, n_f)."""
-        ...
 
     @property
     def f_upper(self) -> FloatArray:
         """Upper bounds as returned at each instant, (N + 1, n_f)."""
-        ...
 
     @property
     def status(self) -> NDArray[np.int64]:
         """Status of each step, (N + 1,)."""
-        ...
 
     @property
     def names(self) -> Mapping[str, tuple[str, ...]]:
         """Names of the signals by group; ``names["f"]`` are the faults."""
-        ...
 
     @property
     def fault_delay(self) -> int:
         """By how many samples the fault bounds lag behind."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -65,16 +58,16 @@ class FaultEvent:
         First and last instant of the fault.
     peak : float
         Its largest magnitude.
+    promised : int or None
+        Instant up to which an alarm was promised: by then the fault had been larger than its
+        interval is long at as many consecutive valid samples as the alarm takes. None: it never
+        was, so it may be missed, or the method does not predict steady widths of the fault.
     alarm : int or None
         Instant at which the alarm was first raised for it; None: missed.
     delay : float or None
         Seconds from the onset to the alarm.
     level : float or None
         Magnitude of the fault at the instant that the alarm speaks of.
-    promised : int or None
-        Instant up to which an alarm was promised: by then the fault had been larger than its
-        interval is long at as many consecutive valid samples as the alarm takes. None: it never
-        was, so it may be missed, or the method does not predict steady widths of the fault.
     others : tuple of str
         Faults that were not there but whose alarm was raised together with it.
     """
@@ -83,11 +76,11 @@ class FaultEvent:
     onset: int
     end: int
     peak: float
-    alarm: int | None
-    delay: float | None
-    level: float | None
     promised: int | None
-    others: tuple[str, ...]
+    alarm: int | None = None
+    delay: float | None = None
+    level: float | None = None
+    others: tuple[str, ...] = ()
 
     @property
     def isolated(self) -> bool:
@@ -187,31 +180,29 @@ def compare(
     for i, name in enumerate(names):
         for onset, end in _stretches(there[:, i]):
             first, stop = onset + fault_delay, end + fault_delay + 1
-            raised = np.flatnonzero(alarm[first:stop, i])
-            at = first + int(raised[0]) if raised.size else None
+            raised = first + np.flatnonzero(alarm[first:stop, i])
             counting = first + np.flatnonzero(valid[first:stop])
             large = None
             if width is not None:
                 large = _first_run(size[counting, i] > width[counting, i], persistence[i])
-            events.append(
-                FaultEvent(
-                    fault=name,
-                    onset=onset,
-                    end=end,
-                    peak=float(np.abs(truth[onset : end + 1, i]).max()),
-                    alarm=at,
-                    delay=None if at is None else float(t[at] - t[onset]),
-                    level=None if at is None else float(size[at, i]),
-                    promised=None if large is None else int(counting[large]),
-                    others=()
-                    if at is None
-                    else tuple(
-                        other
-                        for j, other in enumerate(names)
-                        if alarm[at, j] and not spoken[at, j] and j != i
-                    ),
-                )
+            event = FaultEvent(
+                fault=name,
+                onset=onset,
+                end=end,
+                peak=float(np.abs(truth[onset : end + 1, i]).max()),
+                promised=None if large is None else int(counting[large]),
             )
+            if raised.size:
+                at = int(raised[0])
+                wrong = np.flatnonzero(alarm[at] & ~spoken[at])
+                event = replace(
+                    event,
+                    alarm=at,
+                    delay=float(t[at] - t[onset]),
+                    level=float(size[at, i]),
+                    others=tuple(names[j] for j in wrong.tolist()),
+                )
+            events.append(event)
     events.sort(key=lambda event: event.onset)
     false = (alarm & ~before).sum(axis=0)
     after = (alarm & before & ~spoken).sum(axis=0)

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Certificate, Guarantee
 from obsynth.designs.core.errors import DetectorError
-from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS
+from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.comparison import Detection, RunLike, compare
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
-    from obsynth.designs.core.observer import Observer
     from obsynth.symbolic import Plant
 
 
@@ -102,7 +101,7 @@ class FaultDetector:
                 method=method,
                 faults=names,
             )
-        object.__setattr__(self, "persistence", self._counts(names))
+        object.__setattr__(self, "persistence", _whole_numbers(self.persistence, names))
         unknown = [name for name in self.also_skip if name not in STATUS]
         if unknown:
             raise DetectorError(
@@ -111,30 +110,11 @@ class FaultDetector:
                 also_skip=self.also_skip,
             )
 
-    def _counts(self, names: tuple[str, ...]) -> tuple[int, ...]:
-        given: Any = self.persistence
-        values = tuple(given) if np.ndim(given) else (given,) * len(names)
-        if len(values) != len(names):
-            raise DetectorError(
-                f"persistence has {len(values)} numbers for the {len(names)} faults "
-                f"{', '.join(names)}.",
-                persistence=given,
-            )
-        try:
-            whole = tuple(operator.index(value) for value in values)
-        except TypeError:
-            whole = (0,)
-        if any(isinstance(value, bool) for value in values) or min(whole) < 1:
-            raise DetectorError(
-                f"persistence={given!r} is not a whole number of samples from 1 on.",
-                persistence=given,
-            )
-        return whole
-
     @property
     def counts(self) -> tuple[int, ...]:
         """Samples that the alarm of each fault takes."""
-        return self._counts(self.model.names("f"))
+        counts: Any = self.persistence
+        return tuple(counts)
 
     @property
     def _skipped(self) -> tuple[str, ...]:
@@ -386,3 +366,24 @@ def _bounded_faults(step: ca.Function, n_f: int) -> NDArray[np.bool_]:
 
 def _infinite(value: ca.SX) -> bool:
     return bool(value.is_constant()) and bool(np.isinf(float(value)))
+
+
+def _whole_numbers(given: Any, names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the persistence of each fault."""
+    values = tuple(given) if np.ndim(given) else (given,) * len(names)
+    if len(values) != len(names):
+        raise DetectorError(
+            f"persistence has {len(values)} numbers for the {len(names)} faults "
+            f"{', '.join(names)}.",
+            persistence=given,
+        )
+    try:
+        whole = tuple(operator.index(value) for value in values)
+    except TypeError:
+        whole = (0,)
+    if any(isinstance(value, bool) for value in values) or min(whole) < 1:
+        raise DetectorError(
+            f"persistence={given!r} is not a whole number of samples from 1 on.",
+            persistence=given,
+        )
+    return whole

@@ -38,6 +38,8 @@ class Differences:
     bounded: bool = True
     fault_delay: int = 1
     method: str = "differences"
+    ode: None = None
+    step_covered: bool = False
 
     @property
     def half_widths(self):

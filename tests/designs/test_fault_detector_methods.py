@@ -1,10 +1,13 @@
 """The fault detector over the methods: delays of the papers' examples, promises, refusals."""
 
+import pickle
+
 import numpy as np
 import pytest
 
 import obsynth as ob
 from obsynth.designs.core.errors import DetectorError
+from obsynth.designs.core.observer import STEP_OUTPUTS
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
 
@@ -104,6 +107,36 @@ def test_a_mean_outlasts_its_fault(bank):
     assert found.lingering["theta1"] > 0
     assert found.lingering["theta2"] == 0
     assert found.false_alarms == {"theta1": 0, "theta2": 0}
+
+
+def faulty_step(steps=90):
+    base = ob.scenarios.interval_example(0, steps)
+    return ob.Scenario(**{**vars(base), "faults": np.full((steps + 1, 1), 2.0)})
+
+
+SCENARIOS = {
+    "peak": lambda: ob.scenarios.quadruple_tank("FS1"),
+    "interval": faulty_step,
+    "bank": lambda: ob.scenarios.three_tanks(end=205.0),
+}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_detector_pickles(request, name):
+    """Pickled before or after its step was asked for, it returns the same numbers to the bit."""
+    skipped = ("inconsistent_measurement",)
+    detector = ob.FaultDetector(request.getfixturevalue(name), 3, also_skip=skipped)
+    fresh, scenario = pickle.loads(pickle.dumps(detector)), SCENARIOS[name]()
+    run = ob.simulate(detector.model, detector, scenario, seed=1)
+    assert run.alarm.any() and not run.alarm.all()
+    for other in (fresh, pickle.loads(pickle.dumps(detector))):
+        assert other.step.name_out() == detector.step.name_out()
+        assert (other.counts, other.also_skip) == (detector.counts, detector.also_skip)
+        assert str(other) == str(detector)
+        assert str(other.guarantee) == str(detector.guarantee)
+        again = ob.simulate(other.model, other, scenario, seed=1)
+        for signal in (*STEP_OUTPUTS[1:], "alarm"):
+            assert getattr(again, signal).tobytes() == getattr(run, signal).tobytes(), signal
 
 
 def test_a_method_without_fault_bounds_is_refused():
