@@ -5,8 +5,8 @@ from typing import Any
 
 import sympy as sp
 
-from obsynth.symbolic.arguments import exact_number
 from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.signals import exact_number
 
 METHODS = ("euler", "rk4")
 """The methods by name."""

@@ -11,11 +11,10 @@ from sympy.core.relational import Relational
 from sympy.functions.elementary.piecewise import ExprCondPair
 from sympy.logic.boolalg import ITE, And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
 
-from obsynth.symbolic.arguments import expand_names, per_symbol
 from obsynth.symbolic.convert import nearest_double
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
-from obsynth.symbolic.signals import Role, Signal
+from obsynth.symbolic.signals import Role, Signal, expand_names, per_symbol
 from obsynth.symbolic.text import TextError, read_text, undeclared
 
 _PLAIN = (

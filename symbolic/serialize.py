@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 
-from obsynth.symbolic.arguments import expand_names
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.signals import Role, Signal
+from obsynth.symbolic.signals import Role, Signal, expand_names
 from obsynth.symbolic.text import read_text, write_text
 
 if TYPE_CHECKING:

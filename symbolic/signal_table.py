@@ -7,9 +7,8 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.symbolic.arguments import exact_number, expand_names, make_signals
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.signals import KINDS, Role, Signal
+from obsynth.symbolic.signals import KINDS, Role, Signal, exact_number, expand_names, make_signals
 
 
 class SignalTable:

@@ -1,12 +1,24 @@
-"""Signals: what a symbol of a plant stands for, with its bounds and its unit."""
+"""Signals: what a symbol stands for, with bounds and unit, and how one is declared."""
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from fractions import Fraction
+from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.functions import ALIASES, BY_NAME
+from obsynth.symbolic.text import WORDS
+
+RESERVED = (WORDS | BY_NAME.keys() | ALIASES.keys()) - {"phi1", "tanhc"}
+"""Names that would read as something else; phi1 is too good a name for an angle."""
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Role(StrEnum):
@@ -153,3 +165,194 @@ class Signal:
     def is_fault(self) -> bool:
         """True for actuator, sensor and process faults."""
         return self.role in FAULT_ROLES
+
+
+def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str, ...]:
+    """Expand names as ``sympy.symbols`` does."""
+    parts = [names] if isinstance(names, str) else names
+    if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
+        raise PlantError(f"{what}: names are a string such as 'h1:5', not {names!r}", names=names)
+    try:
+        found = [str(s) for part in parts for s in sp.symbols(part, seq=True)]
+    except (TypeError, ValueError) as error:
+        raise PlantError(f"{what}: {names!r} names nothing: {error}", names=names) from error
+    if not found:
+        raise PlantError(f"{what}: {names!r} names nothing", names=names)
+    for name in found:
+        if not _IDENTIFIER.fullmatch(name):
+            raise PlantError(
+                f"{what}: {name!r} is no name; use letters, digits and underscores", symbol=name
+            )
+        if name in RESERVED:
+            raise PlantError(
+                f"{what}: {name!r} is a word of the equation language; choose another name",
+                symbol=name,
+            )
+        if found.count(name) > 1:
+            raise PlantError(f"{what}: the name {name!r} is given twice", symbol=name)
+    return tuple(found)
+
+
+def per_symbol(value: Any, names: Sequence[str], what: str) -> list[Any]:
+    """Return one value per symbol: a list is taken in order, anything else holds for all."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, list | tuple):
+        return [value] * len(names)
+    if len(value) != len(names):
+        raise PlantError(
+            f"{what}= has {len(value)} entries for {len(names)} symbols ({', '.join(names)})",
+            symbols=tuple(names),
+            keyword=what,
+        )
+    return list(value)
+
+
+def exact_number(value: Any, what: str) -> sp.Expr:
+    """Return a number as SymPy holds it: rationals exact, floats as their double."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Fraction):
+        return sp.Rational(value.numerator, value.denominator)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise PlantError(f"{what}: {value} is not finite", value=value)
+    if isinstance(value, bool) or not isinstance(value, int | float | sp.Expr):
+        raise PlantError(f"{what}: {value!r} is not a number", value=value)
+    number = sp.sympify(value)
+    if not (number.is_number and number.is_extended_real and number.is_finite):
+        raise PlantError(f"{what}: {value} is not a finite real number", value=value)
+    return sp.Float(float(number)) if isinstance(number, sp.Float) else number
+
+
+def make_signals(
+    role: Role,
+    names: str | Sequence[str],
+    *,
+    limits: Any = None,
+    bound: Any = None,
+    nominal: Any = None,
+    unit: Any = "",
+    rate: Any = None,
+    constant: Any = False,
+    measured: Any = True,
+    of: Sequence[str | None] | None = None,
+    value: Any = None,
+    tolerance: Any = None,
+) -> tuple[Signal, ...]:
+    """Make the signals of one declaration.
+
+    Every keyword is one value for all symbols or a list with one per symbol;
+    ``limits`` is one pair or a list of pairs.
+    """
+    found = expand_names(names, str(role))
+    if limits is not None and bound is not None:
+        raise PlantError(f"{role} {found[0]}: give bound= or range=, not both", symbol=found[0])
+    columns = {
+        "limits": _pairs(limits, found),
+        "bound": per_symbol(bound, found, "bound"),
+        "nominal": per_symbol(nominal, found, "nominal"),
+        "unit": per_symbol(unit, found, "unit"),
+        "rate": per_symbol(rate, found, "rate"),
+        "constant": per_symbol(constant, found, "constant"),
+        "measured": per_symbol(measured, found, "measured"),
+        "of": [None] * len(found) if of is None else list(of),
+        "value": per_symbol(value, found, "value"),
+        "tolerance": per_symbol(tolerance, found, "tolerance"),
+    }
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return tuple(_one(role, name, **row) for name, row in zip(found, rows, strict=True))
+
+
+def _one(
+    role: Role,
+    name: str,
+    *,
+    limits: Any,
+    bound: Any,
+    nominal: Any,
+    unit: Any,
+    rate: Any,
+    constant: Any,
+    measured: Any,
+    of: str | None,
+    value: Any,
+    tolerance: Any,
+) -> Signal:
+    who = f"{role} {name}"
+    if not isinstance(unit, str):
+        raise PlantError(f"{who}: unit= is text such as 'cm', not {unit!r}", symbol=name)
+    for flag, word in ((constant, "constant"), (measured, "measured")):
+        if not isinstance(flag, bool):
+            raise PlantError(f"{who}: {word}= is True or False, not {flag!r}", symbol=name)
+    exact = None if value is None else exact_number(value, f"{who}: value")
+    lower, upper = (-math.inf, math.inf) if limits is None else limits
+    if bound is not None:
+        upper = _float(bound, f"{who}: bound")
+        if not 0.0 <= upper < math.inf:
+            raise PlantError(f"{who}: bound={bound} is not a finite, non-negative number")
+        lower = -upper
+    if role is Role.PARAM:
+        lower, upper, nominal = _parameter(who, exact, tolerance, limits, nominal)
+    return Signal(
+        name=name,
+        symbol=sp.Symbol(name, real=True),
+        role=role,
+        lower=_float(lower, f"{who}: range"),
+        upper=_float(upper, f"{who}: range"),
+        unit=unit,
+        nominal=None if nominal is None else _float(nominal, f"{who}: nominal"),
+        rate=None if rate is None else _float(rate, f"{who}: rate"),
+        constant=constant,
+        measured=measured,
+        of=of,
+        value=exact,
+    )
+
+
+def _parameter(
+    who: str, exact: sp.Expr | None, tolerance: Any, limits: Any, nominal: Any
+) -> tuple[float, float, float]:
+    """Return interval and nominal value of a parameter."""
+    if exact is None and limits is None:
+        raise PlantError(f"{who}: give value=, value= with tolerance=, or range=")
+    if tolerance is not None and (exact is None or limits is not None):
+        raise PlantError(f"{who}: tolerance= goes with value= and without range=")
+    if limits is not None:
+        lower, upper = (_float(limit, f"{who}: range") for limit in limits)
+        if not (math.isfinite(lower) and math.isfinite(upper)):
+            raise PlantError(f"{who}: the range of a parameter has to be finite")
+        middle = (lower + upper) / 2.0 if exact is None else float(exact)
+    else:
+        middle = float(exact) if exact is not None else 0.0
+        share = 0.0 if tolerance is None else _float(tolerance, f"{who}: tolerance")
+        if not 0.0 <= share < math.inf:
+            raise PlantError(f"{who}: tolerance={tolerance} is not a finite, non-negative number")
+        lower, upper = middle - share * abs(middle), middle + share * abs(middle)
+    if nominal is None:
+        nominal = middle
+    return lower, upper, _float(nominal, f"{who}: nominal")
+
+
+def _pairs(limits: Any, names: Sequence[str]) -> list[Any]:
+    """Return one (lower, upper) per symbol from one pair or a list of pairs."""
+    if limits is None:
+        return [None] * len(names)
+    if isinstance(limits, np.ndarray):
+        limits = limits.tolist()
+    if not isinstance(limits, list | tuple):
+        raise PlantError(f"range= is a pair (lower, upper) or a list of pairs, not {limits!r}")
+    single = not any(isinstance(item, list | tuple | np.ndarray) or item is None for item in limits)
+    pairs = [limits] * len(names) if single else per_symbol(list(limits), names, "range")
+    for name, pair in zip(names, pairs, strict=True):
+        if pair is not None and len(pair) != 2:
+            raise PlantError(f"range of {name}: a pair (lower, upper), not {pair!r}", symbol=name)
+    return pairs
+
+
+def _float(value: Any, what: str) -> float:
+    if isinstance(value, bool | str | complex):
+        raise PlantError(f"{what}: {value!r} is not a number", value=value)
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise PlantError(f"{what}: {value!r} is not a number", value=value) from error
