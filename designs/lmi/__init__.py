@@ -33,7 +33,6 @@ from obsynth.designs.lmi.blocks import block, he, symmetric_block
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
-    Inequality,
     constant,
     diagonal,
     full,
@@ -45,8 +44,6 @@ from obsynth.designs.lmi.margin import Margin, MarginSolution, largest_margin, s
 from obsynth.designs.lmi.problem import Problem, cap_gain
 from obsynth.designs.lmi.proof import FamilyProof, prove_family
 from obsynth.designs.lmi.reductions import (
-    Extremes,
-    SplitFamily,
     distinct_members,
     extreme_points,
     split_common,
@@ -59,9 +56,7 @@ from obsynth.designs.lmi.relaxation import (
     row_multipliers,
 )
 from obsynth.designs.lmi.search import (
-    Bisection,
     Knob,
-    Search,
     bisect_feasible,
     search_line,
     search_log_convex,
@@ -72,19 +67,14 @@ from obsynth.designs.lmi.statement import Solution
 
 __all__ = [
     "Affine",
-    "Bisection",
     "ExpressionError",
-    "Extremes",
     "FamilyProof",
-    "Inequality",
     "Knob",
     "Margin",
     "MarginSolution",
     "Problem",
     "RowMultipliers",
-    "Search",
     "Solution",
-    "SplitFamily",
     "UncertainRow",
     "bisect_feasible",
     "block",
