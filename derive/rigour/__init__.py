@@ -29,7 +29,9 @@ each kind of number to its law, against exact rationals or balls of 300 bits.
 from obsynth.derive.rigour.definite import ProofResult, prove_positive_definite
 from obsynth.derive.rigour.eigenvalues import finite, largest_eigenvalue, perron_bound, rotate
 from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.exact import (
+from obsynth.derive.rigour.interval import Interval
+from obsynth.derive.rigour.numbers import enclose_number, rational, round_number, substitute
+from obsynth.derive.rigour.rationals import (
     Exact,
     ExactMatrix,
     above,
@@ -44,8 +46,6 @@ from obsynth.derive.rigour.exact import (
     positive,
     to_text,
 )
-from obsynth.derive.rigour.interval import Interval
-from obsynth.derive.rigour.numbers import enclose_number, rational, round_number, substitute
 from obsynth.derive.rigour.rounding import (
     TINY,
     UNIT,

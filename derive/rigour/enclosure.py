@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour.exact import ExactMatrix
+from obsynth.derive.rigour.rationals import ExactMatrix
 from obsynth.derive.rigour.rounding import UNIT_ROUNDOFF, gamma_bound, raised, smallest_above
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -1,6 +1,7 @@
 """Between exact numbers of SymPy and doubles: rounding with a proven bound."""
 
 import math
+import sys
 from collections.abc import Mapping
 from fractions import Fraction
 
@@ -10,6 +11,7 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour.rounding import smallest_above
 
 _DIGITS = 60
+_LARGEST = sp.Integer(int(sys.float_info.max))
 
 
 def rational(value: float) -> sp.Rational:
@@ -30,13 +32,15 @@ def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.E
 def round_number(number: sp.Expr) -> tuple[float, float]:
     """Round an exact real number to a double, with a bound of the rounding error."""
     number = sp.sympify(number)
+    approximation = number if number.is_Rational else number.evalf(_DIGITS)
+    if not (number.is_Rational or approximation.is_Float) or not approximation.is_finite:
+        raise DerivationError(f"{number} is not a finite real number", expression=number)
+    if abs(approximation) > _LARGEST:
+        raise DerivationError(f"{number} is too large for a double", expression=number)
     if number.is_Rational:
         exact = Fraction(int(number.p), int(number.q))
         value = float(exact)
         return value, smallest_above(abs(exact - Fraction(value)))
-    approximation = number.evalf(_DIGITS)
-    if not approximation.is_Float or not approximation.is_finite:
-        raise DerivationError(f"{number} is not a finite real number", expression=number)
     value = float(approximation)
     distance = abs(approximation - sp.Float(rational(value), 2 * _DIGITS))
     margin = sp.Float(10, _DIGITS) ** (10 - _DIGITS) * abs(approximation)

@@ -10,8 +10,7 @@ from obsynth.derive import DerivationError, Split, StructureError, equilibrium, 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.identity import prove_identity
 from obsynth.derive.algebra.linear_parts import rounded
-from obsynth.derive.algebra.zero_test import is_zero
-from obsynth.derive.rigour import enclose_number, rational, round_number
+from obsynth.derive.rigour import rational
 from obsynth.symbolic import Plant
 
 x1, x2, x3, u1 = sp.symbols("x1:4 u1", real=True)
@@ -33,44 +32,6 @@ def make(dynamics, n=2, outputs=None, Ts=None, limits=(-2, 2), nominal=1):
     plant.dynamics(dynamics(signals), Ts=Ts)
     plant.outputs(outputs(signals) if outputs else list(signals["x"]))
     return plant
-
-
-# -- exact numbers -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "number",
-    [sp.Rational(1, 3), sp.sqrt(2), sp.pi / 7, -sp.exp(1), sp.Rational(10**40, 3), sp.Integer(0)],
-)
-def test_rounding_of_exact_numbers_is_bounded(number):
-    value, error = round_number(number)
-    assert sp.Abs(number - rational(value)) <= rational(error)
-    assert error <= 2.3e-16 * max(abs(value), 1e-300) or number == 0
-    lo, hi = enclose_number(number)
-    assert rational(lo) <= number <= rational(hi)
-    assert (lo == hi) == (number.is_Rational and rational(float(number)) == number)
-
-
-def test_no_number_is_refused():
-    with pytest.raises(DerivationError, match="not a finite real number"):
-        round_number(sp.zoo)
-    with pytest.raises(DerivationError, match="not a finite real number"):
-        round_number(x1)
-
-
-@pytest.mark.parametrize(
-    ("expression", "how"),
-    [
-        (x1 - x1, "syntactic"),
-        ((x1 + 1) * (x1 - 1) - x1**2 + 1, "expand"),
-        (1 / (x1 + 1) + 1 / (x1 - 1) - 2 * x1 / (x1**2 - 1), "cancel"),
-        (sp.sin(x1) ** 2 + sp.cos(x1) ** 2 - 1, "simplify"),
-        (sp.sqrt(3 + 2 * sp.sqrt(2)) - 1 - sp.sqrt(2) - sp.Rational(1, 10**9), ""),
-        (x1 - x2, ""),
-    ],
-)
-def test_zero_tests(expression, how):
-    assert is_zero(expression) == how
 
 
 # -- factorisation -----------------------------------------------------------------------------

@@ -163,3 +163,12 @@ def test_a_product_with_a_constant_expression_is_affine():
     P = symmetric("P", 3)
     A = constant(draw(5, None)["A"])
     assert np.allclose((A @ P).value({"P": np.eye(3)}), A.constant, rtol=1e-15)
+
+
+def test_blocks_of_exact_matrices_are_exact():
+    a = ExactMatrix.of([[1, 2], [3, 5]])
+    assert block([[a, 0], [0, ExactMatrix.of(7)]]).to_fractions() == [
+        [1, 2, 0],
+        [3, 5, 0],
+        [0, 0, 7],
+    ]

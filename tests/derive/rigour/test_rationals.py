@@ -9,8 +9,18 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour import ExactMatrix, is_positive_definite
-from obsynth.designs.lmi import block
+from obsynth.derive.rigour import (
+    ExactMatrix,
+    above,
+    down,
+    exact,
+    from_text,
+    image,
+    inverse,
+    is_positive_definite,
+    nearest,
+    to_text,
+)
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=60, deadline=None)
@@ -60,7 +70,6 @@ def test_arithmetic_is_that_of_fractions():
     assert (a @ a.inverse()).to_fractions() == [[1, 0], [0, 1]]
     assert (2 * a - a / 2).to_fractions()[1] == [Fraction(9, 2), Fraction(15, 2)]
     assert (a * a)[1, :].to_fractions() == [[9, 25]]
-    assert block([[a, 0], [0, ExactMatrix.of(7)]]).to_fractions()[2] == [0, 0, 7]
     assert (1 - ExactMatrix.of(Fraction(1, 3))).to_fractions() == [[Fraction(2, 3)]]
     assert (np.eye(2) @ a).to_fractions() == a.to_fractions()
 
@@ -81,3 +90,63 @@ def test_arithmetic_is_that_of_fractions():
 def test_misuse_is_named(attempt, word):
     with pytest.raises(ObsynthError, match=word):
         attempt()
+
+
+# -- arrays ----------------------------------------------------------------------------------------
+
+FRACTIONS = st.lists(st.fractions(-50, 50, max_denominator=10**9), min_size=12, max_size=12)
+
+
+def as_fractions(values):
+    return [Fraction(int(v.p), int(v.q)) for v in exact(values).ravel()]
+
+
+@PROPERTY
+@given(entries=FRACTIONS)
+def test_doubles_are_nearest_or_above(entries):
+    values = exact(entries)
+    near, high = nearest(values).tolist(), above(values).tolist()
+    for value, n, h, below in zip(entries, near, high, down(above(values)), strict=True):
+        assert n == float(value)
+        assert Fraction(float(below)) < value <= Fraction(h)
+
+
+def test_doubles_that_are_only_nearest_are_not_above(monkeypatch):
+    values = exact([Fraction(k, 7) for k in range(1, 30)])
+    assert all(
+        Fraction(h) >= v for h, v in zip(above(values).tolist(), as_fractions(values), strict=True)
+    )
+    monkeypatch.setattr("obsynth.derive.rigour.rationals.smallest_above", float)
+    assert any(
+        Fraction(h) < v for h, v in zip(above(values).tolist(), as_fractions(values), strict=True)
+    )
+
+
+@PROPERTY
+@given(matrix=FRACTIONS, low=FRACTIONS, width=FRACTIONS)
+def test_the_image_of_a_box_is_the_smallest_box_around_it(matrix, low, width):
+    M, low = exact(matrix).reshape(3, 4), exact(low[:4])
+    high = low + abs(exact(width[:4]))
+    bottom, top = image(M, low, high)
+    corners = [M @ np.where(np.array(signs), high, low) for signs in np.ndindex(*([2] * len(low)))]
+    assert (np.max(corners, axis=0) == top).all()
+    assert (np.min(corners, axis=0) == bottom).all()
+
+
+@PROPERTY
+@given(entries=FRACTIONS)
+def test_inverse_and_text_lose_nothing(entries):
+    matrix = exact(entries[:9]).reshape(3, 3)
+    assert (from_text(to_text(matrix), (3, 3)) == matrix).all()
+    if sp.Matrix(3, 3, entries[:9]).det() != 0:
+        assert (inverse(matrix) @ matrix == exact(np.eye(3))).all()
+    else:
+        with pytest.raises(ObsynthError, match="singular"):
+            inverse(matrix)
+
+
+def test_empty_arrays_keep_their_shape():
+    empty = exact(np.zeros((0, 2)))
+    assert inverse(exact(np.zeros((0, 0)))).shape == (0, 0)
+    assert from_text(to_text(empty), (0, 2)).shape == nearest(empty).shape == (0, 2)
+    assert ExactMatrix.of(np.zeros((3, 0))).to_floats().shape == (3, 0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour import Enclosure, ExactMatrix, enclosure
+from obsynth.derive.rigour import Enclosure, ExactMatrix, enclosure, rounding
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=40, deadline=None)
@@ -62,7 +62,23 @@ def test_without_rounding_bounds_the_exact_result_escapes(monkeypatch):
     exact = ExactMatrix.of(a) @ ExactMatrix.of(b)
     assert inside(exact, Enclosure.of(a) @ Enclosure.of(b))
     monkeypatch.setattr(enclosure, "gamma_bound", lambda n: 0.0)
+    monkeypatch.setattr(rounding, "gamma_bound", lambda n: 0.0)
     assert not inside(exact, Enclosure.of(a) @ Enclosure.of(b))
+
+
+@PROPERTY
+@given(entries=st.lists(st.fractions(), min_size=6, max_size=6))
+def test_an_exact_matrix_is_enclosed_by_its_nearest_doubles(entries):
+    exact = ExactMatrix.of(np.array(entries, dtype=object).reshape(2, 3))
+    assert inside(exact, Enclosure.of(exact))
+    assert (Enclosure.of(exact).mid == exact.to_floats()).all()
+
+
+def test_a_nearest_double_without_radius_is_caught(monkeypatch):
+    third = ExactMatrix.of(Fraction(1, 3))
+    assert Enclosure.of(ExactMatrix.of(0.5)).rad[0, 0] == 0.0
+    monkeypatch.setattr(enclosure, "smallest_above", lambda value: 0.0)
+    assert not inside(third, Enclosure.of(third))
 
 
 def test_families_are_enclosed_member_by_member():

@@ -4,7 +4,7 @@ import pytest
 import sympy as sp
 
 from obsynth.derive.algebra import zero_test
-from obsynth.derive.algebra.zero_test import NUMERIC, FormProof, prove_zero
+from obsynth.derive.algebra.zero_test import NUMERIC, FormProof, is_zero, prove_zero
 
 x, y = sp.symbols("x y", real=True)
 
@@ -89,3 +89,18 @@ def test_many_denominators_are_not_multiplied_out():
     many = sp.Add(*[1 / (1 + x + k * y) for k in range(2, 12)])
     other = sp.Add(*[(x + k * y) / (1 + x + k * y) - 1 for k in range(2, 12)])
     assert prove_zero(sp.sin(x) * many + sp.sin(x) * other, {}) in ("cancel", "simplify", NUMERIC)
+
+
+@pytest.mark.parametrize(
+    ("expression", "how"),
+    [
+        (x - x, "syntactic"),
+        ((x + 1) * (x - 1) - x**2 + 1, "expand"),
+        (1 / (x + 1) + 1 / (x - 1) - 2 * x / (x**2 - 1), "cancel"),
+        (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, "simplify"),
+        (sp.sqrt(3 + 2 * sp.sqrt(2)) - 1 - sp.sqrt(2) - sp.Rational(1, 10**9), ""),
+        (x - y, ""),
+    ],
+)
+def test_symbolic_zero_tests(expression, how):
+    assert is_zero(expression) == how
