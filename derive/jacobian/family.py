@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.dependence import AffineDependence, entry_name
-from obsynth.derive.rigour import round_number
+from obsynth.derive.rigour import UNIT_ROUNDOFF, round_number, up
 from obsynth.symbolic.arrays import FloatArray
 
 Entry = tuple[int, int]
-_UNIT = 2.0**-53
 _MOST_SCALARS = 16
 
 
@@ -169,7 +168,7 @@ class AffineFamily:
 
         columns = self.directions.reshape(len(self.directions), -1).T
         rest, slack = (matrix - self.constant).ravel(), self.radius.ravel()
-        slack = slack + 8 * _UNIT * np.abs(matrix).ravel()
+        slack = slack + 8 * UNIT_ROUNDOFF * np.abs(matrix).ravel()
         found = linprog(
             np.zeros(len(self.ranges)),
             np.vstack([columns, -columns]),
@@ -218,8 +217,9 @@ def build_family(
             and abs(float(next(iter(dependence.coefficients.values())))) == 1.0
         )
         if not exact_sum:
-            error += operations * _UNIT * magnitude
-        radius[entry] = np.nextafter(error * (1.0 + 16 * _UNIT), np.inf) if error > 0.0 else 0.0
+            error += operations * UNIT_ROUNDOFF * magnitude
+        if error > 0.0:
+            radius[entry] = up(error * (1.0 + 16 * UNIT_ROUNDOFF))
     seen: set[str] = set()
     disjoint = True
     for entry in basis:

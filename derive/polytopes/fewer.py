@@ -12,11 +12,11 @@ from obsynth.derive.jacobian.bounds import jacobian_bounds
 from obsynth.derive.jacobian.entries import jacobian_entries, sample_entries
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes.support import basis_entries
+from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
-_UNIT = 2.0**-53
 _ROUND = 1.0 + 2.0**-44
 
 
@@ -59,7 +59,7 @@ def _without(family: AffineFamily, dropped: Sequence[int]) -> AffineFamily:
         direction = np.abs(family.directions[k])
         constant = constant + middle * family.directions[k]
         # the product and the sum round once each
-        lost = 4.0 * _UNIT * (np.abs(constant) + 2.0 * abs(middle) * direction)
+        lost = 4.0 * UNIT_ROUNDOFF * (np.abs(constant) + 2.0 * abs(middle) * direction)
         radius = radius + half * direction + np.where(direction > 0.0, lost, 0.0)
     return replace(
         family,
@@ -139,14 +139,15 @@ def principal_family(
     # s = inverse c + defect s: the product of the two matrices is not quite the identity
     size = np.abs(family.ranges).max(axis=1)
     defect = np.abs(np.eye(count) - inverse @ axes)
-    defect = defect + (2 * count + 4) * _UNIT * (np.abs(inverse) @ np.abs(axes) + np.eye(count))
+    unit = (2 * count + 4) * UNIT_ROUNDOFF
+    defect = defect + unit * (np.abs(inverse) @ np.abs(axes) + np.eye(count))
     spread = np.maximum(np.abs(found.lower), np.abs(found.upper))
-    rest = defect @ size + (2 * count + 4) * _UNIT * (np.abs(inverse) @ spread)
+    rest = defect @ size + unit * (np.abs(inverse) @ spread)
     weights = np.abs(family.directions)
     directions = np.tensordot(inverse.T, family.directions, axes=1)
     rounding = (
         (2 * count + 8)
-        * _UNIT
+        * UNIT_ROUNDOFF
         * (np.tensordot(np.abs(inverse) @ spread + size, weights, axes=1) + np.abs(family.constant))
     )
     order = np.argsort(-np.ptp(values @ rotation.T, axis=0), kind="stable")

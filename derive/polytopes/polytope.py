@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.polytopes.pivoting import Degenerate, walk_vertices
+from obsynth.derive.rigour import smallest_above
 from obsynth.symbolic.arrays import FloatArray
 
 # Faces are moved outwards by so much of the size, each by a different multiple, until no more than
@@ -146,21 +147,13 @@ def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope
         ]
         radius = [max(column) for column in zip(*errors, strict=True)]
         order = np.lexsort(vertices.T[::-1])
-        return Polytope(A, b, vertices[order], np.array([_above(r) for r in radius]))
+        return Polytope(A, b, vertices[order], np.array([smallest_above(r) for r in radius]))
     raise DerivationError(
         "the vertices of these half-spaces could not be told apart: the polytope is flat or "
         "nearly so. Describe it in fewer coordinates",
         halfspaces=len(b),
         condition="flat",
     )
-
-
-def _above(value: Fraction) -> float:
-    """Return a double that is not below a nonnegative number."""
-    if value == 0:
-        return 0.0
-    near = float(value)
-    return near if Fraction(near) >= value else float(np.nextafter(near, np.inf))
 
 
 def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
@@ -210,11 +203,10 @@ def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
     for row in normals:
         a = [Fraction(float(v)) for v in row]
         largest = max(
-            sum(x * Fraction(float(y)) for x, y in zip(a, p, strict=True))
+            sum((x * Fraction(float(y)) for x, y in zip(a, p, strict=True)), Fraction(0))
             for p in points[_foremost(points, row)]
         )
-        near = float(largest)
-        offsets.append(near if Fraction(near) >= largest else float(np.nextafter(near, np.inf)))
+        offsets.append(smallest_above(largest))
     order = np.lexsort(kept.T[::-1])
     return Polytope(normals, np.array(offsets), kept[order], np.zeros(n))
 

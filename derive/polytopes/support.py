@@ -26,12 +26,12 @@ from obsynth.derive.polytopes.polytope import (
     polytope_from_halfspaces,
 )
 from obsynth.derive.polytopes.thinning import thin
+from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
 Entry = tuple[int, int]
-_UNIT = 2.0**-53
 _MOST_VERTICES = 2**16
 _LARGEST_GROUP = 3
 # Smallest integer directions: multiples of pi/8 or so in the plane, and towards the faces, edges
@@ -272,7 +272,7 @@ def _radius(family: AffineFamily, groups: Sequence[Group]) -> FloatArray:
     # entries that are a scalar themselves are copied
     sums = family.radius > 0.0
     total = family.radius + moved
-    total = total + np.where(sums, (4 * len(size) + 8) * _UNIT * magnitude, 0.0)
+    total = total + np.where(sums, (4 * len(size) + 8) * UNIT_ROUNDOFF * magnitude, 0.0)
     return np.where(total > 0.0, np.nextafter(total * (1.0 + 2.0**-40), np.inf), 0.0)
 
 

@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour import ExactMatrix
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 
 _RANK_TOLERANCE = 1e-9
-
-
-def _exact(values: Any) -> Any:
-    """Return the exact rational matrix of an array of doubles (`flint.fmpq_mat`)."""
-    from flint import fmpq, fmpq_mat
-
-    array = np.atleast_2d(np.asarray(values, dtype=float))
-    rows, columns = array.shape
-    entries = [fmpq(*float(value).as_integer_ratio()) for value in array.ravel()]
-    return fmpq_mat(rows, columns, entries)
-
-
-def _rounded(matrix: Any) -> FloatArray:
-    """Return the nearest doubles of an exact rational matrix."""
-    rows, columns = matrix.nrows(), matrix.ncols()
-    return np.array(
-        [[int(matrix[i, j].p) / int(matrix[i, j].q) for j in range(columns)] for i in range(rows)],
-        dtype=float,
-    ).reshape(rows, columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,33 +40,29 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
 
     Buciakowski et al., eqs. (13)-(14); C (m, n), D (n, q). Refuses a C D without full column rank.
     """
-    from flint import fmpq_mat
-
     C = np.asarray(C, dtype=float)
     m, n = C.shape
     q = D.shape[1]
     if q == 0:
         return Decoupling(np.zeros((n, m)), np.eye(n), np.eye(m), 0, 0.0, True)
-    exact_C, exact_D = _exact(C), _exact(D)
-    CD = exact_C * exact_D
-    gram = CD.transpose() * CD
-    if gram.det() == 0:
+    exact_C, exact_D = ExactMatrix.of(C), ExactMatrix.of(D)
+    CD = exact_C @ exact_D
+    gram = CD.T @ CD
+    if gram.entries.det() == 0:
         raise StructureError(
-            f"rank(C D) is {CD.rank()} but there are {q} unknown inputs: an unknown input does "
-            "not reach the outputs within one step, so it cannot be decoupled; measure a state "
-            "that it enters",
-            rank=CD.rank(),
+            f"rank(C D) is {CD.entries.rank()} but there are {q} unknown inputs: an unknown input "
+            "does not reach the outputs within one step, so it cannot be decoupled; measure a "
+            "state that it enters",
+            rank=CD.entries.rank(),
             required=q,
         )
-    E = _rounded(exact_D * gram.inv() * CD.transpose() * -1)
-    exact_E = _exact(E)
-    eye_n = fmpq_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
-    eye_m = fmpq_mat(m, m, [int(i == j) for i in range(m) for j in range(m)])
-    exact_T = eye_n + exact_E * exact_C
-    T = _rounded(exact_T)
-    Pi = _rounded(eye_m + exact_C * exact_E)
-    residual = float(np.max(np.abs(_rounded(exact_T * exact_D)), initial=0.0))
-    projector = exact_T * exact_T == exact_T and _exact(T) == exact_T
+    E = (-exact_D @ gram.inverse() @ CD.T).to_floats()
+    exact_E = ExactMatrix.of(E)
+    exact_T = np.eye(n) + exact_E @ exact_C
+    T = exact_T.to_floats()
+    Pi = (np.eye(m) + exact_C @ exact_E).to_floats()
+    residual = float(np.max(np.abs((exact_T @ exact_D).to_floats()), initial=0.0))
+    projector = (exact_T @ exact_T).entries == exact_T.entries == ExactMatrix.of(T).entries
     return Decoupling(E, T, Pi, q, residual, bool(projector))
 
 

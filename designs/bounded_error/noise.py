@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour import middle_and_radius
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -64,9 +65,7 @@ def noise_box(model: Plant) -> NoiseBox:
             symbols=tuple(rateless),
         )
     box: Any = model.box("w")
-    centre = box.mean(axis=1)
-    radius = np.maximum(box[:, 1] - centre, centre - box[:, 0])
-    radius = np.where(radius > 0, np.nextafter(radius, np.inf), radius)
+    centre, radius = middle_and_radius(box[:, 0], box[:, 1])
     exact = (centre - radius <= box[:, 0]) & (box[:, 1] <= centre + radius)
     symmetric = box[:, 0] == -box[:, 1]
     radius = np.where(symmetric, box[:, 1], radius)

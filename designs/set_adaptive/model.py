@@ -9,7 +9,7 @@ import sympy as sp
 
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour import round_number, substitute
+from obsynth.derive.rigour import middle_and_radius, round_number, substitute
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -104,7 +104,9 @@ def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
     bounds = derive_bounds(form)
     _check_readings(plant, bounds, C)
     rate, input_rate = _speed(plant, C)
-    return Structure(form, bounds, C, G, W1, W2, box.mean(axis=1), _radius(box), rate, input_rate)
+    return Structure(
+        form, bounds, C, G, W1, W2, box.mean(axis=1), middle_and_radius(*box.T)[1], rate, input_rate
+    )
 
 
 def continuous(plant: Plant | Split) -> Plant:
@@ -245,10 +247,3 @@ def _speed(plant: Plant, C: FloatArray) -> tuple[FloatArray, FloatArray]:
         for position, (k, _) in enumerate(entries.places):
             rate[k] = found.lower[position], found.upper[position]
     return rate, input_rate
-
-
-def _radius(box: FloatArray) -> FloatArray:
-    """Half widths that, put around the middle in doubles, hold the box."""
-    middle = box.mean(axis=1)
-    radius: FloatArray = np.maximum(box[:, 1] - middle, middle - box[:, 0])
-    return np.nextafter(radius, np.inf) * (radius > 0.0)

@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.varying import Vertices
+from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.symbolic.arrays import FloatArray
-
-_UNIT = 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def centre_form(polytope: PolytopicForm, nominal: ArrayLike | None = None) -> Ce
     largest += np.tensordot(np.abs(family.ranges).max(axis=1, initial=0.0), weights, axes=1)
     varying = (np.tensordot(half, weights, axes=1) > 0.0) | (around.constant != 0.0)
     steps = 4 * (len(family.ranges) + 4)
-    slack = family.radius + np.where(varying, steps * _UNIT * largest, 0.0)
+    slack = family.radius + np.where(varying, steps * UNIT_ROUNDOFF * largest, 0.0)
     lower = np.where(slack > 0.0, np.nextafter(vertices.min(axis=0) - slack, -np.inf), 0.0)
     upper = np.where(slack > 0.0, np.nextafter(vertices.max(axis=0) + slack, np.inf), 0.0)
     return CentredForm(
