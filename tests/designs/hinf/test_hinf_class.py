@@ -137,7 +137,7 @@ def test_a_pendulum_reaches_what_no_filter_can_beat():
 def test_where_the_solver_finds_no_minimum(options, monkeypatch):
     """The level is found by margins alone, and the filter is proved all the same."""
 
-    def trouble(problem):
+    def trouble(problem, *, floor, gap):
         raise SolverTrouble("no minimum")
 
     plant = ob.plants.hinf_example()
