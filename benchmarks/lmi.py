@@ -122,7 +122,8 @@ def print_targets(results: list[dict[str, Any]]) -> None:
     ]
     print()
     for name, value, target, unit in lines:
-        verdict = "met" if value >= target else "MISSED"
+        measured = 0.0 < value < float("inf")
+        verdict = ("met" if value >= target else "MISSED") if measured else "not measured"
         print(f"{name:40} {value:8.1f} {unit:40} target {target:5.1f}  {verdict}")
 
 

@@ -209,6 +209,7 @@ def _phase_two(problem: Problem, kept: float, margin: Margin) -> LazySolution:
     try:
         return solve_lazily(
             problem.tightened(kept),
+            start=margin.found.chosen,
             # No vertex is left much worse than the solver leaves those it knows.
             floor=lambda stated, solution: min(-2.0 * kept, 1.5 * _lowest(stated, solution)),
             solve=lambda stated: solve_with_retries(

@@ -117,16 +117,23 @@ class LazySolution:
 def solve_lazily(
     problem: Problem,
     *,
+    start: Mapping[str, IntArray] | None = None,
     floor: float | Callable[[Problem, Solution], float] = 0.0,
     solve: Callable[[Problem], Solution] = solve_with_retries,
 ) -> LazySolution:
-    """Solve a problem whose families may have many vertices, none left below the floor."""
+    """Solve a problem whose families may have many vertices, none left below the floor.
+
+    Vertices that mattered to a like problem before can be given to start with, by family.
+    """
     families = {
         item.name: item.expression
         for item in problem.blocks.values()
         if item.cone == "psd" and (item.expression.members or 1) > _FEW
     }
-    chosen = {name: _first_choice(family.members or 1) for name, family in families.items()}
+    chosen = {
+        name: (start or {}).get(name, _first_choice(family.members or 1))
+        for name, family in families.items()
+    }
     for count in range(1, _ROUNDS + 1):
         stated = problem.members(chosen)
         solution = solve(stated)

@@ -16,6 +16,7 @@ from obsynth.designs.lmi import (
     largest_margin,
     margin,
     prove_family,
+    solve,
     solve_lazily,
     solve_with_margin,
     symmetric,
@@ -100,6 +101,25 @@ def test_lazy_and_whole_have_the_same_optimum():
     few = problem.members({"decay": [0, 1]}).solve()
     values = few.value(problem.blocks["decay"].expression)
     assert np.linalg.eigvalsh(values).min() < -1e-4
+
+
+def test_the_second_phase_states_the_vertices_of_the_first_at_once(monkeypatch):
+    """Mutant: without `start=` it has to find them again, solve by solve."""
+    stated = []
+    original = Problem.members
+
+    def listed(self, chosen):
+        stated.append((self, chosen))
+        return original(self, chosen)
+
+    monkeypatch.setattr(Problem, "members", listed)
+    draws = iter(([0, 5, 33, 127], [1, 2, 3, 4]))
+    monkeypatch.setattr(solve, "_first_choice", lambda _: np.array(next(draws)))
+    problem, prove, _ = design()
+    solve_with_margin(problem, prove=prove)
+    by_phase = {id(p): [c["decay"] for q, c in stated if q is p] for p, c in stated if c}
+    first, second = by_phase.values()
+    assert np.array_equal(second[0], first[-1])
 
 
 def test_what_the_solver_cannot_reach_is_told():
