@@ -9,15 +9,10 @@ from obsynth.designs.core.errors import (
     SolverTrouble,
 )
 from obsynth.designs.core.observer import STATUS, Observer
-from obsynth.designs.core.registry import load, save
+from obsynth.designs.core.files import save
+from obsynth.designs.core.loading import load
 from obsynth.designs.detection.comparison import Detection, FaultEvent
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.designs.hinf.method import HinfUIO
-from obsynth.designs.hinf.worst_case import WorstCase, worst_case
-from obsynth.designs.interval.method import IntervalObserver
-from obsynth.designs.qpv.method import QPVObserver
-from obsynth.designs.qpv.region import Ellipsoid
-from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 __all__ = [
     "STATUS",
@@ -27,19 +22,12 @@ __all__ = [
     "Claim",
     "Detection",
     "DetectorError",
-    "Ellipsoid",
     "FaultDetector",
     "FaultEvent",
     "Guarantee",
-    "HinfUIO",
     "InfeasibleDesign",
-    "IntervalObserver",
     "Observer",
-    "QPVObserver",
-    "SetAdaptiveObserver",
     "SolverTrouble",
-    "WorstCase",
     "load",
     "save",
-    "worst_case",
 ]

@@ -1,13 +1,16 @@
-"""Proofs of the ellipsoidal bounds, for the gains and matrices as they are stored."""
+"""Proofs for the gains and matrices as they are stored, and that they speak of the stored plant."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
+from obsynth.derive import Split
 from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
+from obsynth.derive.structure.decoupling import decouple
 from obsynth.designs.bounded_error.error_system import (
     Arithmetic,
     ModelData,
@@ -16,13 +19,62 @@ from obsynth.designs.bounded_error.error_system import (
     lift,
 )
 from obsynth.designs.bounded_error.lmis import fixed_gain_block
-from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.model import Derived
+from obsynth.designs.bounded_error.noise import noise_box
+from obsynth.designs.bounded_error.peak.design import prove_peak_claims
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational LDL' on the worst vertex"
+# Magnitudes up to which signals without a declared range are covered.
+LARGEST_SIGNAL = 1e6
+
+
+def claims(design: UioDesign) -> Iterator[Claim]:
+    """Prove everything that the guarantee of a stored design rests on."""
+    yield _prove_boxes(design)
+    yield _prove_decoupling(design)
+    if isinstance(design.bound, EllipsoidBound):
+        yield from prove_ellipsoid(design)
+    else:
+        yield from prove_peak_claims(design)
+
+
+def _prove_boxes(design: UioDesign) -> Claim:
+    boxes = noise_box(design.plant)
+    w = design.plant.box("w")
+    room = np.concatenate(
+        [
+            w[:, 0] - (design.w_centre - design.w_radius),
+            (design.w_centre + design.w_radius) - w[:, 1],
+            design.rate - boxes.rate,
+        ]
+    )
+    margin = float(room.min(initial=np.inf))
+    return Claim(
+        "boxes",
+        "the stored boxes hold the declared disturbances and fault rates",
+        bool(margin >= 0.0),
+        margin,
+        "comparison",
+    )
+
+
+def _prove_decoupling(design: UioDesign) -> Claim:
+    fresh = decouple(design.C, design.D)
+    same = np.array_equal(fresh.E, design.E) and np.array_equal(fresh.T, design.T)
+    return Claim(
+        "decoupling",
+        "(I + E C) D = 0: the unknown input does not enter the error"
+        if fresh.residual == 0
+        else f"|(I + E C) D| <= {fresh.residual:.1e}: covered by the rounding allowance",
+        bool(same and np.array_equal(fresh.Pi, design.Pi)),
+        0.0 - fresh.residual,
+        "exact rational arithmetic on the stored E, C, D",
+    )
 
 
 def reduced_gain(design: UioDesign, error: str) -> FloatArray:
@@ -51,9 +103,7 @@ def recursion_block(
 
 def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
     """Prove every matrix inequality behind an `EllipsoidBound`."""
-    bound = design.bound
-    if not isinstance(bound, EllipsoidBound):
-        raise TypeError("the design has no ellipsoidal bound")
+    bound = ellipsoid_of(design)
     claims = [_prove_weights(bound), _prove_lmi(design, bound), _prove_half_widths(bound)]
     if bound.error == "shifted":
         kept = kept_coordinates(design.T)
@@ -151,3 +201,55 @@ def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
             if prove_positive_definite(_corner(P, i, values[i]), sharp=False).all_proved:
                 break
     return values
+
+
+def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
+    """Compare the stored split and family with those derived from the stored equations."""
+    parts, family = fresh.split, fresh.bounds.family
+    names = ("A", "B", "B_f", "C", "D", "W1", "W2")
+    same = all(np.array_equal(getattr(design, name), getattr(parts, name)) for name in names)
+    lost = _rounding_of_matrices(design, parts)
+    allowed = float(design.rounding.min(initial=np.inf))
+    yield Claim(
+        "model",
+        "A x + B u + D d + B_f f + W1 w + g equals the stored dynamics, C x + W2 w the outputs",
+        bool(same and parts.proof.holds),
+        0.0,
+        str(parts.proof),
+    )
+    yield Claim(
+        "matrix_rounding",
+        "what rounding the matrices to doubles moves in one step is below the allowance "
+        f"(signals without a range up to {LARGEST_SIGNAL:g})",
+        bool(lost <= allowed),
+        allowed - lost,
+        "bounds of |exact - double| times the boxes",
+    )
+    yield Claim(
+        "jacobian",
+        "every Jacobian of g over the box lies in the stored family",
+        design.family.covers(family),
+        float((family.ranges - design.family.ranges)[:, 0].min(initial=0.0))
+        if design.family.ranges.shape == family.ranges.shape
+        else -np.inf,
+        "interval branch and bound with outward rounding; dependences proved symbolically",
+    )
+
+
+def _rounding_of_matrices(design: UioDesign, parts: Split) -> float:
+    """Bound of the error that rounded D, B_f, W1, C, W2 cause in one step of the error."""
+    rounding = parts.proof.rounding
+    largest = {}
+    for kind, names in (("x", ("C",)), ("d", ("D",)), ("f", ("B_f",)), ("w", ("W1", "W2"))):
+        box = np.abs(design.plant.box(kind)).max(axis=1, initial=0.0)
+        box = np.where(np.isfinite(box), box, LARGEST_SIGNAL)
+        for name in names:
+            largest[name] = float((rounding[name] @ box).max(initial=0.0))
+    gain = float(np.abs(design.gain).sum(axis=1).max(initial=0.0))
+    into_output = largest["C"] + largest["W2"]
+    state = (1.0 + np.abs(design.E).sum(axis=1).max(initial=0.0)) * (
+        largest["D"] + largest["B_f"] + largest["W1"]
+    )
+    through_E = float(np.abs(design.E).sum(axis=1).max(initial=0.0)) * into_output
+    size = float(np.abs(design.A).sum(axis=1).max(initial=1.0))
+    return float(state + (gain + size) * into_output + through_E)

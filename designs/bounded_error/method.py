@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
+from obsynth.designs.bounded_error.claims import (
+    claims,
+    covers,
+    inverse_diagonal_bounds,
+    prove_ellipsoid,
+)
 from obsynth.designs.bounded_error.error_system import (
-    ERRORS,
     ErrorKind,
     ErrorSystem,
     build_error_system,
     kept_coordinates,
 )
-from obsynth.designs.bounded_error.model import Prepared, prepare
+from obsynth.designs.bounded_error.guarantee import guarantee, numbers
+from obsynth.designs.bounded_error.model import CLASS, UioModel, read, read_again
 from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.peak.design import bound_peak, design_peak
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.step import build_step, first_memory, memory_sizes
 from obsynth.designs.bounded_error.synthesis import (
-    OBJECTIVES,
     EllipsoidSolution,
     Objective,
     analyse_gain,
@@ -32,23 +38,26 @@ from obsynth.designs.bounded_error.synthesis import (
     synthesise,
 )
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import Number
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import JacobianBounds, Split
-    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
     from obsynth.symbolic import Plant
 
 
 # Keeps sums of rounded weights at or below 1.
 BELOW_ONE = 1.0 - 2.0**-48
-FORMS = ("corrected", "printed", "repaired")
+CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
+WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 
 
 @dataclass(frozen=True)
-class BoundedErrorUIO:
+class BoundedErrorUIO(Method):
     """Unknown input observer with guaranteed intervals for states and actuator faults.
 
     For discrete-time plants ``x+ = A x + B u + D d + g(x, u) + B_f f + W1 w``,
@@ -114,44 +123,33 @@ class BoundedErrorUIO:
     'trace_inverse'
     """
 
-    gamma: float | None = None
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="bounded_error_uio",
+        record=UioDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+    )
+
+    gamma: Annotated[float | None, CONTRACTION] = None
     multipliers: Literal["equal", "per_component"] = "equal"
     error: ErrorKind = "plain"
     post: Literal["common", "per_component"] = "common"
     bounds: Literal["ellipsoid", "peak"] = "ellipsoid"
     objective: Objective = "trace_inverse"
-    weights: tuple[float, ...] | None = None
+    weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
     form: Literal["corrected", "printed", "repaired"] = "corrected"
 
-    def __post_init__(self) -> None:
-        allowed = {
-            "multipliers": ("equal", "per_component"),
-            "error": ERRORS,
-            "post": ("common", "per_component"),
-            "bounds": ("ellipsoid", "peak"),
-            "objective": OBJECTIVES,
-            "form": FORMS,
-        }
-        for name, values in allowed.items():
-            given = getattr(self, name)
-            if given not in values:
-                raise ObsynthError(
-                    f"{name} is {given!r}; it has to be one of {', '.join(map(repr, values))}",
-                    option=name,
-                )
-        if self.gamma is not None and not 0.0 < self.gamma < 1.0:
-            raise ObsynthError(
-                f"gamma is {self.gamma!r}; the contraction per step lies between 0 and 1",
-                option="gamma",
-            )
-        if self.weights is not None:
-            object.__setattr__(self, "weights", tuple(float(w) for w in self.weights))
-            if not all(np.isfinite(w) and w >= 0 for w in self.weights) or not any(self.weights):
-                raise ObsynthError(
-                    f"weights are {self.weights}; they have to be finite, not negative and not "
-                    "all zero",
-                    option="weights",
-                )
+    def check(self) -> None:
+        """Refuse options that do not fit each other."""
+        if self.weights is not None and not any(self.weights):
+            raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
         if self.form != "corrected" and (
             self.error != "plain" or self.multipliers != "equal" or self.bounds != "ellipsoid"
         ):
@@ -161,85 +159,32 @@ class BoundedErrorUIO:
                 option="form",
             )
 
-    def design(
-        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
-    ) -> Observer:
-        """Design, prove and return the observer.
+    def read(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel:
+        """Split the plant, check the structural conditions, bound the Jacobian."""
+        return read(given, bounds)
 
-        Parameters
-        ----------
-        model_or_split : Plant or Split
-            Discrete time, see `Plant.discretise`.
-        bounds : JacobianBounds, optional
-            Of the split's g, where they are at hand.
-
-        Returns
-        -------
-        Observer
-            With a certificate in which every claim is proved.
-
-        Raises
-        ------
-        StructureError
-            If the model is outside the class, or a rank or detectability
-            condition fails; before any LMI.
-        InfeasibleDesign
-            If no observer of this form exists; says which gamma is feasible.
-        UnboundedError
-            If the Jacobian is unbounded over the declared box.
-        """
-        from obsynth.designs.bounded_error.assembly import assemble
-
-        prepared = prepare(model_or_split, bounds)
+    def solve(self, model: UioModel) -> UioDesign:
+        """Find gains and their bounds."""
         if self.bounds == "peak":
-            from obsynth.designs.bounded_error.peak.design import design_peak
+            return design_peak(model, self)
+        return self._design_ellipsoid(model)
 
-            design = design_peak(prepared, self)
-        else:
-            design = self._design_ellipsoid(prepared)
-        return assemble(design, derived=(prepared.split, prepared.bounds))
-
-    def analyse(
-        self,
-        model_or_split: Plant | Split,
-        gains: Mapping[str, ArrayLike],
-        bounds: JacobianBounds | None = None,
-    ) -> Observer:
-        """Return what the given gains guarantee, proved.
-
-        Parameters
-        ----------
-        model_or_split : Plant or Split
-        gains : mapping
-            ``K`` of shape (n, m) and ``F`` of shape (n_f, m).
-        bounds : JacobianBounds, optional
-
-        Raises
-        ------
-        InfeasibleDesign
-            If the gains are unstable at a vertex, or guarantee nothing.
-        """
-        from obsynth.designs.bounded_error.assembly import assemble
-
-        prepared = prepare(model_or_split, bounds)
-        K, F = _read_gains(prepared.design, gains)
-        given = replace(prepared.design, K=K, F=F, options=asdict(self))
+    def fix(self, model: UioModel, gains: Mapping[str, ArrayLike]) -> UioDesign:
+        """Bound the errors of given ``K`` of shape (n, m) and ``F`` of shape (n_f, m)."""
+        blank = model.design
+        found = read_gains(gains, {"K": blank.K.shape, "F": blank.F.shape})
+        given = replace(blank, K=found["K"], F=found["F"], options=self.options())
         if self.bounds == "peak":
-            from obsynth.designs.bounded_error.peak.design import bound_peak
-
-            return assemble(bound_peak(given), derived=(prepared.split, prepared.bounds))
-        system, noise, weights = self._setting(prepared)
-        gain = np.vstack([K[self._kept(given)], F])
+            return bound_peak(given)
+        system, noise, weights = self._setting(model)
+        gain = np.vstack([given.K[self._kept(given)], given.F])
         if self.gamma is None:
             solution = analyse_gain(system, gain, noise, weights)
         else:
             solution = synthesise(system, self.gamma, noise, self.objective, weights, gain)
-        design = self._complete(given, system, solution, noise, weights)
-        return assemble(design, derived=(prepared.split, prepared.bounds))
+        return self._complete(given, system, solution, noise, weights)
 
-    def problem(
-        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
-    ) -> Problem:
+    def problem(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> Problem:
         """Return the design LMI at the given gamma, see `Problem.to_cvxpy`.
 
         Raises
@@ -249,14 +194,14 @@ class BoundedErrorUIO:
         """
         if self.gamma is None:
             raise ObsynthError("the LMI is linear only for a fixed gamma: give gamma=")
-        prepared = prepare(model_or_split, bounds)
+        model: UioModel = self._checked(given, bounds)
         if self.form != "corrected":
             from obsynth.designs.bounded_error.multipliers import box_vertices, multiplier_problem
 
-            data = _with_vertices(prepared, box_vertices(prepared.bounds))
-            noise, weights = self._noise(prepared, 3), self._weights(prepared)
+            data = _with_vertices(model, box_vertices(model.bounds))
+            noise, weights = self._noise(model, 3), self._weights(model)
             return multiplier_problem(data, self.gamma, noise, self.objective, weights, self.form)
-        system, free_or_fixed, weights = self._setting(prepared)
+        system, free_or_fixed, weights = self._setting(model)
         return design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
 
     def _kept(self, design: UioDesign) -> list[int]:
@@ -264,8 +209,8 @@ class BoundedErrorUIO:
             return list(range(len(design.A)))
         return kept_coordinates(design.T)
 
-    def _weights(self, prepared: Prepared) -> FloatArray:
-        design = prepared.design
+    def _weights(self, model: UioModel) -> FloatArray:
+        design = model.design
         n, n_f = design.A.shape[0], design.rate.size
         weights = np.ones(n + n_f) if self.weights is None else np.array(self.weights)
         if weights.shape != (n + n_f,):
@@ -277,20 +222,18 @@ class BoundedErrorUIO:
         return np.concatenate([weights[:n][self._kept(design)], weights[n:]])
 
     @staticmethod
-    def _noise(prepared: Prepared, blocks: int) -> FloatArray:
-        design = prepared.design
+    def _noise(model: UioModel, blocks: int) -> FloatArray:
+        design = model.design
         boxes = NoiseBox(design.w_centre, design.w_radius, design.rate)
         return boxes.equal_weights(blocks) * BELOW_ONE
 
-    def _setting(self, prepared: Prepared) -> tuple[ErrorSystem, FloatArray | None, FloatArray]:
-        system = build_error_system(prepared.design.data, self.error)
-        noise = (
-            None if self.multipliers == "per_component" else self._noise(prepared, system.blocks)
-        )
-        return system, noise, self._weights(prepared)
+    def _setting(self, model: UioModel) -> tuple[ErrorSystem, FloatArray | None, FloatArray]:
+        system = build_error_system(model.design.data, self.error)
+        noise = None if self.multipliers == "per_component" else self._noise(model, system.blocks)
+        return system, noise, self._weights(model)
 
-    def _design_ellipsoid(self, prepared: Prepared) -> UioDesign:
-        system, noise, weights = self._setting(prepared)
+    def _design_ellipsoid(self, model: UioModel) -> UioDesign:
+        system, noise, weights = self._setting(model)
         if self.form == "corrected":
 
             def solve(gamma: float) -> EllipsoidSolution:
@@ -300,20 +243,20 @@ class BoundedErrorUIO:
                 return largest_gamma(system)
 
         else:
-            solve, top = self._multiplier_form(prepared, weights)
+            solve, top = self._multiplier_form(model, weights)
         solution = _solve_or_explain(solve, top, weights, self.gamma, system)
         gain = solution.gain
-        n, m = prepared.design.K.shape
-        kept = self._kept(prepared.design)
+        n, m = model.design.K.shape
+        kept = self._kept(model.design)
         K = np.zeros((n, m))
         K[kept] = gain[: len(kept)]
         F = gain[len(kept) :]
         if self.error == "shifted":
-            K, F = K @ prepared.design.Pi, F @ prepared.design.Pi
-        given = replace(prepared.design, K=K, F=F, options=asdict(self))
+            K, F = K @ model.design.Pi, F @ model.design.Pi
+        given = replace(model.design, K=K, F=F, options=self.options())
         return self._complete(given, system, solution, noise, weights)
 
-    def _multiplier_form(self, prepared: Prepared, weights: FloatArray) -> tuple[Any, Any]:
+    def _multiplier_form(self, model: UioModel, weights: FloatArray) -> tuple[Any, Any]:
         from obsynth.designs.bounded_error.multipliers import (
             box_vertices,
             largest_multiplier_gamma,
@@ -321,9 +264,9 @@ class BoundedErrorUIO:
             synthesise_multipliers,
         )
 
-        vertices = box_vertices(prepared.bounds)
-        data = _with_vertices(prepared, vertices)
-        noise = self._noise(prepared, 3)
+        vertices = box_vertices(model.bounds)
+        data = _with_vertices(model, vertices)
+        noise = self._noise(model, 3)
         form: Any = self.form
         if form == "printed":
             refuse_printed(data, vertices, self.gamma or 0.0)
@@ -363,28 +306,8 @@ class BoundedErrorUIO:
         return design
 
 
-def _with_vertices(prepared: Prepared, vertices: FloatArray) -> Any:
-    return replace(prepared.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices))
-
-
-def _read_gains(design: UioDesign, gains: Mapping[str, ArrayLike]) -> tuple[FloatArray, FloatArray]:
-    missing = {"K", "F"} - set(gains)
-    if missing:
-        raise ObsynthError(
-            f"gains has {sorted(gains)}; K of shape {design.K.shape} and F of shape "
-            f"{design.F.shape} are needed",
-            missing=tuple(sorted(missing)),
-        )
-    arrays = []
-    for name, shape in (("K", design.K.shape), ("F", design.F.shape)):
-        array = np.asarray(gains[name], dtype=float)
-        if array.shape != shape or not np.all(np.isfinite(array)):
-            raise ObsynthError(
-                f"{name} has shape {array.shape}; finite numbers of shape {shape} are needed",
-                gain=name,
-            )
-        arrays.append(array)
-    return arrays[0], arrays[1]
+def _with_vertices(model: UioModel, vertices: FloatArray) -> Any:
+    return replace(model.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices))
 
 
 def _solve_or_explain(

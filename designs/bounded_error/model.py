@@ -12,67 +12,50 @@ from obsynth.derive.structure.decoupling import unknown_input_condition
 from obsynth.derive.structure.detectability import detectability
 from obsynth.designs.bounded_error.noise import noise_box
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
-from obsynth.symbolic import Plant, Role
+from obsynth.designs.core.plant_class import PlantClass
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
+CLASS = PlantClass(
+    who="the bounded-error observer",
+    time="discrete",
+    forbids={
+        "p": " is only known to an interval, which the class (1)-(2) does not have: give it a "
+        "value, or declare its effect as a disturbance",
+        "rho": ": the class (1)-(2) has none; use IntervalObserver or QPVObserver, or declare it "
+        "as an input",
+    },
+    finite={
+        "x": " has no finite range, so the Jacobian cannot be bounded; declare it with "
+        "range=(lower, upper)",
+    },
+)
 # Relative to the largest magnitude of each state: a few thousand roundings of one step.
 ROUNDING = 2.0**-40
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """A model of the class (1)-(2) with everything derived from it.
+class Derived:
+    """What follows from the equations: the split, and the Jacobians of its g over the box."""
+
+    split: Split
+    bounds: JacobianBounds
+
+
+@dataclass(frozen=True, eq=False)
+class UioModel(Derived):
+    """A plant of the class (1)-(2) with everything derived from it.
 
     design: complete except for gains and bound, which are zero
     """
 
-    split: Split
-    bounds: JacobianBounds
     design: UioDesign
 
 
-def check_class(model: Plant) -> None:
-    """Refuse what is outside the class (1)-(2) by the user's own names."""
-    if model.Ts is None:
-        raise StructureError(
-            f"{model.name} is in continuous time and the bounded-error observer works in discrete "
-            'time: call discretise("euler", Ts=...) first'
-        )
-    if model.p:
-        names = ", ".join(signal.name for signal in model.p)
-        raise StructureError(
-            f"parameter {names} is only known to an interval, which the class (1)-(2) does not "
-            "have: give it a value, or declare its effect as a disturbance",
-            symbols=tuple(signal.name for signal in model.p),
-        )
-    if model.rho:
-        names = ", ".join(signal.name for signal in model.rho)
-        raise StructureError(
-            f"scheduling variable {names}: the class (1)-(2) has none; use IntervalObserver or "
-            "QPVObserver, or declare it as an input",
-            symbols=tuple(signal.name for signal in model.rho),
-        )
-    sensors = [signal.name for signal in model.f if signal.role is Role.SENSOR_FAULT]
-    if sensors:
-        raise StructureError(
-            f"sensor fault {', '.join(sensors)}: this method estimates faults that enter the "
-            "dynamics (actuator and process faults)",
-            symbols=tuple(sensors),
-        )
-    unbounded = [s.name for s in model.x if not np.isfinite([s.lower, s.upper]).all()]
-    if unbounded:
-        raise StructureError(
-            f"state {', '.join(unbounded)} has no finite range, so the Jacobian cannot be "
-            "bounded; declare it with range=(lower, upper)",
-            symbols=tuple(unbounded),
-        )
-
-
-def prepare(model_or_split: Plant | Split, bounds: JacobianBounds | None = None) -> Prepared:
+def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel:
     """Split, check the structural conditions, bound the Jacobian."""
-    model = model_or_split if isinstance(model_or_split, Plant) else model_or_split.model
-    check_class(model)
-    parts = split(model) if isinstance(model_or_split, Plant) else model_or_split
+    model = given if isinstance(given, Plant) else given.model
+    parts = split(model) if isinstance(given, Plant) else given
     noise = noise_box(model)
     decoupling = unknown_input_condition(parts)
     if bounds is None:
@@ -111,7 +94,13 @@ def prepare(model_or_split: Plant | Split, bounds: JacobianBounds | None = None)
         bound=PeakData(np.zeros(n + n_f), 0.0),
         options={},
     )
-    return Prepared(parts, bounds, design)
+    return UioModel(parts, bounds, design)
+
+
+def read_again(design: UioDesign) -> Derived:
+    """Derive split and Jacobian bounds from the stored equations, at the stored point."""
+    parts = split(design.plant, at=(design.x_at, design.u_at), linear=design.linear)
+    return Derived(parts, jacobian_bounds(parts))
 
 
 def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:

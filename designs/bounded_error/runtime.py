@@ -1,23 +1,53 @@
-"""From a proved bound to what runs: half-width recursions and the first memory."""
+"""From a proved bound to what runs: half-width recursions and their first values."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.error_system import kept_coordinates
-from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
-from obsynth.designs.bounded_error.step import RuntimeBound, memory_layout
-from obsynth.designs.starting import read_box, read_vector
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+ROUND_UP = 1.0 + 2.0**-50
+# covers the rounding of estimate - half and estimate + half
+ULPS = 2.0**-50
 # Above the relative rounding error of the few dozen operations of each formula below.
 UP = 1.0 + 2.0**-44
 CORNERS = 14
+
+
+@dataclass(frozen=True, eq=False)
+class RuntimeBound:
+    """How the guaranteed half widths evolve, one scalar recursion per component.
+
+    ``s+ = decay * s + offset``; the half width of a component is
+    ``sqrt(s * scale) + add`` if `root` is set (ellipsoids, eqs. (35)-(36)) and
+    ``s * scale + add`` otherwise (peak bounds). All arrays have shape (n + n_f,).
+
+    reset: value of s that holds whenever the state, the fault and their estimates lie in the
+        declared boxes; infinite where no such box is declared
+    """
+
+    decay: FloatArray
+    offset: FloatArray
+    scale: FloatArray
+    add: FloatArray
+    root: bool
+    reset: FloatArray
+
+    def half_widths(self, s: FloatArray) -> FloatArray:
+        """Return the half widths that belong to a value of s."""
+        inner = s * self.scale
+        return (np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add
+
+    @property
+    def steady(self) -> FloatArray:
+        """Half widths in the limit k to infinity."""
+        return self.half_widths(self.offset / (1.0 - self.decay))
 
 
 def noise_offset(design: UioDesign) -> FloatArray:
@@ -98,9 +128,7 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
     An error of at most `UioDesign.rounding` per step is at most rho in the norm
     of P, so ``V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho + rho^2``.
     """
-    bound = design.bound
-    if not isinstance(bound, EllipsoidBound):
-        raise TypeError("the design has no ellipsoidal bound")
+    bound = ellipsoid_of(design)
     n, n_f = design.A.shape[0], design.rate.size
     size = n + n_f
     decay, offset, scale = np.zeros(size), np.zeros(size), np.zeros(size)
@@ -143,47 +171,8 @@ def reset_box(design: UioDesign) -> StartBox | None:
     return box
 
 
-def make_start(
-    design: UioDesign, first: Callable[[StartBox], FloatArray]
-) -> Callable[..., FloatArray]:
-    """Return the function behind `Observer.memory0`."""
-    n, n_f = design.A.shape[0], design.rate.size
-    names, faults = design.plant.names("x"), design.plant.names("f")
-
-    def start(
-        guess: ArrayLike,
-        x_range: ArrayLike | None = None,
-        f_range: ArrayLike | None = None,
-        y0: ArrayLike | None = None,
-        z0: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
-        point = read_vector(guess, "guess", names)
-        x_box = design.plant.box("x") if x_range is None else read_box(x_range, "x_range", names)
-        f_box = np.zeros((n_f, 2)) if f_range is None else read_box(f_range, "f_range", faults)
-        if not np.isfinite(x_box).all():
-            raise ObsynthError(
-                "x_range is needed: the states have no finite declared range, so the first error "
-                "has no bound"
-            )
-        z = design.T @ point if z0 is None else read_vector(z0, "z0", names)
-        if z0 is not None and isinstance(design.bound, EllipsoidBound):
-            _check_range_of_T(design, design.bound, z)
-        fhat = f_box.mean(axis=1)
-        box = StartBox(design, z, x_box, fhat, f_box)
-        layout = memory_layout(n, n_f)
-        memory = np.zeros(layout["initialised"].stop)
-        memory[layout["z"]] = z
-        memory[layout["fhat"]] = fhat
-        memory[layout["bound"]] = first(box)
-        memory[layout["prediction"]] = point
-        memory[layout["initialised"]] = 1.0
-        return memory
-
-    return start
-
-
-def _check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
+def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
+    """Refuse a first z that a recursion in the range of T would not keep."""
     if bound.error == "shifted" and np.any(design.T @ z != z):
         raise ObsynthError(
             "z0 has to lie in the range of T (zero in the coordinates that the unknown input "
@@ -192,16 +181,10 @@ def _check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -
         )
 
 
-def ellipsoid_first(design: UioDesign) -> Callable[[StartBox], FloatArray]:
+def first_levels(design: UioDesign, box: StartBox) -> FloatArray:
     """Return V_0 of every component's ellipsoid for a box of first errors, delta of (48)."""
-    bound = design.bound
-    if not isinstance(bound, EllipsoidBound):
-        raise TypeError("the design has no ellipsoidal bound")
+    bound = ellipsoid_of(design)
+    lower, upper = box.xi(design, bound.error)
+    levels = [largest_level(P, lower, upper) for P in bound.P]
     components = _component_map(design, bound)
-
-    def first(box: StartBox) -> FloatArray:
-        lower, upper = box.xi(design, bound.error)
-        levels = [largest_level(P, lower, upper) for P in bound.P]
-        return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])
-
-    return first
+    return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])

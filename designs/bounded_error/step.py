@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
+from obsynth.designs.bounded_error.peak.design import first_transient, peak_runtime
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.runtime import (
+    ROUND_UP,
+    ULPS,
+    RuntimeBound,
+    StartBox,
+    check_range_of_T,
+    ellipsoid_runtime,
+    first_levels,
+)
+from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.stepping import (
     FINITE,
     all_finite,
@@ -16,77 +26,44 @@ from obsynth.designs.core.stepping import (
     inside,
     make_step,
     select,
+    slices,
     status_word,
 )
-from obsynth.symbolic.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from obsynth.symbolic import Plant
 
 
-ROUND_UP = 1.0 + 2.0**-50
-# covers the rounding of estimate - half and estimate + half
-ULPS = 2.0**-50
-
-
-@dataclass(frozen=True, eq=False)
-class RuntimeBound:
-    """How the guaranteed half widths evolve, one scalar recursion per component.
-
-    ``s+ = decay * s + offset``; the half width of a component is
-    ``sqrt(s * scale) + add`` if `root` is set (ellipsoids, eqs. (35)-(36)) and
-    ``s * scale + add`` otherwise (peak bounds). All arrays have shape (n + n_f,).
-
-    reset: value of s that holds whenever the state, the fault and their estimates lie in the
-        declared boxes; infinite where no such box is declared
-    """
-
-    decay: FloatArray
-    offset: FloatArray
-    scale: FloatArray
-    add: FloatArray
-    root: bool
-    reset: FloatArray
-
-    def half_widths(self, s: FloatArray) -> FloatArray:
-        """Return the half widths that belong to a value of s."""
-        inner = s * self.scale
-        return (np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add
-
-    @property
-    def steady(self) -> FloatArray:
-        """Half widths in the limit k to infinity."""
-        return self.half_widths(self.offset / (1.0 - self.decay))
-
-
-def memory_layout(n: int, n_f: int) -> dict[str, slice]:
+def memory_sizes(design: UioDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
     ``z`` (10), ``fhat`` (12), ``bound`` (the s of `RuntimeBound`),
     ``prediction`` (of the state, used when a measurement is missing) and
     ``initialised`` (0 or 1).
     """
-    sizes = {"z": n, "fhat": n_f, "bound": n + n_f, "prediction": n, "initialised": 1}
-    layout: dict[str, slice] = {}
-    at = 0
-    for name, size in sizes.items():
-        layout[name] = slice(at, at + size)
-        at += size
-    return layout
+    n, n_f = len(design.A), len(design.rate)
+    return {"z": n, "fhat": n_f, "bound": n + n_f, "prediction": n, "initialised": 1}
 
 
-def build_step(
-    model: Plant,
-    C: FloatArray,
-    W2: FloatArray,
-    E: FloatArray,
-    T: FloatArray,
-    K: FloatArray,
-    F: FloatArray,
-    w_centre: FloatArray,
-    w_radius: FloatArray,
-    bound: RuntimeBound,
-) -> ca.Function:
+def running_bound(design: UioDesign) -> RuntimeBound:
+    """Return how the half widths of a design evolve."""
+    ellipsoid = isinstance(design.bound, EllipsoidBound)
+    return ellipsoid_runtime(design) if ellipsoid else peak_runtime(design)
+
+
+def first_memory(
+    design: UioDesign, start: Start, z0: ArrayLike | None = None
+) -> dict[str, ArrayLike]:
+    """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
+    x_box, z = start.x, design.T @ start.guess
+    if z0 is not None:
+        z = read_vector(z0, "z0", design.plant.names("x"))
+        if isinstance(design.bound, EllipsoidBound):
+            check_range_of_T(design, design.bound, z)
+    fhat = start.f.mean(axis=1)
+    box = StartBox(design, z, x_box, fhat, start.f)
+    first = first_levels if isinstance(design.bound, EllipsoidBound) else first_transient
+    return {"z": z, "fhat": fhat, "bound": first(design, box), "prediction": start.guess}
+
+
+def build_step(design: UioDesign) -> ca.Function:
     """Build `Observer.step` of the bounded-error observer.
 
     Equations (10)-(12) with N = T A - K C and L = K - N E are, with the
@@ -98,11 +75,11 @@ def build_step(
 
     where f is the plant's own right-hand side without unknown input. This form
     needs neither the split nor N, G, L, so nothing is lost by rounding them.
-
-    Shapes: w_centre, w_radius (n_w,).
     """
+    bound = running_bound(design)
+    model, C, W2, w_centre = design.plant, design.C, design.W2, design.w_centre
     n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), C.shape[0]
-    layout = memory_layout(n, n_f)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", n_u), ca.SX.sym("y", m)
     z, fhat, s, prediction = (memory[layout[k]] for k in ("z", "fhat", "bound", "prediction"))
@@ -116,7 +93,7 @@ def build_step(
     nominal = [0.0 if signal.nominal is None else float(signal.nominal) for signal in model.u]
     u_used = finite_or(u, nominal)
 
-    xhat = z - ca.DM(E) @ y_used
+    xhat = z - ca.DM(design.E) @ y_used
     innovation = y_used - ca.DM(C) @ xhat
     xhat_inside = inside(xhat, xhat, box)
     fhat_inside = inside(fhat, fhat, f_box)
@@ -138,7 +115,7 @@ def build_step(
     x_lower, x_upper = xhat - half[:n], xhat + half[:n]
     f_lower, f_upper = fhat - half[n:], fhat + half[n:]
 
-    allowed = ca.DM(np.abs(C)) @ half[:n] + ca.DM(np.abs(W2) @ w_radius)
+    allowed = ca.DM(np.abs(C)) @ half[:n] + ca.DM(np.abs(W2) @ design.w_radius)
     consistent = ca.SX(1)
     for i in range(m):
         consistent = ca.logic_and(consistent, ca.fabs(innovation[i]) <= allowed[i])
@@ -168,8 +145,8 @@ def build_step(
         ca.DM.zeros(zeros["p"]),
         ca.DM.zeros(zeros["rho"]),
     )[0]
-    z_next = ca.DM(T) @ next_state + ca.DM(K) @ innovation
-    fhat_next = fhat + ca.DM(F) @ innovation
+    z_next = ca.DM(design.T) @ next_state + ca.DM(design.K) @ innovation
+    fhat_next = fhat + ca.DM(design.F) @ innovation
     s_next = ca.DM(bound.decay) * s_now + ca.DM(bound.offset)
     s_next = ca.vertcat(*(ca.if_else(u_finite, s_next[i], ca.inf) for i in range(n + n_f)))
     moved = ca.vertcat(z_next, fhat_next, s_next, next_state, 1)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 from obsynth.designs.core.errors import CertificateError
+
+if TYPE_CHECKING:
+    from obsynth.designs.core.method import Contract
+    from obsynth.designs.core.observer import Observer
 
 Level = Literal["full", "lmi"]
 LEVELS: tuple[Level, ...] = ("full", "lmi")
@@ -69,12 +73,30 @@ class Certificate:
     Attributes
     ----------
     claims : tuple of Claim
-    record : mapping
-        The stored design: everything the proofs use, as JSON-able data.
+    design : Record
+        The stored design: everything the proofs use.
+    contract : Contract
+        Of the design's method: what is claimed of it and what runs.
     """
 
     claims: tuple[Claim, ...]
-    record: Mapping[str, Any] = field(repr=False)
+    design: Any = field(repr=False)
+    contract: Contract[Any] = field(repr=False)
+
+    @cached_property
+    def record(self) -> Mapping[str, Any]:
+        """The stored design as JSON-able data."""
+        return self.contract.to_record(self.design)
+
+    def __getstate__(self) -> tuple[tuple[Claim, ...], Mapping[str, Any], Contract[Any]]:
+        return self.claims, self.record, self.contract
+
+    def __setstate__(
+        self, state: tuple[tuple[Claim, ...], Mapping[str, Any], Contract[Any]]
+    ) -> None:
+        claims, record, contract = state
+        design = contract.record.from_record(record)
+        self.__dict__.update(claims=claims, design=design, contract=contract)
 
     @property
     def valid(self) -> bool:
@@ -115,13 +137,20 @@ class Certificate:
         CertificateError
             If a claim cannot be proved; ``error.claims`` holds all of them.
         """
-        from obsynth.designs.core.registry import method_module
-
         if level not in LEVELS:
             raise CertificateError(f"level is {level!r}; it has to be one of {', '.join(LEVELS)}")
-        module = importlib.import_module(method_module(self.record))
-        claims: tuple[Claim, ...] = module.prove(self.record, level)
-        return Certificate(claims, self.record).require()
+        design = self.contract.record.from_record(self.record)
+        return self.contract.certify(design, level).require()
+
+    def observer(self) -> Observer:
+        """Return the observer of the design.
+
+        Raises
+        ------
+        CertificateError
+            If a claim could not be proved.
+        """
+        return self.contract.observer(self)
 
     def require(self) -> Certificate:
         """Return the certificate itself if every claim holds.

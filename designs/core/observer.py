@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -82,22 +82,9 @@ class Observer:
     half_widths: FloatArray | None
     certificate: Certificate
     guarantee: Guarantee
-    start: Callable[..., FloatArray] = field(repr=False)
     fault_delay: int = 0
     ode: ca.Function | None = None
     step_covered: bool = False
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out `start`, a closure: the stored design says what it is."""
-        return {name: value for name, value in self.__dict__.items() if name != "start"}
-
-    def __setstate__(self, state: Mapping[str, Any]) -> None:
-        from importlib import import_module
-
-        from obsynth.designs.core.registry import method_module
-
-        self.__dict__.update(state)
-        self.__dict__["start"] = import_module(method_module(self.record)).read_start(self.record)
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -147,7 +134,10 @@ class Observer:
         -------
         ndarray of shape (n_memory,)
         """
-        return self.start(guess, x_range=x_range, f_range=f_range, y0=y0, **options)
+        certificate = self.certificate
+        return certificate.contract.start(
+            certificate.design, guess, x_range, f_range, y0, **options
+        )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Store the design as JSON; the file is replaced only when complete.
@@ -156,7 +146,7 @@ class Observer:
         --------
         obsynth.load
         """
-        from obsynth.designs.core.registry import save
+        from obsynth.designs.core.files import save
 
         save(self, path)
 

@@ -1,49 +1,90 @@
-"""Designs as plain data: what every method needs to write its record and to read it with care."""
+"""Stored designs: dataclasses whose annotations say the shapes, written and read by one reader.
+
+An array says its shape in its annotation, ``K: Annotated[FloatArray, "n m"]``. The letters stand
+for the numbers of the plant's signals (`sizes_of`); sums like ``n+n_f`` and numbers are allowed,
+and any other letter stands for the length that it meets first. The plant comes before them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
 from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.rigour import Exact, from_text, to_text
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.registry import FORMAT, VERSION
 from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.arrays import FloatArray, IntArray
+
+ARRAYS = {FloatArray: float, IntArray: np.int64}
 
 
-def with_header(method: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with the header that `load` reads."""
-    return {"format": FORMAT, "version": VERSION, "method": method, **record}
+def sizes_of(plant: Plant) -> dict[str, int]:
+    """Return the numbers of signals by the letters of shapes."""
+    sizes = {f"n_{kind}": len(getattr(plant, kind)) for kind in ("u", "f", "w", "p", "rho")}
+    return {"n": len(plant.x), "m": len(plant.output_names), "q": len(plant.d), **sizes}
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON-able data: plants, dataclasses, arrays and containers of them.
+@dataclass
+class Context:
+    """What is known while a record is read: the plant, and what the letters of shapes stand for."""
 
-    What has a ``to_record`` of its own is asked for it.
+    plant: Plant | None = None
+    sizes: dict[str, int] = field(default_factory=dict)
+
+    def shape(self, letters: str, actual: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape that letters stand for; a new letter takes the length it meets."""
+        words = letters.split()
+        for word, length in zip(words, actual, strict=False):
+            if word.isidentifier():
+                self.sizes.setdefault(word, length)
+        return tuple(sum(self._size(part) for part in word.split("+")) for word in words)
+
+    def _size(self, word: str) -> int:
+        return int(word) if word.isdigit() else self.sizes[word]
+
+
+class Record:
+    """A dataclass that is stored: written by its fields, read by their annotations.
+
+    KIND tells records apart where a field may hold one of several.
     """
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Plant):
-        return value.to_dict()
-    if hasattr(value, "to_record"):
-        return value.to_record()
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain_fields(value)
-    if isinstance(value, Mapping):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain(entry) for entry in value]
-    return value
 
+    KIND: ClassVar[str | None] = None
 
-def plain_fields(value: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON-able data, for a ``to_record`` of its own."""
-    return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    def to_record(self) -> dict[str, Any]:
+        """Return the fields as JSON-able data."""
+        kind = {} if self.KIND is None else {"kind": self.KIND}
+        return {**kind, **plain_fields(self)}
+
+    @classmethod
+    def from_record(cls, stored: Mapping[str, Any], context: Context | None = None) -> Self:
+        """Read what `to_record` wrote, every shape, number and word checked.
+
+        Raises CertificateError, which says what cannot be read.
+        """
+        with reading():
+            found: Self = read_fields(cls, stored, Context() if context is None else context)
+            found.check()
+        return found
+
+    def check(self) -> None:
+        """Refuse what annotations cannot say, with a CertificateError."""
 
 
 @contextmanager
@@ -57,11 +98,85 @@ def reading() -> Iterator[None]:
         raise CertificateError(f"the stored design cannot be read: {error!r}") from error
 
 
-def read_array(values: Any, shape: tuple[int, ...], name: str) -> FloatArray:
-    """Return finite numbers of a given shape."""
-    array = np.asarray(values, dtype=float)
+def plain(value: Any) -> Any:
+    """Return a value as JSON-able data: plants, records, dataclasses, arrays, containers."""
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return to_text(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Plant):
+        return value.to_dict()
+    if hasattr(value, "to_record"):
+        return value.to_record()
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_fields(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(entry) for entry in value]
+    return value
+
+
+def plain_fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON-able data."""
+    return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+
+
+def read_fields(cls: Any, stored: Mapping[str, Any], context: Context) -> Any:
+    """Read a dataclass from its stored fields, in their order."""
+    hints = get_type_hints(cls, include_extras=True)
+    values = {
+        one.name: read_value(hints[one.name], stored[one.name], one.name, context)
+        for one in fields(cls)
+    }
+    return cls(**values)
+
+
+def read_value(kind: Any, stored: Any, name: str, context: Context) -> Any:
+    """Read one value as an annotation describes it."""
+    shape = ""
+    if get_origin(kind) is Annotated:
+        kind, shape = get_args(kind)[:2]
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind in ARRAYS:
+        return _read_array(stored, shape, name, context, ARRAYS[kind])
+    if kind == Exact:
+        actual = np.array(stored, dtype=object).shape
+        return from_text(stored, context.shape(shape, actual))
+    if kind is AffineFamily:
+        actual = np.asarray(stored["constant"], dtype=float).shape
+        return read_family(stored, context.shape(shape, actual), name)
+    if kind is Plant:
+        context.plant = Plant.from_dict(stored)
+        context.sizes |= sizes_of(context.plant)
+        return context.plant
+    if origin in (Union, UnionType):
+        return _read_union(inner, stored, name, context, shape)
+    if origin is Literal:
+        return _read_literal(inner, stored, name)
+    if origin is tuple:
+        return _read_tuple(inner, stored, name, context)
+    if origin is not None and issubclass(origin, Mapping):
+        if inner[1] is Any:
+            return dict(stored)
+        return {
+            key: read_value(inner[1], value, f"{name}.{key}", context)
+            for key, value in stored.items()
+        }
+    if hasattr(kind, "from_record"):
+        return kind.from_record(stored, context)
+    if is_dataclass(kind):
+        return read_fields(kind, stored, context)
+    return _read_scalar(kind, stored, name)
+
+
+def _read_array(stored: Any, letters: str, name: str, context: Context, kind: Any) -> Any:
+    array = np.asarray(stored, dtype=kind)
+    if kind is not float and not np.array_equal(array, np.asarray(stored, dtype=float)):
+        raise CertificateError(f"{name} of the stored design has to hold whole numbers")
+    shape = context.shape(letters, array.shape)
     if array.size == 0 and 0 in shape:
-        array = np.zeros(shape)
+        array = np.zeros(shape, dtype=kind)
     if array.shape != shape:
         raise CertificateError(
             f"{name} has shape {array.shape} in the stored design; {shape} is needed"
@@ -71,18 +186,76 @@ def read_array(values: Any, shape: tuple[int, ...], name: str) -> FloatArray:
     return array
 
 
-def read_family(stored: Mapping[str, Any], shape: tuple[int, int]) -> AffineFamily:
-    """Return the family of matrices of a given shape that was stored by `plain`."""
-    directions = np.asarray(stored["directions"], dtype=float).reshape(-1, *shape)
-    count = len(directions)
+def read_family(stored: Mapping[str, Any], shape: tuple[int, ...], name: str) -> AffineFamily:
+    """Read a family of matrices of a given shape."""
+    count = len(stored["directions"])
+    context = Context(sizes={"K": count})
+    rows, columns = shape
+
+    def read(part: str, letters: str) -> FloatArray:
+        array: FloatArray = _read_array(stored[part], letters, f"{name}.{part}", context, float)
+        return array
+
     family = AffineFamily(
-        constant=read_array(stored["constant"], shape, "family.constant"),
-        directions=read_array(directions, (count, *shape), "family.directions"),
-        ranges=read_array(stored["ranges"], (count, 2), "family.ranges"),
-        radius=read_array(stored["radius"], shape, "family.radius"),
+        constant=read("constant", f"{rows} {columns}"),
+        directions=read("directions", f"K {rows} {columns}"),
+        ranges=read("ranges", "K 2"),
+        radius=read("radius", f"{rows} {columns}"),
         labels=tuple(map(str, stored["labels"])),
         exact=bool(stored["exact"]),
     )
     if family.radius.min(initial=0.0) < 0.0:
-        raise CertificateError("family.radius of the stored design is negative")
+        raise CertificateError(f"{name}.radius of the stored design is negative")
+    if np.any(family.ranges[:, 0] > family.ranges[:, 1]):
+        raise CertificateError(f"a range of {name} of the stored design has lower above upper")
     return family
+
+
+def _read_union(
+    kinds: tuple[Any, ...], stored: Any, name: str, context: Context, shape: str
+) -> Any:
+    if stored is None and NoneType in kinds:
+        return None
+    rest = [kind for kind in kinds if kind is not NoneType]
+    if len(rest) > 1:
+        tags = {kind.KIND: kind for kind in rest}
+        if stored["kind"] not in tags:
+            raise CertificateError(
+                f"{name} of the stored design is of kind {stored['kind']!r}; "
+                f"{', '.join(map(repr, tags))} are known"
+            )
+        return read_value(tags[stored["kind"]], stored, name, context)
+    kind = Annotated[rest[0], shape] if shape else rest[0]
+    return read_value(kind, stored, name, context)
+
+
+def _read_literal(allowed: tuple[Any, ...], stored: Any, name: str) -> Any:
+    for one in allowed:
+        if type(stored) is type(one) and stored == one:
+            return one
+    raise CertificateError(
+        f"{name} is {stored!r} in the stored design; it has to be one of "
+        f"{', '.join(map(repr, allowed))}"
+    )
+
+
+def _read_tuple(kinds: tuple[Any, ...], stored: Any, name: str, context: Context) -> Any:
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = (kinds[0],) * len(stored)
+    return tuple(
+        read_value(kind, value, f"{name}[{k}]", context)
+        for k, (kind, value) in enumerate(zip(kinds, stored, strict=True))
+    )
+
+
+def _read_scalar(kind: Any, stored: Any, name: str) -> Any:
+    if kind is float and isinstance(stored, int | float) and not isinstance(stored, bool):
+        if np.isfinite(stored):
+            return float(stored)
+    elif kind in (int, bool, str) and type(stored) is kind:
+        return stored
+    raise CertificateError(
+        f"{name} is {stored!r} in the stored design; a finite {kind.__name__} is needed"
+        if kind in (int, float)
+        else f"{name} is {stored!r} in the stored design; {kind.__name__} is needed"
+    )

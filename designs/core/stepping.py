@@ -14,6 +14,15 @@ FINITE = 1e300
 """What is larger counts as no number: CasADi folds ``y == y`` to 1, so size is what tells."""
 
 
+def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Return where the parts of a vector are, by their sizes, one behind the other."""
+    layout, at = {}, 0
+    for name, size in sizes.items():
+        layout[name] = slice(at, at + size)
+        at += size
+    return layout
+
+
 def clip(value: ca.SX, box: FloatArray) -> ca.SX:
     """Return the nearest point of a box of shape (n, 2); infinite ends do not bind."""
     parts = []

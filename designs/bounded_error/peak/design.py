@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,14 +12,18 @@ from obsynth.designs.bounded_error.error_system import (
     build_error_system,
     kept_coordinates,
 )
-from obsynth.designs.bounded_error.model import Prepared
+from obsynth.designs.bounded_error.model import UioModel
 from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
 from obsynth.designs.bounded_error.peak.gain import peak_gain
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.bounded_error.peak.transient import Transient, transient
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
-from obsynth.designs.bounded_error.runtime import StartBox, noise_offset, reset_box
-from obsynth.designs.bounded_error.step import RuntimeBound
+from obsynth.designs.bounded_error.runtime import (
+    RuntimeBound,
+    StartBox,
+    noise_offset,
+    reset_box,
+)
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
@@ -79,9 +82,9 @@ def _widest_start(design: UioDesign) -> FloatArray:
     return np.concatenate([np.abs(design.T) @ width, design.rate])
 
 
-def design_peak(prepared: Prepared, method: BoundedErrorUIO) -> UioDesign:
+def design_peak(model: UioModel, method: BoundedErrorUIO) -> UioDesign:
     """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves."""
-    design = prepared.design
+    design = model.design
     n, n_f = design.A.shape[0], design.rate.size
     weights = np.ones(n + n_f) if method.weights is None else np.array(method.weights)
     diagonal = not np.any(design.T - np.diag(np.diag(design.T)))
@@ -102,7 +105,7 @@ def design_peak(prepared: Prepared, method: BoundedErrorUIO) -> UioDesign:
     K = np.zeros_like(design.K)
     K[kept] = first.gain[: len(kept)]
     F = first.gain[len(kept) :]
-    given = replace(design, K=K, F=F, options={**asdict(method), "start_error": error})
+    given = replace(design, K=K, F=F, options={**method.options(), "start_error": error})
     found = peak_gain(
         _system(given),
         design.w_radius,
@@ -177,14 +180,9 @@ def _first(design: UioDesign, peak: PeakBound, box: StartBox) -> FloatArray:
     return np.maximum(tail.c[:size], now) * STEP_UP
 
 
-def peak_start(design: UioDesign) -> Callable[[StartBox], FloatArray]:
+def first_transient(design: UioDesign, box: StartBox) -> FloatArray:
     """Return the first transient for a box of first errors."""
-    peak = _stored_bound(design)
-
-    def first(box: StartBox) -> FloatArray:
-        return _first(design, peak, box)
-
-    return first
+    return _first(design, _stored_bound(design), box)
 
 
 def peak_runtime(design: UioDesign) -> RuntimeBound:
@@ -194,7 +192,7 @@ def peak_runtime(design: UioDesign) -> RuntimeBound:
     reset = np.full(size, np.inf)
     box = reset_box(design)
     if box is not None:
-        reset = _first(design, _stored_bound(design), box)
+        reset = first_transient(design, box)
     return RuntimeBound(
         decay=np.full(size, bound.decay * STEP_UP),
         offset=np.zeros(size),

@@ -1,0 +1,48 @@
+"""Designs as JSON files, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from obsynth.designs.core.certificate import Claim
+    from obsynth.designs.core.observer import Observer
+
+
+CLAIMS = "claims"
+
+
+def save(observer: Observer, path: str | os.PathLike[str]) -> None:
+    """Write the record of an observer; an existing file is replaced only when complete.
+
+    The claims stand in the file too, for people to read; `load` proves them again and never
+    believes them.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    target = Path(path)
+    claims = [_claim(claim) for claim in observer.certificate]
+    text = json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _claim(claim: Claim) -> dict[str, Any]:
+    margin = claim.margin if math.isfinite(claim.margin) else None
+    return {**asdict(claim), "margin": margin}

@@ -1,0 +1,240 @@
+"""What a method is: options that read and solve, and a contract for what they store.
+
+A method is written as a folder with the files ``model`` (what is read of a plant), ``record``
+(what is stored), ``lmis``, ``synthesis``, ``claims``, ``step`` and ``method``; `Method` and
+`Contract` say what they owe, and the observer, its certificate, its file and its memory follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.derive import JacobianBounds
+from obsynth.derive.errors import DerivationError
+from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
+from obsynth.designs.core.given import Start
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.options import check_options, options_record
+from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.record import plain
+from obsynth.designs.core.stepping import slices
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
+
+D = TypeVar("D")
+
+FORMAT = "obsynth design"
+VERSION = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """What an observer shows of itself: gains by the paper's letters, performance, half widths."""
+
+    gains: Mapping[str, FloatArray]
+    performance: Mapping[str, float]
+    half_widths: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Contract(Generic[D]):
+    """What a method owes for a design that is stored, each a function of the design alone.
+
+    name: under which designs are stored
+    record: type of the design, see `Record`; it has a `plant`
+    read_again: what was read of the plant, derived anew from the stored equations
+    claims: proofs of what the guarantee rests on, from the stored numbers
+    covers: proofs that the stored numbers speak of the stored plant, from what was read of it
+    guarantee: what is promised, and under which assumptions
+    numbers: gains, performance and half widths for people to read
+    memory: parts of the memory and their sizes, ``initialised`` the last
+    first: parts of the memory for a first set; further keywords are those of the method
+    step: `Observer.step`
+    ode: `Observer.ode` of methods in continuous time
+    fault_delay, step_covered: see `Observer`
+    """
+
+    name: str
+    record: type[D]
+    read_again: Callable[[D], Any]
+    claims: Callable[[D], Iterable[Claim]]
+    covers: Callable[[D, Any], Iterable[Claim]]
+    guarantee: Callable[[D], Guarantee]
+    numbers: Callable[[D], Numbers]
+    memory: Callable[[D], Mapping[str, int]]
+    first: Callable[..., Mapping[str, ArrayLike]]
+    step: Callable[[D], ca.Function]
+    ode: Callable[[D], ca.Function] | None = None
+    fault_delay: int = 0
+    step_covered: bool = field(default=False)
+
+    def to_record(self, design: Any) -> dict[str, Any]:
+        """Return a design as JSON-able data with the header that `load` reads."""
+        head = {"format": FORMAT, "version": VERSION, "method": self.name}
+        return {**head, **plain(design)}
+
+    def certify(self, design: Any, level: Level = "full", model: Any = None) -> Certificate:
+        """Prove a design; `model`, what was read of the plant, spares deriving it again."""
+        claims = [*self.claims(design)]
+        if level == "full" or model is not None:
+            try:
+                fresh = self.read_again(design) if model is None else model
+                claims += self.covers(design, fresh)
+            except DerivationError as error:
+                said = "what was read of the plant can be derived from the stored equations"
+                claims.append(Claim("derivation", said, False, -np.inf, str(error)))
+        return Certificate(tuple(claims), design, self)
+
+    def observer(self, certificate: Certificate) -> Observer:
+        """Return what runs, for a certificate in which every claim holds."""
+        design: Any = certificate.require().design
+        plant: Plant = design.plant
+        numbers = self.numbers(design)
+        return Observer(
+            method=self.name,
+            model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
+            step=self.step(design),
+            memory_layout=self.layout(design),
+            gains=numbers.gains,
+            performance=numbers.performance,
+            half_widths=numbers.half_widths,
+            certificate=certificate,
+            guarantee=self.guarantee(design),
+            fault_delay=self.fault_delay,
+            ode=None if self.ode is None else self.ode(design),
+            step_covered=self.step_covered,
+        )
+
+    def layout(self, design: Any) -> dict[str, slice]:
+        """Return which entries of the memory hold what."""
+        return slices(self.memory(design))
+
+    def start(
+        self,
+        design: Any,
+        guess: ArrayLike,
+        x_range: ArrayLike | None = None,
+        f_range: ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+        **options: Any,
+    ) -> FloatArray:
+        """Return the memory for the first call of the step, see `Observer.memory0`."""
+        given = Start.read(design.plant, guess, x_range, f_range, y0)
+        layout = self.layout(design)
+        memory = np.zeros(layout["initialised"].stop)
+        memory[layout["initialised"]] = 1.0
+        for name, value in self.first(design, given, **options).items():
+            memory[layout[name]] = value
+        return memory
+
+
+CONTRACTS: dict[str, Contract[Any]] = {}
+"""Contracts of all methods that are defined, by name."""
+
+
+class Method:
+    """Options of a method, a frozen dataclass, and its way from a plant to an observer.
+
+    A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
+    """
+
+    CLASS: ClassVar[PlantClass]
+    CONTRACT: ClassVar[Contract[Any]]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        CONTRACTS.setdefault(cls.CONTRACT.name, cls.CONTRACT)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        self.check()
+
+    def check(self) -> None:
+        """Refuse options that do not fit each other, with an ObsynthError."""
+
+    def read(self, *args: Any, **kwargs: Any) -> Any:
+        """Read of a plant of the class what the method needs, structural conditions first."""
+        raise NotImplementedError
+
+    def solve(self, model: Any) -> Any:
+        """Find a design for what was read, or refuse it."""
+        raise NotImplementedError
+
+    def fix(self, model: Any, gains: Mapping[str, ArrayLike]) -> Any:
+        """Complete a design with given gains, or refuse them."""
+        raise NotImplementedError
+
+    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer.
+
+        Parameters
+        ----------
+        model : Plant
+            Or what `obsynth` derives from it and the method builds on: a `Split` for
+            BoundedErrorUIO, HinfUIO and SetAdaptiveObserver, a `QuasiLPV` for IntervalObserver, a
+            `QPV` for QPVObserver.
+        bounds : JacobianBounds, optional
+            Of the split's g, where they are at hand, for BoundedErrorUIO and HinfUIO.
+
+        Returns
+        -------
+        Observer
+            With a certificate in which every claim is proved.
+
+        Raises
+        ------
+        StructureError
+            If the plant is outside the class, or a rank or detectability condition fails; before
+            anything is solved.
+        InfeasibleDesign
+            If no observer of this form exists; says what binds and what would help.
+        UnboundedError
+            If what has to be bounded is unbounded over the declared ranges.
+        CertificateError
+            If a claim cannot be proved, or for printed forms that do not prove what they claim.
+        """
+        found = self._checked(model, bounds)
+        return self._certified(self.solve(found), found)
+
+    def analyse(
+        self,
+        model: Any,
+        gains: Mapping[str, ArrayLike],
+        bounds: JacobianBounds | None = None,
+    ) -> Observer:
+        """Return what given gains guarantee, proved.
+
+        Parameters
+        ----------
+        model : Plant
+            As of `design`.
+        gains : mapping of str to array_like
+            By the letters of `Observer.gains`; the class says which are needed.
+        bounds : JacobianBounds, optional
+            As of `design`.
+
+        Raises
+        ------
+        InfeasibleDesign
+            If the gains are unstable, which is shown, or guarantee nothing.
+        """
+        found = self._checked(model, bounds)
+        return self._certified(self.fix(found, gains), found)
+
+    def options(self) -> Mapping[str, Any]:
+        """Return the options as JSON-able data."""
+        stored: dict[str, Any] = plain(options_record(self))
+        return stored
+
+    def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:
+        self.CLASS.check(given if isinstance(given, Plant) else given.model)
+        return self.read(given) if bounds is None else self.read(given, bounds)
+
+    def _certified(self, design: Any, model: Any) -> Observer:
+        return self.CONTRACT.certify(design, model=model).observer()

@@ -1,0 +1,121 @@
+"""Options of a method: what their own annotations say of them is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from obsynth.symbolic.errors import ObsynthError
+
+
+@dataclass(frozen=True)
+class Number:
+    """What a number among the options has to satisfy, every entry of a sequence alike.
+
+    because: how a refusal goes on after "gamma is 1.5; "
+    """
+
+    above: float = -np.inf
+    below: float = np.inf
+    at_least: float = -np.inf
+    at_most: float = np.inf
+    because: str = "it has to be finite"
+
+    def holds(self, values: Any) -> bool:
+        """Whether finite numbers all lie within the limits."""
+        numbers = np.asarray(values, dtype=float)
+        inside = (numbers > self.above) & (numbers < self.below)
+        inside &= (numbers >= self.at_least) & (numbers <= self.at_most)
+        return bool(np.all(inside & np.isfinite(numbers)))
+
+
+POSITIVE = Number(above=0.0, because="it has to be positive and finite")
+
+
+def check_options(method: Any) -> None:
+    """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
+
+    Literals, bool, int, float, tuples of floats and their unions with None are checked, numbers
+    also by a `Number` in ``Annotated``; whatever else a method takes it checks by itself.
+    """
+    hints = get_type_hints(type(method), include_extras=True)
+    for field in fields(method):
+        value = read_option(field.name, hints[field.name], getattr(method, field.name))
+        object.__setattr__(method, field.name, value)
+
+
+def read_option(name: str, kind: Any, value: Any) -> Any:
+    """Return the value of an option as its annotation describes it, or refuse it."""
+    limits = Number()
+    if get_origin(kind) is Annotated:
+        kind, *extras = get_args(kind)
+        limits = next((extra for extra in extras if isinstance(extra, Number)), limits)
+    allowed = list(get_args(kind)) if get_origin(kind) in (Union, UnionType) else [kind]
+    if value is None and NoneType in allowed:
+        return None
+    allowed = [one for one in allowed if one is not NoneType]
+    literals = [v for one in allowed if get_origin(one) is Literal for v in get_args(one)]
+    if literals and len(allowed) == 1:
+        return _one_of(name, value, [*literals, *([None] if _optional(kind) else [])])
+    if allowed == [bool]:
+        return _one_of(name, value, [True, False])
+    if allowed in ([float], [int]):
+        return _number(name, value, limits, whole=allowed == [int])
+    if allowed == [tuple[float, ...]]:
+        return _numbers(name, value, limits)
+    return value
+
+
+def _optional(kind: Any) -> bool:
+    return get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind)
+
+
+def _one_of(name: str, value: Any, allowed: list[Any]) -> Any:
+    for one in allowed:
+        if type(value) is type(one) and value == one:
+            return one
+    words = ", ".join(map(repr, allowed))
+    raise ObsynthError(f"{name} is {value!r}; it has to be one of {words}", option=name)
+
+
+def _number(name: str, value: Any, limits: Number, whole: bool) -> float | int:
+    fits = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not fits or not limits.holds(value) or (whole and value != int(value)):
+        raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
+    return int(value) if whole else float(value)
+
+
+def _numbers(name: str, value: Any, limits: Number) -> tuple[float, ...]:
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.ndim != 1 or not numbers.size or not limits.holds(numbers):
+        raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
+    return tuple(numbers.tolist())
+
+
+def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np.ndarray[Any, Any]:
+    """Return an option that is an array of finite numbers; a vector serves as one column."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ObsynthError(f"{name} is no array of numbers: {value!r}", option=name) from error
+    if array.ndim == 1 and 1 not in dimensions:
+        array = array[:, None]
+    if array.ndim not in dimensions or not np.isfinite(array).all():
+        raise ObsynthError(
+            f"{name} has to hold finite numbers in {' or '.join(map(str, dimensions))} dimensions; "
+            f"got {value!r}",
+            option=name,
+        )
+    return array
+
+
+def options_record(method: Any) -> Mapping[str, Any]:
+    """Return all options as they are given, by name."""
+    return {field.name: getattr(method, field.name) for field in fields(method)}
