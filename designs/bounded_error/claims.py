@@ -19,7 +19,7 @@ from obsynth.designs.bounded_error.error_system import (
     lift,
 )
 from obsynth.designs.bounded_error.lmis import fixed_gain_block
-from obsynth.designs.bounded_error.model import Derived
+from obsynth.designs.bounded_error.model import Derived, rounding_allowance
 from obsynth.designs.bounded_error.noise import noise_box
 from obsynth.designs.bounded_error.peak.design import prove_peak_claims
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
@@ -45,18 +45,21 @@ def claims(design: UioDesign) -> Iterator[Claim]:
 
 def _prove_boxes(design: UioDesign) -> Claim:
     boxes = noise_box(design.plant)
+    residual = decouple(design.C, design.D).residual
     w = design.plant.box("w")
     room = np.concatenate(
         [
             w[:, 0] - (design.w_centre - design.w_radius),
             (design.w_centre + design.w_radius) - w[:, 1],
             design.rate - boxes.rate,
+            design.rounding - rounding_allowance(design.plant, residual),
         ]
     )
     margin = float(room.min(initial=np.inf))
     return Claim(
         "boxes",
-        "the stored boxes hold the declared disturbances and fault rates",
+        "the stored boxes hold the declared disturbances and fault rates, and the allowance for "
+        "rounding is not below what the ranges ask for",
         bool(margin >= 0.0),
         margin,
         "comparison",

@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 import sympy as sp
-from zoo import ZOO
 
 from obsynth.symbolic import Plant, PlantError, plants
 from obsynth.symbolic.parity import ParityError
+from zoo import ZOO
 
 KINDS = ("x", "u", "d", "f", "w", "p", "rho")
 

@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 import sympy as sp
-from zoo import ZOO
 
 from obsynth.derive import Status, StructureError, equilibrium, jacobian_bounds, split
+from zoo import ZOO
 
 HEAVY = ("bicycle", "planar_arm 3R")
 LIGHT = tuple(name for name in ZOO if name not in HEAVY)

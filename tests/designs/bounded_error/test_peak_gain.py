@@ -17,7 +17,7 @@ from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.symbolic.errors import ObsynthError
 
 REFERENCE = json.loads(
-    (Path(__file__).parents[1] / "reference" / "bounded_error_uio.json").read_text()
+    (Path(__file__).parents[2] / "reference" / "bounded_error_uio.json").read_text()
 )
 WBAR, EPSBAR = np.full(3, 0.1), np.full(2, 0.05)
 K = [[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]

@@ -22,7 +22,7 @@ from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, p
 from obsynth.designs.bounded_error.peak.transient import transient
 from obsynth.designs.core.errors import InfeasibleDesign
 
-REFERENCE = Path(__file__).parents[1] / "reference" / "bounded_error_uio.json"
+REFERENCE = Path(__file__).parents[2] / "reference" / "bounded_error_uio.json"
 WBAR, EPSBAR = np.full(3, 0.1), np.full(2, 0.05)
 K = [[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]
 F = [[0.6766, 0.0023, 0], [-0.0042, 0.6263, 0]]

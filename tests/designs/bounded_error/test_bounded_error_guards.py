@@ -11,7 +11,7 @@ from obsynth.designs.bounded_error.error_system import (
     plain_error,
     shifted_error,
 )
-from obsynth.designs.bounded_error.model import prepare
+from obsynth.designs.bounded_error.model import read
 from obsynth.designs.bounded_error.noise import NoiseBox
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import build_step
@@ -274,20 +274,7 @@ def test_rounding_of_a_step_is_within_its_allowance(base, design, run):
 
 def test_a_step_without_the_fault_is_not_certified_by_chance(design, base, tank):
     """Coverage is lost if the deployed step is not the proved one (a sign of F flipped)."""
-    from obsynth.designs.bounded_error.runtime import ellipsoid_runtime
-
-    mutant = build_step(
-        design.plant,
-        design.C,
-        design.W2,
-        design.E,
-        design.T,
-        design.K,
-        -design.F,
-        design.w_centre,
-        design.w_radius,
-        ellipsoid_runtime(design),
-    )
+    mutant = build_step(replace(design, F=-design.F))
     run = ob.simulate(tank, replace(base, step=mutant), ob.scenarios.quadruple_tank("FS1"), seed=0)
     assert min(run.coverage.values()) < 1.0
 
@@ -314,7 +301,7 @@ def test_shifted_error_recursion(design, tank_split, run):
 
 def test_the_best_trace_of_a_given_gain_is_log_convex_in_gamma(base, tank_split, tank_bounds):
     """Why the search over gamma has one minimum when the gain is given."""
-    prepared = prepare(tank_split, tank_bounds)
+    prepared = read(tank_split, tank_bounds)
     system = build_error_system(prepared.design.data, "plain")
     noise = ob.BoundedErrorUIO._noise(prepared, system.blocks)
     gain = np.vstack([base.gains["K"], base.gains["F"]])

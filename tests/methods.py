@@ -1,0 +1,87 @@
+"""The table of methods: with one entry, tests/designs/test_contract.py holds a method to all."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+import obsynth as ob
+from luenberger.method import Luenberger
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method with a plant of its class, and what its tests need to know.
+
+    scenario: within the assumptions of the guarantee, with states that move
+    outside: a plant that is not of the class
+    option: an option with a value that is refused
+    spoilt: path of a number in the record, what it is multiplied by, the claim that falls
+    gains: those of `Observer.gains` that `analyse` takes, by its name for them
+    detects: whether a fault detector can stand on it
+    module: what another process has to import before it can load a design
+    """
+
+    method: Any
+    plant: Callable[[], ob.Plant]
+    scenario: Callable[[], ob.Scenario]
+    outside: Callable[[], ob.Plant]
+    spoilt: tuple[tuple[str | int, ...], float, str]
+    option: Mapping[str, Any] | None = None
+    gains: tuple[str, ...] = ()
+    detects: bool = True
+    module: str = "obsynth"
+
+
+def tank() -> ob.Plant:
+    return ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
+
+
+def two_tanks() -> ob.Plant:
+    """Two tanks in a row, the second level measured."""
+    plant = ob.Plant("two tanks")
+    h1, h2 = plant.states("h1 h2", range=(4, 40), nominal=[9, 9], unit="cm")
+    (v,) = plant.inputs("v", range=(0, 10), nominal=3, unit="V")
+    w1, w2 = plant.disturbances("w1 w2", bound=[0.02, 0.05])
+    quarter = sp.Rational(1, 4)
+    plant.dynamics(
+        [quarter * (v - sp.sqrt(h1)) + w1, quarter * (sp.sqrt(h1) - sp.sqrt(h2))],
+    )
+    plant.outputs([h2 + w2])
+    return plant.discretise("euler", Ts=1.0)
+
+
+def two_tanks_filling() -> ob.Scenario:
+    return ob.Scenario(
+        name="filling",
+        steps=120,
+        x0=[16, 12],
+        guess=[12, 14],
+        inputs=lambda k: [4 + np.sin(k / 20)],
+        x_range=[(8, 20), (8, 20)],
+    )
+
+
+METHODS = {
+    "bounded_error_uio": Entry(
+        ob.BoundedErrorUIO(gamma=0.005),
+        tank,
+        lambda: ob.scenarios.quadruple_tank("FS1"),
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("bound", "gamma", 0), 2.0, "lmi"),
+        option={"gamma": 1.5},
+        gains=("K", "F"),
+    ),
+    "luenberger": Entry(
+        Luenberger(),
+        two_tanks,
+        two_tanks_filling,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("b", 1), 0.5, "peak"),
+        gains=("L",),
+        detects=False,
+        module="luenberger.method",
+    ),
+}
