@@ -4,5 +4,5 @@
     |e| <= s elementwise, s+ = N s + n,  N >= |A + M - L C|,  n >= |W1 - L W2| |w|,
 
 so that s stays below b once N b + n <= b: the peak bound. For discrete-time plants without faults
-and unknown inputs; docs/adding_a_method.md goes through its files.
+and unknown inputs; CONTRIBUTING.md goes through its files.
 """

@@ -1,0 +1,70 @@
+"""Options are held against their annotations; what is refused names option, value and remedy."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+
+from obsynth.designs.core.options import POSITIVE, Number, check_options
+from obsynth.symbolic import ObsynthError
+
+SHARE = Number(0.0, 1.0, because="a share lies between 0 and 1")
+
+
+@dataclass(frozen=True)
+class Options:
+    form: Literal["corrected", "printed"] = "corrected"
+    fine: Literal["row", "entry"] | None = None
+    noise: bool = True
+    order: int = 2
+    share: Annotated[float, SHARE] = 0.5
+    rate: Annotated[float | None, POSITIVE] = None
+    weights: Annotated[tuple[float, ...] | None, Number(at_least=0.0)] = None
+    own: Any = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+def test_what_fits_is_kept_and_sequences_become_tuples():
+    given = Options(fine="row", rate=3, weights=np.array([1, 2]), own=[1])
+    assert given == Options(fine="row", rate=3.0, weights=(1.0, 2.0), own=[1])
+    assert (type(given.rate), type(given.weights)) == (float, tuple)
+    assert Options(weights=0.5).weights == (0.5,)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("form", "shortened", "one of 'corrected', 'printed'"),
+        ("form", None, "one of"),
+        ("fine", "column", "one of 'row', 'entry', None"),
+        ("noise", 1, "one of True, False"),
+        ("order", 2.5, "it has to be"),
+        ("share", 1.0, "a share lies between 0 and 1"),
+        ("share", 0.0, "a share lies between 0 and 1"),
+        ("share", float("nan"), "a share lies between 0 and 1"),
+        ("share", "half", "a share lies between 0 and 1"),
+        ("share", True, "a share lies between 0 and 1"),
+        ("rate", 0.0, "positive and finite"),
+        ("rate", float("inf"), "positive and finite"),
+        ("weights", [1.0, -1e-300], "it has to be"),
+        ("weights", [[1.0]], "it has to be"),
+        ("weights", [], "it has to be"),
+        ("weights", "many", "it has to be"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(name, value, said):
+    with pytest.raises(ObsynthError, match=f"^{name} is ") as refusal:
+        Options(**{name: value})
+    assert said in str(refusal.value)
+    assert refusal.value.option == name
+
+
+def test_limits_are_those_that_were_said():
+    values = np.linspace(-1.0, 2.0, 61)
+    assert [SHARE.holds(v) for v in values] == [0.0 < v < 1.0 for v in values]
+    closed = Number(at_least=0.0, at_most=1.0)
+    assert [closed.holds(v) for v in values] == [0.0 <= v <= 1.0 for v in values]
+    assert SHARE.holds([0.1, 0.9]) and not SHARE.holds([0.1, 1.1])
