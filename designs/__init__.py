@@ -8,11 +8,13 @@ from obsynth.designs.core.errors import (
     InfeasibleDesign,
     SolverTrouble,
 )
-from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.core.files import save
 from obsynth.designs.core.loading import load
+from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.comparison import Detection, FaultEvent
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.designs.hinf.method import HinfUIO
+from obsynth.designs.hinf.worst_case import WorstCase, worst_case
 
 __all__ = [
     "STATUS",
@@ -25,9 +27,12 @@ __all__ = [
     "FaultDetector",
     "FaultEvent",
     "Guarantee",
+    "HinfUIO",
     "InfeasibleDesign",
     "Observer",
     "SolverTrouble",
+    "WorstCase",
     "load",
     "save",
+    "worst_case",
 ]

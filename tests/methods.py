@@ -74,6 +74,16 @@ METHODS = {
         option={"gamma": 1.5},
         gains=("K", "F"),
     ),
+    "hinf_uio": Entry(
+        ob.HinfUIO(method="general", multipliers="per_row", decay=0.6),
+        ob.plants.hinf_example,
+        lambda: ob.scenarios.hinf_example("noise"),
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("bound", "mu"), 0.999, "lmi"),
+        option={"mu": 0.0},
+        gains=("K", "F", "H", "D"),
+        detects=False,
+    ),
     "luenberger": Entry(
         Luenberger(),
         two_tanks,

@@ -1,7 +1,8 @@
-"""Proofs of the attenuation level, for the gains and matrices as they are stored."""
+"""Proofs of the attenuation level for the stored numbers, and that these speak of the plant."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
@@ -17,13 +18,26 @@ from obsynth.designs.hinf.lmis import (
     printed_block,
     printed_bound,
 )
+from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
+from obsynth.designs.hinf.sector import build_sector, covers_sector
 from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
+from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational elimination at the worst vertex"
 # What rounding F and H may leave of the fault, relative to what they take away.
 RESIDUAL = 1e-12
+# Magnitude up to which signals without a declared range are covered.
+LARGEST_SIGNAL = 1e6
+# What rounding C and L may move in one step, relative to the sizes of the signals.
+ALLOWED = 2.0**-40
+
+
+def claims(design: HinfDesign) -> Iterator[Claim]:
+    """Prove everything that the guarantee of a stored design rests on."""
+    yield prove_decoupling(design)
+    yield from prove_level(design)
 
 
 def proof_blocks(
@@ -56,7 +70,7 @@ def proof_blocks(
     return blocks
 
 
-def prove_level(design: HinfDesign) -> tuple[Claim, ...]:
+def prove_level(design: HinfDesign) -> Iterator[Claim]:
     """Prove every matrix inequality behind the level."""
     data, bound = design.data, design.bound
     count = data.count
@@ -74,36 +88,30 @@ def prove_level(design: HinfDesign) -> tuple[Claim, ...]:
         "decay": f"V+ < {bound.decay} V where w = 0, {where}",
     }
     exact = {}
-    claims = []
     for name, block in proof_blocks(design, "enclosure").items():
         result = prove_positive_definite(block)
         worst = int(result.worst()[0]) if data.sector is None else 0
         if worst not in exact:
             exact[worst] = proof_blocks(design, "exact", data.vertex(worst))
         confirmed = is_positive_definite(_symmetric(exact[worst][name]))
-        claims.append(
-            Claim(
-                name,
-                statements[name],
-                bool(result.all_proved and confirmed),
-                float(result.relative.min()),
-                f"{RUMP}; {EXACT}",
-            )
+        yield Claim(
+            name,
+            statements[name],
+            bool(result.all_proved and confirmed),
+            float(result.relative.min()),
+            f"{RUMP}; {EXACT}",
         )
     if printed:
         least = float(min(bound.printed[0], bound.printed[1]))
         # (45) knows neither an output feedthrough D nor a decay rate.
         plain = not design.gains.D.any() and bound.decay is None
-        claims.append(
-            Claim(
-                "multipliers",
-                "alpha > 0, beta > 0, D = 0",
-                bool(least > 0.0 and plain),
-                least,
-                "comparison",
-            )
+        yield Claim(
+            "multipliers",
+            "alpha > 0, beta > 0, D = 0",
+            bool(least > 0.0 and plain),
+            least,
+            "comparison",
         )
-    return tuple(claims)
 
 
 def _symmetric(matrix: ExactMatrix) -> ExactMatrix:
@@ -137,3 +145,81 @@ def prove_decoupling(design: HinfDesign) -> Claim:
         0.0 - max(state / size, fault),
         "exact rational arithmetic on the stored F, H, C, L",
     )
+
+
+def covers(design: HinfDesign, fresh: Derived) -> Iterator[Claim]:
+    """Compare the stored matrices, family and sector with those derived from the equations."""
+    parts = fresh.split
+    rounding = parts.proof.rounding
+    pairs = (
+        (design.A, parts.A),
+        (design.B, parts.B),
+        (design.C, parts.C),
+        (design.L, np.hstack([parts.B_f, parts.D])),
+        (design.W, parts.W1),
+    )
+    same = all(np.array_equal(stored, derived) for stored, derived in pairs)
+    held = bool(np.all(design.W_radius >= rounding["W1"])) and not parts.W2.any()
+    lost, size = _rounding_of_signals(design, rounding)
+    yield Claim(
+        "model",
+        "A x + B u + L f + W w + g equals the stored dynamics, C x the outputs",
+        bool(same and held and parts.proof.holds),
+        0.0,
+        str(parts.proof),
+    )
+    yield Claim(
+        "matrix_rounding",
+        f"rounding C and L to doubles moves no signal by more than {ALLOWED:.0e} of its size "
+        f"(signals without a range up to {LARGEST_SIGNAL:g})",
+        bool(lost <= ALLOWED * size),
+        ALLOWED * size - lost,
+        "bounds of |exact - double| times the ranges",
+    )
+    # The step and the refusal of unstable gains use the vertices in every form.
+    yield _covers_family(design, fresh)
+    if design.sector is not None:
+        yield _covers_sector(design, fresh)
+
+
+def _covers_family(design: HinfDesign, fresh: Derived) -> Claim:
+    stored, derived = design.family.ranges, fresh.bounds.family.ranges
+    room = -np.inf
+    if derived.shape == stored.shape:
+        below, above = (derived - stored)[:, 0], (stored - derived)[:, 1]
+        room = float(min(below.min(initial=0.0), above.min(initial=0.0)))
+    return Claim(
+        "jacobian",
+        "every Jacobian of g over the box lies in the stored family",
+        design.family.covers(fresh.bounds.family),
+        room,
+        "interval branch and bound with outward rounding; dependences proved symbolically",
+    )
+
+
+def _covers_sector(design: HinfDesign, fresh: Derived) -> Claim:
+    found, form = fresh.majorant, design.sector_form
+    holds, room = False, -np.inf
+    if design.sector is not None and found is not None and form is not None:
+        holds, room = covers_sector(design.sector, build_sector(found, form))
+        holds = holds and bool(np.all(design.A_radius >= found.rounding))
+    return Claim(
+        "majorant",
+        "g(a) - g(b) lies in the stored sector for all a, b in the box",
+        holds,
+        room,
+        "interval branch and bound of sum_j (dg_i/dx_j)^2 / R_jj",
+    )
+
+
+def _rounding_of_signals(
+    design: HinfDesign, rounding: dict[str, FloatArray]
+) -> tuple[float, float]:
+    """Bound what rounding C, B_f and D moves in one step, and the size to compare it with."""
+    lost, size = 0.0, 1.0
+    for kind, name in (("x", "C"), ("f", "B_f"), ("d", "D")):
+        box = np.abs(design.plant.box(kind)).max(axis=1, initial=0.0)
+        box = np.where(np.isfinite(box), box, LARGEST_SIGNAL)
+        lost += float((rounding[name] @ box).max(initial=0.0))
+        size = max(size, float(box.max(initial=0.0)))
+    return lost, size

@@ -2,43 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.hinf.claims import prove_level
-from obsynth.designs.hinf.given import read_diagonal, read_gains, unstable_gains
-from obsynth.designs.hinf.model import Prepared, prepare
-from obsynth.designs.hinf.problems import Structure, state_problem
+from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import Number, read_matrix
+from obsynth.designs.hinf.claims import (
+    RESIDUAL,
+    claims,
+    covers,
+    decoupling_residual,
+    prove_level,
+)
+from obsynth.designs.hinf.guarantee import guarantee, numbers
+from obsynth.designs.hinf.model import CLASS, HinfModel, read, read_again
 from obsynth.designs.hinf.record import Bound, HinfDesign
-from obsynth.designs.hinf.sector import MULTIPLIERS, Multipliers
+from obsynth.designs.hinf.sector import Multipliers, SectorForm
+from obsynth.designs.hinf.step import build_step, first_memory, memory_sizes
 from obsynth.designs.hinf.synthesis import (
     Found,
+    Structure,
     find_filter,
     find_level,
     find_storage,
+    state_problem,
     unstable_vertex,
 )
 from obsynth.designs.hinf.system import Filter
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import JacobianBounds, Split
-    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
     from obsynth.symbolic import Plant
 
-
-METHODS = ("standard", "polytopic", "general")
-FORMS = ("corrected", "printed")
+LEVEL = Number(above=0.0, because="a level is positive and finite")
+SLACK = Number(above=0.0, because="it is positive, since an infimum is not attained")
+DECAY = Number(0.0, 1.0, because="the factor of V per step lies between 0 and 1")
+DIAGONAL = Number(at_least=0.0, because="it has to be the diagonal of M'M, not negative")
 
 
 @dataclass(frozen=True)
-class HinfUIO:
+class HinfUIO(Method):
     """Unknown input observer with a guaranteed energy gain from disturbances to fault errors.
 
     For discrete-time plants ``x+ = A x + B u + g(x, u) + L f + W w``, ``y = C x`` with
@@ -78,6 +90,11 @@ class HinfUIO:
 
     Notes
     -----
+    ``performance["l2_gain"]`` is the level that is proved; `obsynth.worst_case` shows how much of
+    it a disturbance reaches. `analyse` takes the gain ``K`` of shape (n, m), and of the general
+    filter ``F`` (n, m), ``H`` (n_f, m) and ``D`` (n_f, m), by default those of (18)-(19);
+    ``method="polytopic"`` is the sharpest for given gains.
+
     M. Witczak, J. Korbicz, R. Jozefowicz, "A H-infinity approach to robust fault estimation of
     non-linear discrete-time systems". What does not hold as printed:
 
@@ -112,45 +129,37 @@ class HinfUIO:
     (0.4586, True)
     """
 
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="hinf_uio",
+        record=HinfDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+        fault_delay=1,
+    )
+
     method: Literal["standard", "polytopic", "general"] = "standard"
     multipliers: Multipliers | None = None
     drop_zero_rows: bool = True
-    mu: float | None = None
-    slack: float = 5e-4
-    decay: float | None = None
-    majorant: tuple[float, ...] | None = None
+    mu: Annotated[float | None, LEVEL] = None
+    slack: Annotated[float, SLACK] = 5e-4
+    decay: Annotated[float | None, DECAY] = None
+    majorant: Annotated[tuple[float, ...] | None, DIAGONAL] = None
     form: Literal["corrected", "printed"] = "corrected"
 
     def __post_init__(self) -> None:
-        allowed: dict[str, tuple[Any, ...]] = {
-            "method": METHODS,
-            "multipliers": (None, *MULTIPLIERS),
-            "form": FORMS,
-        }
-        for name, values in allowed.items():
-            given = getattr(self, name)
-            if given not in values:
-                raise ObsynthError(
-                    f"{name} is {given!r}; it has to be one of {', '.join(map(repr, values))}",
-                    option=name,
-                )
-        if self.mu is not None and not 0.0 < self.mu < np.inf:
-            raise ObsynthError(f"mu is {self.mu!r}; a level is positive and finite", option="mu")
-        if not 0.0 < self.slack < np.inf:
-            raise ObsynthError(
-                f"slack is {self.slack!r}; it is positive, since an infimum is not attained",
-                option="slack",
-            )
-        if self.decay is not None and not 0.0 < self.decay < 1.0:
-            raise ObsynthError(
-                f"decay is {self.decay!r}; the factor of V per step lies between 0 and 1",
-                option="decay",
-            )
         if self.majorant is not None:
-            object.__setattr__(self, "majorant", read_diagonal(self.majorant))
-        self._refuse_contradictions()
+            object.__setattr__(self, "majorant", _diagonal(self.majorant))
+        super().__post_init__()
 
-    def _refuse_contradictions(self) -> None:
+    def check(self) -> None:
+        """Refuse options that do not fit each other."""
         if self.method == "polytopic" and self.multipliers is not None:
             raise ObsynthError(
                 'method="polytopic" takes the vertices of the Jacobian and no multipliers',
@@ -170,6 +179,45 @@ class HinfUIO:
                 option="form",
             )
 
+    def read(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> HinfModel:
+        """Split the plant, check the structural conditions, bound the nonlinearity."""
+        form = None
+        if self._multipliers is not None:
+            drop = self.drop_zero_rows and self.form != "printed"
+            form = SectorForm(self._multipliers, drop, self.majorant)
+        return read(given, form, bounds)
+
+    def solve(self, model: HinfModel) -> HinfDesign:
+        """Find the filter with the smallest trace of P at the first level that is proved."""
+
+        def find(level: float) -> tuple[Filter, Found]:
+            return find_filter(model.design.data, self._structure, level, self.decay)
+
+        return self._first_proved(model, find)
+
+    def fix(self, model: HinfModel, gains: Mapping[str, ArrayLike]) -> HinfDesign:
+        """Bound the gain from w to f - fhat of a given filter."""
+        chosen = _read_filter(model.design, gains)
+        if self.form == "printed" and chosen.D.any():
+            raise ObsynthError('form="printed" has no gain D; leave it out', option="D")
+        unstable = unstable_vertex(model.design.data, chosen)
+        if unstable is not None:
+            raise _unstable_gains(model, *unstable)
+
+        def find(level: float) -> tuple[Filter, Found]:
+            data = model.design.data
+            return chosen, find_storage(data, self._structure, level, chosen, self.decay)
+
+        return self._first_proved(model, find, chosen)
+
+    def problem(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> Problem:
+        """Return the design LMI in the plant's units, see `Problem.to_cvxpy`.
+
+        Without ``mu`` it minimises ``mu2``, the square of the level; with it the trace of P.
+        """
+        model: HinfModel = self._checked(given, bounds)
+        return state_problem(model.design.data, self._structure, self.mu, self.decay)
+
     @property
     def _multipliers(self) -> Multipliers | None:
         if self.multipliers is None and self.method == "standard":
@@ -182,183 +230,66 @@ class HinfUIO:
             return "printed"
         return "general" if self.method == "general" else "standard"
 
-    def design(
-        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
-    ) -> Observer:
-        """Design, prove and return the observer.
-
-        Parameters
-        ----------
-        model_or_split : Plant or Split
-            Discrete time; a plant is split into its linear terms and the rest.
-        bounds : JacobianBounds, optional
-            Of the split's g, where they are at hand.
-
-        Returns
-        -------
-        Observer
-            ``performance["l2_gain"]`` is the level that is proved.
-
-        Raises
-        ------
-        StructureError
-            If the model is outside the class, or a rank or detectability condition fails;
-            before any LMI.
-        InfeasibleDesign
-            If no observer of this form exists at the level; says which level is feasible.
-        UnboundedError
-            If the Jacobian is unbounded over the declared box.
-        """
-        prepared = self._prepare(model_or_split, bounds)
-        data = prepared.design.data
+    def _first_proved(
+        self,
+        model: HinfModel,
+        find: Callable[[float], tuple[Filter, Found]],
+        gains: Filter | None = None,
+    ) -> HinfDesign:
+        """Return the design at the first level that is proved, from just above the least one."""
         least = None
-        if self.mu is None:
-            least = find_level(data, self._structure, self.decay)
-        last: Exception | None = None
-        for level in self._levels(least):
-            try:
-                gains, found = find_filter(data, self._structure, level, self.decay)
-            except InfeasibleDesign as refusal:
-                last = refusal
-                if self.mu is not None:
-                    break
-                continue
-            except SolverTrouble as trouble:
-                last = trouble
-                continue
-            design = self._certified(prepared, level, least, gains, found)
-            if design is not None:
-                return self._assemble(design, prepared)
         if self.mu is not None:
-            raise self._refusal(prepared) from last
+            levels = [self.mu]
+        else:
+            least = find_level(model.design.data, self._structure, self.decay, gains)
+            growth = [self.slack * 2.0**k for k in range(12)]
+            levels = [least * (1.0 + s) for s in growth if s <= max(self.slack, 0.01)]
+        last: Exception | None = None
+        for level in levels:
+            try:
+                design = self._proved(model, level, least, *find(level))
+            except (InfeasibleDesign, SolverTrouble) as refusal:
+                last = refusal
+                continue
+            if design is not None:
+                return design
+        if least is None and gains is None:
+            raise self._refusal(model) from last
+        if least is None and last is not None:
+            raise last
         raise SolverTrouble(
-            f"the least mu is {least:.6g}, but no filter was proved up to 1 % above it",
+            "no level was proved for these gains"
+            if least is None
+            else f"the least mu is {least:.6g}, but no filter was proved up to 1 % above it",
             [*(() if last is None else (str(last),)), "give a larger slack= or mu="],
             least_mu=least,
         ) from last
 
-    def analyse(
-        self,
-        model_or_split: Plant | Split,
-        gains: Mapping[str, ArrayLike],
-        bounds: JacobianBounds | None = None,
-    ) -> Observer:
-        """Return what given gains guarantee, proved.
-
-        Parameters
-        ----------
-        model_or_split : Plant or Split
-        gains : mapping
-            ``K`` of shape (n, m); ``F`` (n, m), ``H`` (n_f, m) and ``D`` (n_f, m) of the
-            general filter, by default those of (18)-(19).
-        bounds : JacobianBounds, optional
-
-        Returns
-        -------
-        Observer
-            ``performance["l2_gain"]`` is an upper bound of the worst-case gain; compare
-            `obsynth.worst_case`. Its tightness depends on ``method``: ``"polytopic"`` is the
-            sharpest.
-
-        Raises
-        ------
-        InfeasibleDesign
-            If the error is unstable at a vertex of the Jacobian set, which is named, or the gains
-            guarantee nothing.
-        """
-        prepared = self._prepare(model_or_split, bounds)
-        data = prepared.design.data
-        chosen = read_gains(prepared.design, gains)
-        if self.form == "printed" and chosen.D.any():
-            raise ObsynthError('form="printed" has no gain D; leave it out', option="D")
-        unstable = unstable_vertex(data, chosen)
-        if unstable is not None:
-            raise unstable_gains(prepared, *unstable)
-        least = None
-        if self.mu is None:
-            least = find_level(data, self._structure, self.decay, chosen)
-        for level in self._levels(least):
-            try:
-                found = find_storage(data, self._structure, level, chosen, self.decay)
-            except InfeasibleDesign:
-                if self.mu is not None:
-                    raise
-                continue
-            design = self._certified(prepared, level, least, chosen, found)
-            if design is not None:
-                return self._assemble(design, prepared)
-        raise SolverTrouble(
-            "no level was proved for these gains", ["give a larger slack= or mu="], least_mu=least
-        )
-
-    def problem(
-        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
-    ) -> Problem:
-        """Return the design LMI in the plant's units, see `Problem.to_cvxpy`.
-
-        Without ``mu`` it minimises ``mu2``, the square of the level; with it the trace of P.
-        """
-        data = self._prepare(model_or_split, bounds).design.data
-        return state_problem(data, self._structure, self.mu, self.decay)
-
-    def _prepare(
-        self, model_or_split: Plant | Split, bounds: JacobianBounds | None = None
-    ) -> Prepared:
-        drop = self.drop_zero_rows and self.form != "printed"
-        prepared = prepare(model_or_split, self._multipliers, drop, self.majorant, bounds)
-        options = asdict(self) | {"multipliers": self._multipliers, "drop_zero_rows": drop}
-        return replace(prepared, design=replace(prepared.design, options=options))
-
-    def _levels(self, least: float | None) -> list[float]:
-        if self.mu is not None:
-            return [self.mu]
-        growth = [self.slack * 2.0**k for k in range(12)]
-        return [(least or 0.0) * (1.0 + s) for s in growth if s <= max(self.slack, 0.01)]
-
-    def _certified(
-        self,
-        prepared: Prepared,
-        level: float,
-        least: float | None,
-        gains: Filter,
-        found: Found,
+    def _proved(
+        self, model: HinfModel, level: float, least: float | None, gains: Filter, found: Found
     ) -> HinfDesign | None:
         """Complete a design if its level can be proved, else look for a storage with more room."""
-        options = dict(prepared.design.options) | {"least_mu": least}
-        design = replace(prepared.design, gains=gains, options=options)
-        design = replace(design, bound=self._bound(level, found))
-        if all(claim.holds for claim in prove_level(design)):
+        given = replace(model.design, gains=gains, options=self.options())
+
+        def complete(found: Found) -> HinfDesign:
+            extra = None if self.decay is None else found.tau_decay
+            bound = Bound(level, found.P, found.tau, found.printed, self.decay, extra, least)
+            return replace(given, bound=bound)
+
+        def holds(design: HinfDesign) -> bool:
+            return all(claim.holds for claim in prove_level(design))
+
+        design = complete(found)
+        if holds(design):
             return design
-        try:
-            more = find_storage(design.data, self._structure, level, gains, self.decay)
-        except (InfeasibleDesign, SolverTrouble):
-            return None
+        more = find_storage(design.data, self._structure, level, gains, self.decay)
         # The nearer to the first one, the smaller is P.
-        for share in np.geomspace(1e-8, 1.0, 17):
-            design = replace(design, bound=self._bound(level, found.mixed(more, float(share))))
-            if all(claim.holds for claim in prove_level(design)):
-                return design
-        return None
+        mixed = (complete(found.mixed(more, float(s))) for s in np.geomspace(1e-8, 1.0, 17))
+        return next((design for design in mixed if holds(design)), None)
 
-    def _bound(self, level: float, found: Found) -> Bound:
-        decays = self.decay is not None
-        return Bound(
-            level,
-            found.P,
-            found.tau,
-            found.printed,
-            self.decay,
-            found.tau_decay if decays else None,
-        )
-
-    def _assemble(self, design: HinfDesign, prepared: Prepared) -> Observer:
-        from obsynth.designs.hinf.assembly import assemble
-
-        return assemble(design, derived=(prepared.split, prepared.bounds, prepared.majorant))
-
-    def _refusal(self, prepared: Prepared) -> InfeasibleDesign:
+    def _refusal(self, model: HinfModel) -> InfeasibleDesign:
         """Say which level is feasible where the given one is not."""
-        data = prepared.design.data
+        data = model.design.data
         least = find_level(data, self._structure, self.decay)
         details = [f"the least level of this form is {least:.6g}"]
         if self.mu is not None and self.mu > least:
@@ -368,9 +299,62 @@ class HinfUIO:
                 mu=self.mu,
                 least_mu=least,
             )
-        if self.method != "general" and prepared.design.family.vertex_count == len(data.vertices):
+        if self.method != "general" and model.design.family.vertex_count == len(data.vertices):
             other = find_level(replace(data, sector=None), "general", self.decay)
             details.append(f'method="general" reaches {other:.6g}')
         return InfeasibleDesign(
             f"mu = {self.mu:.6g} is infeasible", details, mu=self.mu, least_mu=least
         )
+
+
+def _diagonal(value: Any) -> FloatArray:
+    """Return the diagonal of M'M from a sequence or a diagonal matrix."""
+    array = read_matrix("majorant", value, (1, 2))
+    if array.ndim == 2:
+        diagonal = np.diag(array)
+        if not np.array_equal(array, np.diag(diagonal)):
+            raise ObsynthError("majorant= has to be a diagonal M'M", option="majorant")
+        return diagonal
+    return array
+
+
+def _read_filter(design: HinfDesign, gains: Mapping[str, ArrayLike]) -> Filter:
+    """Return the filter of given gains; F, H and D as in (18)-(19) where they are not given."""
+    blank = design.gains
+    shapes = {name: getattr(blank, name).shape for name in ("K", "F", "H", "D")}
+    arrays = read_gains(gains, shapes, optional=("F", "H", "D"))
+    chosen = replace(design.data.standard_filter(arrays["K"]), **arrays)
+    state, fault = decoupling_residual(replace(design, gains=chosen))
+    for name, left, identity in (("F", state, "(I - F C) L = 0"), ("H", fault, "H C L = I")):
+        if left > RESIDUAL * max(1.0, float(np.abs(design.L).max())):
+            raise ObsynthError(
+                f"{name} does not decouple {', '.join(design.plant.names('f'))}: {identity} is "
+                f"missed by {left:.3g}; round {name} so that it holds to the last digits",
+                option=name,
+                residual=left,
+            )
+    return chosen
+
+
+def _unstable_gains(model: HinfModel, index: int, radius: float) -> InfeasibleDesign:
+    """Return the refusal of gains whose error grows at a vertex of the Jacobian set."""
+    vertex = model.design.data.vertices[index]
+    varying = model.bounds.max > model.bounds.min
+    names = model.design.plant.names("x")
+    entries = {
+        f"dg_{names[i]}/d{names[j]}": float(vertex[i, j])
+        for i, j in np.argwhere(varying & (np.abs(vertex) > 1e-12))
+    }
+    where = ", ".join(f"{name} = {value:.6g}" for name, value in entries.items())
+    return InfeasibleDesign(
+        f"the error is unstable with these gains: spectral radius {radius:.6f} at the vertex "
+        f"{where or index}",
+        [
+            "a Jacobian that the plant has there or near it makes the estimation error grow",
+            "design gains for this plant, or narrow the ranges of the states",
+        ],
+        spectral_radius=radius,
+        vertex=vertex,
+        vertex_index=index,
+        entries=entries,
+    )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -14,67 +14,78 @@ from obsynth.derive import AffineFamily
 from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.core.record import plain_fields, read_array, read_family, reading
-from obsynth.designs.hinf.system import Filter, FilterData, Sector
+from obsynth.designs.core.record import Record
+from obsynth.designs.hinf.sector import Sector, SectorForm
+from obsynth.designs.hinf.system import Filter, FilterData
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-METHOD = "hinf_uio"
 MOST_VERTICES = 2**12
-LINEAR_FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 
 
 @dataclass(frozen=True, eq=False)
-class Bound:
+class Bound(Record):
     """What proves the attenuation level.
 
     mu: |f - fhat| <= mu |w| in the sense of energies, e_0 = 0
-    P (n, n): V = e'Pe; with the printed form V = e'Pe + s'Qs
-    tau (n_groups,): multipliers; none with vertices or the printed form
+    P: V = e'Pe; with the printed form V = e'Pe + s'Qs
+    tau: multipliers, one per group; none with vertices or the printed form
     printed (0,) or (2 + n n,): alpha, beta and Q of (45), by rows
     decay: V+ < decay V where w = 0
-    tau_decay (n_groups,)
+    tau_decay: multipliers of the decay, one per group
+    least_mu: the least level that the solver found, where none was given
     """
 
     mu: float
-    P: FloatArray
-    tau: FloatArray
-    printed: FloatArray
+    P: Annotated[FloatArray, "n n"]
+    tau: Annotated[FloatArray, "n_tau"]
+    printed: Annotated[FloatArray, "n_printed"]
     decay: float | None = None
-    tau_decay: FloatArray | None = None
+    tau_decay: Annotated[FloatArray | None, "n_tau_decay"] = None
+    least_mu: float | None = None
 
     @property
     def Q(self) -> FloatArray:
         """Q of (45), (n, n)."""
         return self.printed[2:].reshape(self.P.shape)
 
+    def fits(self, groups: int) -> bool:
+        """Whether there are as many numbers as the inequalities for so many groups have."""
+        if self.printed.size:
+            return groups > 0 and not self.tau.size and self.printed.size == 2 + self.P.size
+        decays = self.decay is not None
+        extra = None if self.tau_decay is None else len(self.tau_decay)
+        return len(self.tau) == groups and extra == (groups if decays else None)
+
 
 @dataclass(frozen=True, eq=False)
-class HinfDesign:
+class HinfDesign(Record):
     """Everything that is deployed and proved, in doubles.
 
     plant: the discrete plant
     linear: how A was chosen, see `obsynth.split`
-    x_at, u_at (n,), (n_u,)
-    A, B, C, L, W: shapes (n, n), (n, n_u), (m, n), (n, s), (n, n_w)
+    x_at, u_at: the point at which it was chosen
+    A, B, C, L, W: the split; L stacks faults and unknown inputs
     A_radius, W_radius: distance of the plant's own coefficients from these doubles
     family: the set of Jacobians of g
+    sector_form: how the sector is made
     sector: what the multipliers weigh; None for the vertices of the family
-    options: the options of the method, as given, and ``least_mu``: what the solver found
+    options: the options of the method, as given
     """
 
     plant: Plant
     linear: LinearForm
-    x_at: FloatArray
-    u_at: FloatArray
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    L: FloatArray
-    W: FloatArray
-    A_radius: FloatArray
-    W_radius: FloatArray
-    family: AffineFamily
+    x_at: Annotated[FloatArray, "n"]
+    u_at: Annotated[FloatArray, "n_u"]
+    A: Annotated[FloatArray, "n n"]
+    B: Annotated[FloatArray, "n n_u"]
+    C: Annotated[FloatArray, "m n"]
+    L: Annotated[FloatArray, "n n_f+q"]
+    W: Annotated[FloatArray, "n n_w"]
+    A_radius: Annotated[FloatArray, "n n"]
+    W_radius: Annotated[FloatArray, "n n_w"]
+    family: Annotated[AffineFamily, "n n"]
+    sector_form: SectorForm | None
     sector: Sector | None
     gains: Filter
     bound: Bound
@@ -104,24 +115,24 @@ class HinfDesign:
             sector=self.sector,
         )
 
-    def to_record(self) -> dict[str, Any]:
-        """Return the design as JSON-able data."""
-        return plain_fields(self)
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> HinfDesign:
-        """Read and check the data of `to_record`."""
-        with reading():
-            design = _read(record)
-        radii = (design.A_radius, design.W_radius)
-        if min(float(r.min(initial=0.0)) for r in radii) < 0.0 or not design.bound.mu > 0.0:
+    def check(self) -> None:
+        """Refuse numbers that do not fit each other."""
+        sector, bound = self.sector, self.bound
+        radii = (self.A_radius, self.W_radius)
+        if min(float(r.min(initial=0.0)) for r in radii) < 0.0 or not bound.mu > 0.0:
             raise CertificateError("a radius is negative, or mu is not positive")
-        if not np.array_equal(design.bound.P, design.bound.P.T):
+        if not np.array_equal(bound.P, bound.P.T):
             raise CertificateError("P of the stored design is not symmetric")
-        sector = design.sector
-        if sector is not None and not set(sector.group) <= set(range(sector.groups)):
-            raise CertificateError("a group of the sector has no multiplier")
-        return design
+        if sector is not None and (
+            self.sector_form is None
+            or len(sector.group) != sector.E.shape[1]
+            or not set(sector.group) <= set(range(sector.groups))
+        ):
+            raise CertificateError(
+                "the sector is not said to be made, or a group has no multiplier"
+            )
+        if not bound.fits(0 if sector is None else sector.groups):
+            raise CertificateError("the stored bound has not one number per group of the sector")
 
 
 def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
@@ -145,49 +156,4 @@ def enclosed_vertices(family: AffineFamily, every: bool = True) -> Enclosure:
         Enclosure.of(family.constant, family.radius),
         Enclosure.of(family.directions),
         table,
-    )
-
-
-def _read(record: Mapping[str, Any]) -> HinfDesign:
-    plant = Plant.from_dict(record["plant"])
-    n, m, n_f = len(plant.x), len(plant.output_names), len(plant.f)
-    n_u, n_w, s = len(plant.u), len(plant.w), len(plant.f) + len(plant.d)
-    gains, bound, stored = record["gains"], record["bound"], record["sector"]
-    sector = None
-    if stored is not None:
-        group = tuple(int(g) for g in stored["group"])
-        R = read_array(stored["R"], (len(stored["R"]), n), "R")
-        sector = Sector(read_array(stored["E"], (n, len(group)), "E"), group, R)
-    groups = 0 if sector is None else sector.groups
-    numbers = 2 + n * n if bound["printed"] else 0
-    extra = bound["tau_decay"]
-    return HinfDesign(
-        plant=plant,
-        linear=next(form for form in LINEAR_FORMS if form == record["linear"]),
-        x_at=read_array(record["x_at"], (n,), "x_at"),
-        u_at=read_array(record["u_at"], (n_u,), "u_at"),
-        A=read_array(record["A"], (n, n), "A"),
-        B=read_array(record["B"], (n, n_u), "B"),
-        C=read_array(record["C"], (m, n), "C"),
-        L=read_array(record["L"], (n, s), "L"),
-        W=read_array(record["W"], (n, n_w), "W"),
-        A_radius=read_array(record["A_radius"], (n, n), "A_radius"),
-        W_radius=read_array(record["W_radius"], (n, n_w), "W_radius"),
-        family=read_family(record["family"], (n, n)),
-        sector=sector,
-        gains=Filter(
-            K=read_array(gains["K"], (n, m), "K"),
-            F=read_array(gains["F"], (n, m), "F"),
-            H=read_array(gains["H"], (n_f, m), "H"),
-            D=read_array(gains["D"], (n_f, m), "D"),
-        ),
-        bound=Bound(
-            mu=float(bound["mu"]),
-            P=read_array(bound["P"], (n, n), "P"),
-            tau=read_array(bound["tau"], (0 if numbers else groups,), "tau"),
-            printed=read_array(bound["printed"], (numbers,), "alpha, beta and Q"),
-            decay=None if bound["decay"] is None else float(bound["decay"]),
-            tau_decay=None if extra is None else read_array(extra, (groups,), "tau_decay"),
-        ),
-        options=dict(record["options"]),
     )

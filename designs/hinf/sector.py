@@ -1,17 +1,16 @@
-"""From a majorant or Jacobian bounds to the sector that multipliers weigh."""
+"""The sector that multipliers weigh: what it says, and how it is made from a majorant."""
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 
-from obsynth.derive import Majorant, Split, majorant
-from obsynth.derive.errors import DerivationError
-from obsynth.designs.hinf.system import Sector
+from obsynth.derive import Majorant
+from obsynth.symbolic.arrays import FloatArray
 
 Multipliers = Literal["single", "per_row", "per_entry"]
-MULTIPLIERS: tuple[Multipliers, ...] = ("single", "per_row", "per_entry")
 # Covers the rounding of one square.
 UP = 1.0 + 2.0**-51
 # A given number such as .1089 may be the exact least value: it counts with what branch and bound
@@ -19,42 +18,51 @@ UP = 1.0 + 2.0**-51
 ROOM = 1.0 + 2.0**-28
 
 
-def derive_majorant(parts: Split, given: tuple[float, ...] | None = None) -> Majorant:
-    """Derive M'M, or prove that a given diagonal is one."""
-    if given is None:
-        return majorant(parts)
-    names = parts.model.names("x")
-    if len(given) != len(names):
-        raise DerivationError(
-            f"majorant= has {len(given)} numbers; M'M has {len(names)} on its diagonal "
-            f"({', '.join(names)})"
-        )
-    free = majorant(parts)
-    needed = [bool(column.any()) for column in free.entry_bounds.T]
-    for name, value, used in zip(names, given, needed, strict=True):
-        if used and not value > 0.0:
-            raise DerivationError(
-                f"majorant= has {value} for {name}, on which g depends: it has to be positive",
-                symbol=name,
-            )
-    fixed = {n: v * ROOM for n, v, used in zip(names, given, needed, strict=True) if used}
-    return majorant(parts, fixed=fixed) if fixed else free
+@dataclass(frozen=True, eq=False)
+class SectorForm:
+    """How a nonlinearity is bounded by a sector.
+
+    multipliers: how finely
+    drop_zero_rows: whether rows of g that are zero are left out
+    given: diagonal of M'M where it is given and only proved
+    """
+
+    multipliers: Multipliers
+    drop_zero_rows: bool = True
+    given: tuple[float, ...] | None = None
 
 
-def build_sector(
-    found: Majorant,
-    multipliers: Multipliers,
-    drop_zero_rows: bool,
-    given: tuple[float, ...] | None = None,
-) -> Sector | None:
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
+
+    E: where every phi enters
+    group: group of every phi; one multiplier per group
+    """
+
+    E: Annotated[FloatArray, "n k"]
+    group: tuple[int, ...]
+    R: Annotated[FloatArray, "groups n"]
+
+    @property
+    def groups(self) -> int:
+        """Number of multipliers."""
+        return len(self.R)
+
+    def mask(self, number: int) -> FloatArray:
+        """Return the diagonal matrix that picks the phi of one group."""
+        return np.diag([1.0 if g == number else 0.0 for g in self.group])
+
+
+def build_sector(found: Majorant, form: SectorForm) -> Sector | None:
     """Make the sector of a majorant, None where g has no part to bound."""
     n = len(found.diagonal)
     eye = np.eye(n)
-    if multipliers == "single":
-        rows = [part.row for part in found.rows] if drop_zero_rows else list(range(n))
-        diagonal = found.diagonal if given is None else np.array(given) * ROOM
+    if form.multipliers == "single":
+        rows = [part.row for part in found.rows] if form.drop_zero_rows else list(range(n))
+        diagonal = found.diagonal if form.given is None else np.array(form.given) * ROOM
         return Sector(eye[:, rows], (0,) * len(rows), diagonal[None]) if rows else None
-    if multipliers == "per_row":
+    if form.multipliers == "per_row":
         rows = [part.row for part in found.rows]
         R = np.array([part.diagonal for part in found.rows])
     else:
@@ -64,7 +72,7 @@ def build_sector(
         R = eye[columns] * (sizes**2 * UP)[:, None]
     if not rows:
         return None
-    if not drop_zero_rows:
+    if not form.drop_zero_rows:
         rest = [i for i in range(n) if i not in rows]
         rows, R = rows + rest, np.vstack([R, np.zeros((len(rest), n))])
     return Sector(eye[:, rows], tuple(range(len(rows))), R)

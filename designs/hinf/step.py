@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
+from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import (
     all_finite,
     clip,
@@ -14,29 +14,28 @@ from obsynth.designs.core.stepping import (
     inside,
     make_step,
     select,
+    slices,
     status_word,
 )
-from obsynth.designs.hinf.system import Filter
+from obsynth.designs.hinf.record import HinfDesign
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-if TYPE_CHECKING:
-    from obsynth.symbolic import Plant
 
-
-def memory_layout(n: int, m: int) -> dict[str, slice]:
+def memory_sizes(design: HinfDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
     ``prediction`` (p of the state now), ``innovation`` (y - C xhat of the instant before),
     ``running`` (1 after the first sample), ``known_input`` (1 if u of the instant before was
     finite) and ``initialised`` (0 or 1).
     """
-    sizes = {"prediction": n, "innovation": m, "running": 1, "known_input": 1, "initialised": 1}
-    layout: dict[str, slice] = {}
-    at = 0
-    for name, size in sizes.items():
-        layout[name] = slice(at, at + size)
-        at += size
-    return layout
+    m, n = design.C.shape
+    return {"prediction": n, "innovation": m, "running": 1, "known_input": 1, "initialised": 1}
+
+
+def first_memory(design: HinfDesign, start: Start) -> dict[str, ArrayLike]:
+    """Start at the guess; the boxes and y0 are not needed, as no set is carried along."""
+    return {"prediction": start.guess}
 
 
 def output_box(C: FloatArray, box: FloatArray) -> FloatArray:
@@ -64,7 +63,7 @@ def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
     return value + ca.DM(A) @ (xhat - nearest)
 
 
-def build_step(model: Plant, A: FloatArray, C: FloatArray, gains: Filter) -> ca.Function:
+def build_step(design: HinfDesign) -> ca.Function:
     """Build `Observer.step` of the H-infinity filter.
 
     f_k shows in y_{k+1} only, so at instant k the step returns xhat_k and fhat_{k-1}:
@@ -73,11 +72,10 @@ def build_step(model: Plant, A: FloatArray, C: FloatArray, gains: Filter) -> ca.
         r0 = y_k - C xhat_k ,  p = A xhat_k + B u_k + g(xhat_k, u_k) .
 
     The first sample has no prediction behind it: xhat_0 is the guess.
-
-    Shapes: A, C (n, n), (m, n).
     """
+    model, C, gains = design.plant, design.C, design.gains
     n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), len(C)
-    layout = memory_layout(n, m)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", n_u), ca.SX.sym("y", m)
     p, r0 = memory[layout["prediction"]], memory[layout["innovation"]]
@@ -111,7 +109,7 @@ def build_step(model: Plant, A: FloatArray, C: FloatArray, gains: Filter) -> ca.
         }
     )
     kept = ca.vertcat(*(ca.if_else(y_finite, y[i] - output[i], 0.0) for i in range(m)))
-    moved = ca.vertcat(predict(model, A, xhat, u_used), kept, 1, u_finite, 1)
+    moved = ca.vertcat(predict(model, design.A, xhat, u_used), kept, 1, u_finite, 1)
     infinite = ca.DM.inf(n), ca.DM.inf(n_f)
     return make_step(
         {"memory": memory, "u": u, "y": y},

@@ -11,11 +11,12 @@ where (I - F C) L = 0 and H C L = I.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
+from obsynth.designs.hinf.sector import Sector
 from obsynth.symbolic.arrays import FloatArray
 
 Arithmetic = Literal["float", "enclosure", "exact"]
@@ -33,36 +34,13 @@ def lift(value: FloatArray, arithmetic: Arithmetic, radius: FloatArray | float =
 
 
 @dataclass(frozen=True, eq=False)
-class Sector:
-    """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
-
-    E (n, k): where every phi enters
-    group: group of every phi, k of them; one multiplier per group
-    R (n_groups, n)
-    """
-
-    E: FloatArray
-    group: tuple[int, ...]
-    R: FloatArray
-
-    @property
-    def groups(self) -> int:
-        """Number of multipliers."""
-        return len(self.R)
-
-    def mask(self, number: int) -> FloatArray:
-        """Return the diagonal matrix that picks the phi of one group."""
-        return np.diag([1.0 if g == number else 0.0 for g in self.group])
-
-
-@dataclass(frozen=True, eq=False)
 class Filter:
-    """The gains that run, shapes (n, m), (n, m), (n_f, m), (n_f, m)."""
+    """The gains that run."""
 
-    K: FloatArray
-    F: FloatArray
-    H: FloatArray
-    D: FloatArray
+    K: Annotated[FloatArray, "n m"]
+    F: Annotated[FloatArray, "n m"]
+    H: Annotated[FloatArray, "n_f m"]
+    D: Annotated[FloatArray, "n_f m"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import Observer
+from obsynth.designs.hinf.method import HinfUIO
 from obsynth.designs.hinf.operating_points import OperatingPoints, frozen_gain, search_points
-from obsynth.designs.hinf.record import METHOD, HinfDesign
+from obsynth.designs.hinf.record import HinfDesign
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
@@ -111,9 +112,9 @@ def worst_case(
     >>> bool(0.99 < found.gain / found.certified <= 1.0)
     True
     """
-    if observer.method != METHOD:
+    if observer.method != HinfUIO.CONTRACT.name:
         raise ObsynthError(f"worst_case is for HinfUIO; this observer is of {observer.method}")
-    design = replace(HinfDesign.from_record(observer.record), plant=observer.model)
+    design: HinfDesign = observer.certificate.design
     candidates = search_points(design, points, seed)
     if not len(candidates):
         raise ObsynthError(

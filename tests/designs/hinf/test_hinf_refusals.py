@@ -171,9 +171,9 @@ def test_a_majorant_that_is_none(consistent):
 
 def test_gains_that_are_none(consistent):
     method = ob.HinfUIO(method="polytopic")
-    with pytest.raises(ob.ObsynthError, match="K is needed"):
+    with pytest.raises(ob.ObsynthError, match="it takes K of shape"):
         method.analyse(consistent[0], {"L": np.zeros((3, 2))})
-    with pytest.raises(ob.ObsynthError, match=r"\(3, 2\) finite numbers"):
+    with pytest.raises(ob.ObsynthError, match=r"finite numbers of shape \(3, 2\)"):
         method.analyse(consistent[0], {"K": np.zeros((2, 3))})
 
 
@@ -213,3 +213,8 @@ def test_options(options):
     with pytest.raises(ob.ObsynthError) as caught:
         ob.HinfUIO(**options)
     assert caught.value.option in options
+
+
+def test_a_majorant_may_be_a_diagonal_matrix():
+    diagonal = (0.0, 0.517, 0.1089)
+    assert ob.HinfUIO(majorant=np.diag(diagonal)) == ob.HinfUIO(majorant=diagonal)

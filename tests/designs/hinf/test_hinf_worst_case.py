@@ -1,7 +1,6 @@
 """The search for the worst case: strong enough to prove something, never above what is proved."""
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,9 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.hinf.model import prepare
 from obsynth.designs.hinf.operating_points import frozen_gain, hold_points
-from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.worst_case import _half_sine, _Loop, worst_case
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "hinf_worst_case.py"
@@ -134,7 +131,8 @@ def test_a_level_that_is_claimed_too_low_is_exceeded(consistent):
     """Without the factor 2 in (45) the claim would be .4438 for a gain that does .4587."""
     import cvxpy as cp
 
-    data = prepare(consistent[0], "single", False, (0.0, 0.517, 0.1089)).design.data
+    method = ob.HinfUIO(form="printed", majorant=(0.0, 0.517, 0.1089))
+    data = method.read(consistent[0]).design.data
     A, C, W, G = data.A, data.C, data.W, data.G
     Hb, MM, eye = (data.H @ C).T @ (data.H @ C), np.diag([0.0, 0.517, 0.1089]), np.eye(3)
     zero = np.zeros((3, 3))
@@ -174,7 +172,7 @@ def test_a_search_that_leaves_the_domain_counts_for_nothing(bench):
     """At the border of X the plant leaves it, g is clipped, and the error has no bound."""
     plant = bench["random_plant"](28)
     observer = bench["METHODS"]["general"].design(plant)
-    design = replace(HinfDesign.from_record(observer.record), plant=observer.model)
+    design = observer.certificate.design
     inner = hold_points(plant, np.array([[14.0, 19.9, 19.9]]), np.zeros((1, 3)))
     limit, frequency, direction = frozen_gain(design, inner.jacobian)
     loop = _Loop(observer, design)
