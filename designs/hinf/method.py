@@ -35,7 +35,6 @@ from obsynth.designs.hinf.synthesis import (
     unstable_vertex,
 )
 from obsynth.designs.hinf.system import Filter
-from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
@@ -307,15 +306,14 @@ class HinfUIO(Method):
         )
 
 
-def _diagonal(value: Any) -> FloatArray:
+def _diagonal(value: Any) -> tuple[float, ...]:
     """Return the diagonal of M'M from a sequence or a diagonal matrix."""
     array = read_matrix("majorant", value, (1, 2))
     if array.ndim == 2:
-        diagonal = np.diag(array)
-        if not np.array_equal(array, np.diag(diagonal)):
+        if not np.array_equal(array, np.diag(np.diag(array))):
             raise ObsynthError("majorant= has to be a diagonal M'M", option="majorant")
-        return diagonal
-    return array
+        array = np.diag(array)
+    return tuple(array.tolist())
 
 
 def _read_filter(design: HinfDesign, gains: Mapping[str, ArrayLike]) -> Filter:
