@@ -1,24 +1,219 @@
-"""The matrix inequalities of the method, each written once for expressions and enclosures.
+"""The error recursion (16) at every vertex of the Jacobian set and its inequalities, once.
 
-All are returned as a matrix that has to be positive definite. v is scaled by its boxes, so
-Q_v of the paper is a diagonal of weights that sum to 1.
+``xi+ = (Abar_i - Kbar Cbar) xi + (Wbar_i - Kbar Vbar) v`` with the gain ``Kbar`` still free, in
+floats, enclosures or exact rationals. The inequalities are matrices that have to be positive
+definite; v is scaled by its boxes, so Q_v of the paper is a diagonal of weights that sum to 1.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.derive.rigour import Enclosure
-from obsynth.designs.bounded_error.error_system import (
-    Arithmetic,
-    ErrorSystem,
-    ModelData,
-    lift,
-    plain_error,
-)
-from obsynth.designs.lmi import he, symmetric_block
+from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour import Enclosure, ExactMatrix
+from obsynth.designs.lmi import block, he, symmetric_block
+from obsynth.symbolic.arrays import FloatArray
+
+ErrorKind = Literal["plain", "shifted"]
+Arithmetic = Literal["float", "enclosure", "exact"]
+ERRORS: tuple[ErrorKind, ...] = ("plain", "shifted")
+
+
+@dataclass(frozen=True, eq=False)
+class ModelData:
+    """Everything numeric that the error system is formed from.
+
+    A, B_f, C, W1, W2: shapes (n, n), (n, n_f), (m, n), (n, n_w), (m, n_w)
+    E, T, Pi: of `Decoupling`, shapes (n, m), (n, n), (m, m)
+    vertices, vertex_radius (N, n, n): every Jacobian is a convex combination of matrices within the
+        radius of the vertices
+    w_radius, rate (n_w,), (n_f,)
+    """
+
+    A: FloatArray
+    B_f: FloatArray
+    C: FloatArray
+    W1: FloatArray
+    W2: FloatArray
+    E: FloatArray
+    T: FloatArray
+    Pi: FloatArray
+    vertices: FloatArray
+    vertex_radius: FloatArray
+    w_radius: FloatArray
+    rate: FloatArray
+
+    def vertex(self, index: int) -> ModelData:
+        """Return the same data with one vertex."""
+        pick = slice(index, index + 1)
+        radius = self.vertex_radius[pick]
+        return replace(self, vertices=self.vertices[pick], vertex_radius=radius)
+
+    def without_nonlinearity(self) -> ModelData:
+        """Return the same data with the one vertex M = 0."""
+        zero = np.zeros((1, *self.A.shape))
+        return replace(self, vertices=zero, vertex_radius=zero)
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """n, n_f, m, n_w."""
+        return self.A.shape[0], self.B_f.shape[1], self.C.shape[0], self.w_radius.size
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSystem:
+    """Matrices of the error recursion, arrays or enclosures, one member per vertex.
+
+    Abar (N, p, p)
+    Cbar (m, p)
+    Wbar (N, p, n_v) or (p, n_v): columns are scaled by the boxes, so that every component of v is
+        in [-1, 1]
+    Vbar (m, n_v)
+    basis (n, p - n_f): state errors are ``basis @ xi[:p - n_f] + E W2 w_k`` (shifted) or the first
+        n entries of xi (plain)
+    blocks: 3 where v = (w_k, eps_k, w_{k+1}), 2 where v = (w_k, eps_k)
+    """
+
+    Abar: Any
+    Cbar: Any
+    Wbar: Any
+    Vbar: Any
+    basis: FloatArray
+    blocks: int
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """p, m, n_v."""
+        return self.Abar.shape[-1], self.Cbar.shape[-2], self.Vbar.shape[-1]
+
+    def closed_loop(self, gain: Any) -> tuple[Any, Any]:
+        """X = Abar - Kbar Cbar and Z = Wbar - Kbar Vbar for a given gain (p, m)."""
+        return self.Abar - gain @ self.Cbar, self.Wbar - gain @ self.Vbar
+
+
+def lift(value: FloatArray, arithmetic: Arithmetic) -> Any:
+    """Return an array of exact doubles in the arithmetic of a formula."""
+    if arithmetic == "enclosure":
+        return Enclosure.of(value)
+    return ExactMatrix.of(value) if arithmetic == "exact" else value
+
+
+def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:
+    """Return the matrices; unless they are floats, T and Pi are exactly I + E C, I + C E."""
+    n, _, m, _ = data.sizes
+    E, C = lift(data.E, arithmetic), lift(data.C, arithmetic)
+    width = lift(np.diag(data.w_radius), arithmetic)
+    T: Any
+    Pi: Any
+    M: Any
+    if arithmetic == "float":
+        T, Pi, M = data.T, data.Pi, data.vertices
+    else:
+        T, Pi = lift(np.eye(n), arithmetic) + E @ C, lift(np.eye(m), arithmetic) + C @ E
+        if arithmetic == "exact":
+            M = ExactMatrix.of(data.vertices[0])
+        else:
+            M = Enclosure.of(data.vertices, data.vertex_radius)
+    return {
+        "A": lift(data.A, arithmetic),
+        "C": C,
+        "T": T,
+        "Pi": Pi,
+        "E": E,
+        "M": M,
+        "W1s": lift(data.W1, arithmetic) @ width,
+        "W2s": lift(data.W2, arithmetic) @ width,
+    }
+
+
+def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
+    """Error system of the paper, xi = (e, e_f), v = (w_k, eps_k, w_{k+1}).
+
+    Eqs. (16)-(18) with the third block of Wbar corrected to E W2: e_{k+1}
+    contains E y_{k+1}, and y_{k+1} contains W2 w_{k+1}.
+    """
+    n, n_f, m, n_w = data.sizes
+    part = _parts(data, arithmetic)
+
+    def one(value: FloatArray) -> Any:
+        return lift(value, arithmetic)
+
+    top = part["T"] @ (part["A"] + part["M"])
+    if n_f:
+        Abar = block([[top, part["T"] @ one(data.B_f)], [0, one(np.eye(n_f))]])
+        Cbar = block([[part["C"], one(np.zeros((m, n_f)))]])
+        Wbar = block(
+            [
+                [part["T"] @ part["W1s"], one(np.zeros((n, n_f))), part["E"] @ part["W2s"]],
+                [one(np.zeros((n_f, n_w))), one(np.diag(data.rate)), one(np.zeros((n_f, n_w)))],
+            ]
+        )
+    else:
+        Abar, Cbar = top, part["C"]
+        Wbar = block([[part["T"] @ part["W1s"], part["E"] @ part["W2s"]]])
+    Vbar = block([[part["W2s"], one(np.zeros((m, n_f + n_w)))]])
+    return ErrorSystem(Abar, Cbar, Wbar, Vbar, np.eye(n), 3)
+
+
+def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
+    """Error system in zeta = T x - z, which the noise w_{k+1} does not enter.
+
+    With e = zeta + E W2 w_k,
+
+        zeta+ = (T (A + M) - K C) zeta + T B_f e_f
+                + (T (A + M) E W2 + T W1 - K Pi W2) w_k .
+
+    zeta stays in the range of the projector T, so it is written in coordinates
+    of that range.
+    """
+    n, n_f, m, _ = data.sizes
+    keep = kept_coordinates(data.T)
+    part = _parts(data, arithmetic)
+
+    def one(value: FloatArray) -> Any:
+        return lift(value, arithmetic)
+
+    basis = np.eye(n)[:, keep]
+    down = one(np.ascontiguousarray(basis.T))
+    AM = part["A"] + part["M"]
+    top = down @ (part["T"] @ AM) @ one(basis)
+    noise = down @ (part["T"] @ AM @ (part["E"] @ part["W2s"]) + part["T"] @ part["W1s"])
+    p = len(keep)
+    Cz = part["C"] @ one(basis)
+    Vw = part["Pi"] @ part["W2s"]
+    if n_f:
+        Abar = block([[top, down @ (part["T"] @ one(data.B_f))], [0, one(np.eye(n_f))]])
+        Cbar = block([[Cz, one(np.zeros((m, n_f)))]])
+        Wbar = block([[noise, one(np.zeros((p, n_f)))], [0, one(np.diag(data.rate))]])
+        Vbar = block([[Vw, one(np.zeros((m, n_f)))]])
+    else:
+        Abar, Cbar, Wbar, Vbar = top, Cz, noise, Vw
+    return ErrorSystem(Abar, Cbar, Wbar, Vbar, basis, 2)
+
+
+def kept_coordinates(T: FloatArray) -> list[int]:
+    """Return the coordinates onto which T projects, for T = diag(0 or 1)."""
+    diagonal = np.diag(T)
+    if np.any(np.diag(diagonal) != T) or np.any((diagonal != 0) & (diagonal != 1)):
+        raise StructureError(
+            'error="shifted" needs an unknown input that takes away whole state coordinates '
+            "(T = I + E C a diagonal of zeros and ones); here T mixes states, so rounding would "
+            'leave the range of T: use error="plain" or bounds="peak"',
+            T=T,
+        )
+    return [i for i, value in enumerate(diagonal) if value == 1]
+
+
+def build_error_system(
+    data: ModelData, error: ErrorKind, arithmetic: Arithmetic = "float"
+) -> ErrorSystem:
+    """Build the error system of a kind, see `plain_error` and `shifted_error`."""
+    build = plain_error if error == "plain" else shifted_error
+    return build(data, arithmetic)
 
 
 def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:

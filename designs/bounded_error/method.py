@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike
 from obsynth.designs.bounded_error.claims import (
     claims,
     covers,
+    guarantee,
     inverse_diagonal_bounds,
+    numbers,
     prove_ellipsoid,
 )
-from obsynth.designs.bounded_error.error_system import (
+from obsynth.designs.bounded_error.lmis import (
     ErrorKind,
     ErrorSystem,
     build_error_system,
     kept_coordinates,
 )
-from obsynth.designs.bounded_error.guarantee import guarantee, numbers
-from obsynth.designs.bounded_error.model import CLASS, UioModel, read, read_again
-from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read, read_again
 from obsynth.designs.bounded_error.peak.design import bound_peak, design_peak
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.step import build_step, first_memory, memory_sizes

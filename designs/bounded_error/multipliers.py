@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from obsynth.derive import JacobianBounds
-from obsynth.designs.bounded_error.error_system import ModelData
 from obsynth.designs.bounded_error.infeasibility import find_fixed_point
-from obsynth.designs.bounded_error.lmis import multiplier_block
+from obsynth.designs.bounded_error.lmis import ModelData, multiplier_block
 from obsynth.designs.bounded_error.synthesis import (
     FLOOR,
     GAP,

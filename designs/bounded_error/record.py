@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
-from obsynth.designs.bounded_error.error_system import ErrorKind, ModelData
+from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.designs.bounded_error.error_system import ErrorSystem
-from obsynth.designs.bounded_error.lmis import direct_block, fixed_gain_block
+from obsynth.designs.bounded_error.lmis import ErrorSystem, direct_block, fixed_gain_block
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Affine,

@@ -35,7 +35,8 @@ def load(path: str | os.PathLike[str]) -> Observer:
         raise CertificateError(f"{source.name} holds no design")
     record.pop(CLAIMS, None)
     contract = contract_of(record)
-    return contract.certify(contract.record.from_record(record), "lmi").observer()
+    certificate = contract.certify(contract.record.from_record(record), "lmi")
+    return certificate.stored_as(record).observer()
 
 
 def contract_of(record: Mapping[str, Any]) -> Contract[Any]:

@@ -8,7 +8,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
 import casadi as ca
@@ -20,7 +20,7 @@ from obsynth.derive.errors import DerivationError
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.observer import Observer
-from obsynth.designs.core.options import check_options, options_record
+from obsynth.designs.core.options import check_options
 from obsynth.designs.core.plant_class import PlantClass
 from obsynth.designs.core.record import plain
 from obsynth.designs.core.stepping import slices
@@ -72,7 +72,7 @@ class Contract(Generic[D]):
     step: Callable[[D], ca.Function]
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
-    step_covered: bool = field(default=False)
+    step_covered: bool = False
 
     def to_record(self, design: Any) -> dict[str, Any]:
         """Return a design as JSON-able data with the header that `load` reads."""
@@ -138,6 +138,7 @@ CONTRACTS: dict[str, Contract[Any]] = {}
 """Contracts of all methods that are defined, by name."""
 
 
+@dataclass(frozen=True, eq=False)
 class Method:
     """Options of a method, a frozen dataclass, and its way from a plant to an observer.
 
@@ -228,9 +229,8 @@ class Method:
         return self._certified(self.fix(found, gains), found)
 
     def options(self) -> Mapping[str, Any]:
-        """Return the options as JSON-able data."""
-        stored: dict[str, Any] = plain(options_record(self))
-        return stored
+        """Return the options by name, as a design stores them."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:
         self.CLASS.check(given if isinstance(given, Plant) else given.model)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -114,8 +113,3 @@ def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np
             option=name,
         )
     return array
-
-
-def options_record(method: Any) -> Mapping[str, Any]:
-    """Return all options as they are given, by name."""
-    return {field.name: getattr(method, field.name) for field in fields(method)}

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.runtime import largest_level
+from obsynth.designs.bounded_error.step import largest_level
 from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.designs.qpv.schedule import measured_schedule, vertex_weights

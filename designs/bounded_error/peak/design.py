@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.designs.bounded_error.error_system import (
+from obsynth.designs.bounded_error.lmis import (
     ErrorKind,
     build_error_system,
     kept_coordinates,
@@ -16,14 +16,8 @@ from obsynth.designs.bounded_error.model import UioModel
 from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
 from obsynth.designs.bounded_error.peak.gain import peak_gain
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
-from obsynth.designs.bounded_error.peak.transient import Transient, transient
+from obsynth.designs.bounded_error.peak.transient import transient
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
-from obsynth.designs.bounded_error.runtime import (
-    RuntimeBound,
-    StartBox,
-    noise_offset,
-    reset_box,
-)
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
@@ -36,7 +30,6 @@ if TYPE_CHECKING:
 # Of the largest feasible gamma: where the ellipsoidal design gives a good first gain.
 START_SHARE = 2.0 / 3.0
 FAULT_WEIGHT = 0.01
-STEP_UP = 1.0 + 2.0**-50
 
 
 def _system(design: UioDesign) -> PeakSystem:
@@ -119,7 +112,7 @@ def design_peak(model: UioModel, method: BoundedErrorUIO) -> UioDesign:
 
 def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
     """Prove the stored peak bounds from the stored data."""
-    bound = _peak_data(design)
+    bound = peak_data(design)
     statement = "n + G b <= b: the stored b bounds every error at every k"
     try:
         proof = prove_peak(
@@ -152,52 +145,19 @@ def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
     )
 
 
-def _peak_data(design: UioDesign) -> PeakData:
+def peak_data(design: UioDesign) -> PeakData:
+    """Return the bound of a design by peaks."""
     if not isinstance(design.bound, PeakData):
         raise TypeError("the design has no peak bound")
     return design.bound
 
 
-def _stored_bound(design: UioDesign) -> PeakBound:
+def stored_bound(design: UioDesign) -> PeakBound:
+    """Return the peak bound of a design with what it was found from."""
     return peak_bound(
         _system(design),
         design.w_radius,
         design.rate,
         rounding=design.rounding,
         dbar=_unknown_input_bound(design),
-    )
-
-
-def _first(design: UioDesign, peak: PeakBound, box: StartBox) -> FloatArray:
-    """Transient at k = 0: covers the first error, and c lambda^k from k = 1 on."""
-    bound = _peak_data(design)
-    n = design.A.shape[0]
-    size = n + design.rate.size
-    zeta = np.maximum(np.abs(box.zeta[0]), np.abs(box.zeta[1]))
-    e_f = np.maximum(np.abs(box.e_f[0]), np.abs(box.e_f[1]))
-    tail: Transient = transient(peak, np.concatenate([zeta, e_f]), decay=bound.decay)
-    now = np.concatenate([zeta + noise_offset(design), e_f]) - bound.b[:size]
-    return np.maximum(tail.c[:size], now) * STEP_UP
-
-
-def first_transient(design: UioDesign, box: StartBox) -> FloatArray:
-    """Return the first transient for a box of first errors."""
-    return _first(design, _stored_bound(design), box)
-
-
-def peak_runtime(design: UioDesign) -> RuntimeBound:
-    """Recursion t+ = lambda t of the transient, half width b + t."""
-    bound = _peak_data(design)
-    size = design.A.shape[0] + design.rate.size
-    reset = np.full(size, np.inf)
-    box = reset_box(design)
-    if box is not None:
-        reset = first_transient(design, box)
-    return RuntimeBound(
-        decay=np.full(size, bound.decay * STEP_UP),
-        offset=np.zeros(size),
-        scale=np.ones(size),
-        add=(bound.b[:size] + design.rounding) * STEP_UP,
-        root=False,
-        reset=reset,
     )

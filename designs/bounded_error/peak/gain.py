@@ -16,9 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs, peak_bound
-from obsynth.designs.bounded_error.peak.small_gain import spectral_radius
-from obsynth.designs.bounded_error.peak.sums import absolute_sums
+from obsynth.designs.bounded_error.peak.bound import (
+    PeakBound,
+    channel_inputs,
+    peak_bound,
+    spectral_radius,
+)
+from obsynth.designs.bounded_error.peak.responses import absolute_sums
 from obsynth.designs.bounded_error.peak.system import PeakSystem, projected_gains
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

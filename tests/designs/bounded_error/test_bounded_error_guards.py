@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.bounded_error.error_system import (
+from obsynth.designs.bounded_error.lmis import (
     build_error_system,
     plain_error,
     shifted_error,
 )
-from obsynth.designs.bounded_error.model import read
-from obsynth.designs.bounded_error.noise import NoiseBox
+from obsynth.designs.bounded_error.model import NoiseBox, read
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import build_step
 from obsynth.designs.bounded_error.synthesis import analyse_gain, synthesise

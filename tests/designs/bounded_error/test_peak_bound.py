@@ -13,9 +13,13 @@ from hypothesis import strategies as st
 from obsynth.derive.rigour import Enclosure
 from obsynth.designs.bounded_error.peak import bound as peak_bound_module
 from obsynth.designs.bounded_error.peak.attained import attained
-from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
+from obsynth.designs.bounded_error.peak.bound import (
+    PeakBound,
+    peak_bound,
+    prove_peak,
+    small_gain_solution,
+)
 from obsynth.designs.bounded_error.peak.responses import power_sum, response
-from obsynth.designs.bounded_error.peak.small_gain import small_gain_solution
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.designs.bounded_error.peak.transient import Transient, transient
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
