@@ -15,6 +15,7 @@ from obsynth.designs.detection.comparison import Detection, FaultEvent
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.designs.hinf.method import HinfUIO
 from obsynth.designs.hinf.worst_case import WorstCase, worst_case
+from obsynth.designs.interval.method import IntervalObserver
 
 __all__ = [
     "STATUS",
@@ -29,6 +30,7 @@ __all__ = [
     "Guarantee",
     "HinfUIO",
     "InfeasibleDesign",
+    "IntervalObserver",
     "Observer",
     "SolverTrouble",
     "WorstCase",

@@ -1,7 +1,7 @@
 """The table of methods: with one entry, tests/designs/test_contract.py holds a method to all."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,15 @@ METHODS = {
         option={"mu": 0.0},
         gains=("K", "F", "H", "D"),
         detects=False,
+    ),
+    "interval_observer": Entry(
+        ob.IntervalObserver(),
+        ob.plants.interval_example,
+        lambda: replace(ob.scenarios.interval_example(seed=1), f_range=[(-1, 1)]),
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("width", 0), 0.9, "stability"),
+        option={"precision": "half"},
+        gains=("P", "L"),
     ),
     "luenberger": Entry(
         Luenberger(),

@@ -100,21 +100,24 @@ def read_gains(
     shapes: Mapping[str, tuple[int, ...]],
     optional: tuple[str, ...] = (),
 ) -> dict[str, FloatArray]:
-    """Return given gains by name, their names, shapes and numbers checked."""
+    """Return given gains by name, names, shapes and numbers checked; a vector is one column."""
     wanted = ", ".join(
         f"{name} of shape {shape}{' (optional)' if name in optional else ''}"
         for name, shape in shapes.items()
     )
     missing = tuple(sorted(set(shapes) - set(optional) - set(gains)))
     if missing or set(gains) - set(shapes):
+        needs = f" and needs {', '.join(missing)}" if missing else ""
         raise ObsynthError(
-            f"gains has {sorted(gains)}; it takes {wanted}", option="gains", missing=missing
+            f"gains has {sorted(gains)}{needs}; it takes {wanted}", option="gains", missing=missing
         )
     found: dict[str, FloatArray] = {}
     for name, value in gains.items():
         array = _numbers(value)
         if array is not None and array.size == 0 and 0 in shapes[name]:
             array = np.zeros(shapes[name])
+        if array is not None and array.ndim == 1 and shapes[name] == (array.size, 1):
+            array = array[:, None]
         if array is None or array.shape != shapes[name] or not np.isfinite(array).all():
             given = "no array of numbers" if array is None else f"shape {array.shape}"
             raise ObsynthError(

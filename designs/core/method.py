@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds
-from obsynth.derive.errors import DerivationError
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.observer import Observer
@@ -26,6 +25,7 @@ from obsynth.designs.core.record import plain
 from obsynth.designs.core.stepping import slices
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
 
 D = TypeVar("D")
 
@@ -86,7 +86,7 @@ class Contract(Generic[D]):
             try:
                 fresh = self.read_again(design) if model is None else model
                 claims += self.covers(design, fresh)
-            except DerivationError as error:
+            except ObsynthError as error:
                 said = "what was read of the plant can be derived from the stored equations"
                 claims.append(Claim("derivation", said, False, -np.inf, str(error)))
         return Certificate(tuple(claims), design, self)

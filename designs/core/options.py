@@ -33,13 +33,16 @@ class Number:
 
 
 POSITIVE = Number(above=0.0, because="it has to be positive and finite")
+MATRIX = "matrix"
+"""In ``Annotated``: finite numbers, kept as a tuple of rows; a vector serves as one column."""
 
 
 def check_options(method: Any) -> None:
     """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
 
     Literals, bool, int, float, tuples of floats and their unions with None are checked, numbers
-    also by a `Number` in ``Annotated``; whatever else a method takes it checks by itself.
+    also by a `Number` in ``Annotated``, and what is a `MATRIX`; whatever else a method takes it
+    checks by itself.
     """
     hints = get_type_hints(type(method), include_extras=True)
     for field in fields(method):
@@ -49,13 +52,15 @@ def check_options(method: Any) -> None:
 
 def read_option(name: str, kind: Any, value: Any) -> Any:
     """Return the value of an option as its annotation describes it, or refuse it."""
-    limits = Number()
+    limits, extras = Number(), []
     if get_origin(kind) is Annotated:
         kind, *extras = get_args(kind)
         limits = next((extra for extra in extras if isinstance(extra, Number)), limits)
     allowed = list(get_args(kind)) if get_origin(kind) in (Union, UnionType) else [kind]
     if value is None and NoneType in allowed:
         return None
+    if MATRIX in extras:
+        return read_rows(name, value)
     allowed = [one for one in allowed if one is not NoneType]
     literals = [v for one in allowed if get_origin(one) is Literal for v in get_args(one)]
     if literals and len(allowed) == 1:
@@ -113,3 +118,8 @@ def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np
             option=name,
         )
     return array
+
+
+def read_rows(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix of finite numbers as a tuple of rows, which can be compared."""
+    return tuple(map(tuple, read_matrix(name, value).tolist()))

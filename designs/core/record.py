@@ -1,12 +1,13 @@
 """Stored designs: dataclasses whose annotations say the shapes, written and read by one reader.
 
 An array says its shape in its annotation, ``K: Annotated[FloatArray, "n m"]``. The letters stand
-for the numbers of the plant's signals (`sizes_of`); sums like ``n+n_f`` and numbers are allowed,
-and any other letter stands for the length that it meets first. The plant comes before them.
+for the numbers of the plant's signals (`sizes_of`); sums like ``n+n_f-1`` are allowed, and any
+other letter stands for the length that it meets first. The plant comes before them.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -53,10 +54,12 @@ class Context:
         for word, length in zip(words, actual, strict=False):
             if word.isidentifier():
                 self.sizes.setdefault(word, length)
-        return tuple(sum(self._size(part) for part in word.split("+")) for word in words)
+        return tuple(map(self._size, words))
 
     def _size(self, word: str) -> int:
-        return int(word) if word.isdigit() else self.sizes[word]
+        parts = re.findall(r"([+-]?)(\w+)", word)
+        sizes = [int(part) if part.isdigit() else self.sizes[part] for _, part in parts]
+        return sum(-s if sign == "-" else s for (sign, _), s in zip(parts, sizes, strict=True))
 
 
 class Record:

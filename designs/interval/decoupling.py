@@ -12,17 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import Exact, exact, inverse, nearest
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic import ObsynthError
 from obsynth.symbolic.arrays import FloatArray
 
-RANK = 1e-9
 ORTHOGONAL = 1e-9
 
 
@@ -33,12 +31,12 @@ class Transformation:
     H, N: orthogonal
     """
 
-    H: FloatArray
-    R0: FloatArray
-    K0: FloatArray
-    N: FloatArray
-    R1: FloatArray
-    K1: FloatArray
+    H: Annotated[FloatArray, "n n"]
+    R0: Annotated[FloatArray, "n_f+q n_f+q"]
+    K0: Annotated[FloatArray, "n_f+q n_f+q"]
+    N: Annotated[FloatArray, "m m"]
+    R1: Annotated[FloatArray, "n_f+q n_f+q"]
+    K1: Annotated[FloatArray, "n_f+q n_f+q"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,117 +57,109 @@ class Decoupled:
     C2: Exact
 
 
-def transformation(
-    model: IntervalModel, given: Mapping[str, FloatArray | None] | None = None
-) -> Transformation:
-    """Return the transformation: singular value decompositions, or what was given."""
-    given = dict(given or {})
-    F, C = nearest(model.F), nearest(model.C)
-    _check_ranks(model, F, C)
-    n, q, m = model.n, model.q, len(C)
-    left, values, right = np.linalg.svd(F, full_matrices=True)
-    H, R0, K0 = _with_given(given, ("H", "R0", "K0"), (left, np.diag(values), right.T), F, n)
-    _check("H, R0, K0", H, R0, K0, F)
-    first = C @ H[:, :q]
-    left, values, right = np.linalg.svd(first, full_matrices=True)
-    N, R1, K1 = _with_given(given, ("N", "R1", "K1"), (left, np.diag(values), right.T), first, m)
-    _check("N, R1, K1", N, R1, K1, first)
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The plant without its faults, in doubles, one matrix per vertex.
+
+    A: T2 A_i W
+    D: T2 A_i Phi
+    W1, W2: T2 W1, and W2
+    y_size: largest |y| over the declared boxes
+    W: x = W z2 and a share that the measurement gives
+    changes: T2 times what every scheduling scalar changes over its range in [A B o]
+    signals: largest |x|, |u| and 1
+    """
+
+    A: FloatArray
+    D: FloatArray
+    C2: FloatArray
+    N12: FloatArray
+    W1: FloatArray
+    W2: FloatArray
+    w_width: FloatArray
+    y_size: FloatArray
+    W: FloatArray
+    changes: FloatArray
+    signals: FloatArray
+
+    @classmethod
+    def of(cls, model: IntervalModel, free: Decoupled) -> Reduced:
+        """Round the exact matrices."""
+        a, _, _ = model.columns
+        n2, m = free.T2.shape[0], len(model.C)
+        A = [nearest(free.T2 @ v[:, a] @ free.W) for v in model.vertices]
+        D = [nearest(free.T2 @ v[:, a] @ free.Phi) for v in model.vertices]
+        box = nearest(model.box("w")).reshape(-1, 2)
+        C, W2 = nearest(model.C), nearest(model.W2)
+        x = nearest(model.size("x"))
+        size = np.abs(C) @ x + np.abs(W2) @ np.abs(box).max(axis=1, initial=0.0)
+        ranges = model.family.ranges[:, 1] - model.family.ranges[:, 0]
+        return cls(
+            np.array(A).reshape(len(A), n2, n2),
+            np.array(D).reshape(len(D), n2, m),
+            nearest(free.C2),
+            nearest(free.N12),
+            nearest(free.T2 @ model.W1),
+            W2,
+            box[:, 1] - box[:, 0],
+            size,
+            nearest(free.W),
+            nearest(free.T2) @ (ranges[:, None, None] * model.family.directions),
+            np.concatenate([x, nearest(model.size("u")), [1.0]]),
+        )
+
+
+def find_transformation(model: IntervalModel, given: Mapping[str, Any]) -> Transformation:
+    """Return singular value decompositions, or what is given (None: not given), by letters."""
+    F, C, q = nearest(model.F), nearest(model.C), model.q
+    H, R0, K0 = _factorise(given, ("H", "R0", "K0"), F, "F")
+    N, R1, K1 = _factorise(given, ("N", "R1", "K1"), C @ H[:, :q], "C H1")
     return Transformation(H, R0, K0, N, R1, K1)
 
 
-def _with_given(
-    given: Mapping[str, Any],
-    names: tuple[str, str, str],
-    found: tuple[FloatArray, FloatArray, FloatArray],
-    target: FloatArray,
-    size: int,
+def _factorise(
+    given: Mapping[str, Any], names: tuple[str, str, str], target: FloatArray, what: str
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    orthogonal, inner, outer = (given.get(name) for name in names)
-    q = target.shape[1]
+    """Return (orthogonal, inner, outer) with orthogonal [inner; 0] outer' = target."""
+    size, q = target.shape
+    orthogonal, inner, outer = (given[name] for name in names)
     if orthogonal is None:
         if inner is not None or outer is not None:
             raise ObsynthError(
                 f"{names[1]} or {names[2]} is given without {names[0]}: they belong together",
                 option=names[0],
             )
-        return found
-    orthogonal = _shaped(orthogonal, (size, size), names[0])
-    inner = orthogonal[:, :q].T @ target if inner is None else _shaped(inner, (q, q), names[1])
-    outer = np.eye(q) if outer is None else _shaped(outer, (q, q), names[2])
+        left, values, right = np.linalg.svd(target, full_matrices=True)
+        return left, np.diag(values), right.T
+    orthogonal = shaped(orthogonal, (size, size), names[0])
+    inner = orthogonal[:, :q].T @ target if inner is None else shaped(inner, (q, q), names[1])
+    outer = np.eye(q) if outer is None else shaped(outer, (q, q), names[2])
+    skew = float(np.abs(orthogonal.T @ orthogonal - np.eye(size)).max(initial=0.0))
+    if skew > ORTHOGONAL:
+        raise ObsynthError(
+            f"{names[0]} is not orthogonal: |{names[0]}'{names[0]} - I| is {skew:.3g}",
+            option=names[0],
+        )
+    miss = float(np.abs(orthogonal[:, :q] @ inner @ outer.T - target).max(initial=0.0))
+    if miss > ORTHOGONAL * max(1.0, float(np.abs(target).max(initial=0.0))):
+        raise ObsynthError(
+            f"{', '.join(names)} do not factorise {what}: the largest difference is {miss:.3g}",
+            option=names[0],
+        )
     return orthogonal, inner, outer
 
 
-def _shaped(value: Any, shape: tuple[int, int], name: str) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.shape != shape or not np.isfinite(array).all():
+def shaped(value: Any, shape: tuple[int, int], name: str, option: str | None = None) -> FloatArray:
+    """Return finite numbers as an array of a shape; an empty one is of any empty shape."""
+    array = np.array(value, dtype=float)
+    if array.size == 0 and 0 in shape:
+        array = np.zeros(shape)
+    if array.shape != shape:
         raise ObsynthError(
-            f"{name} has to be finite with shape {shape}; its shape is {array.shape}", option=name
+            f"{name} has to be finite with shape {shape}; its shape is {array.shape}",
+            option=option or name,
         )
     return array
-
-
-def _check(
-    names: str, orthogonal: FloatArray, inner: FloatArray, outer: FloatArray, target: FloatArray
-) -> None:
-    q = target.shape[1]
-    first = names.split(",")[0]
-    skew = float(np.abs(orthogonal.T @ orthogonal - np.eye(len(orthogonal))).max(initial=0.0))
-    if skew > ORTHOGONAL:
-        raise ObsynthError(
-            f"{first} is not orthogonal: |{first}'{first} - I| is {skew:.3g}", option=first
-        )
-    size = max(1.0, float(np.abs(target).max(initial=0.0)))
-    miss = float(np.abs(orthogonal[:, :q] @ inner @ outer.T - target).max(initial=0.0))
-    if miss > ORTHOGONAL * size:
-        what = "F" if first == "H" else "C H1"
-        raise ObsynthError(
-            f"{names} do not factorise {what}: the largest difference is {miss:.3g}", option=first
-        )
-
-
-def _check_ranks(model: IntervalModel, F: FloatArray, C: FloatArray) -> None:
-    q = model.q
-    names = (*model.plant.names("f"), *model.plant.names("d"))
-    rank_F, rank_CF = _rank(F), _rank(C @ F)
-    if rank_F < q:
-        raise StructureError(
-            f"rank(F) = {rank_F} for {q} faults and unknown inputs: {', '.join(names)} act on the "
-            "states in the same way and cannot be told apart; merge or remove them",
-            condition="rank(F) = q",
-            symbols=names,
-            rank_F=rank_F,
-            rank_CF=rank_CF,
-            q=q,
-        )
-    if rank_CF < q:
-        _, values, vectors = np.linalg.svd(C @ F, full_matrices=True)
-        full = np.zeros(q)
-        full[: len(values)] = values
-        lost = vectors[full <= RANK * max(1.0, float(full.max()))].T
-        symbols = tuple(s for j, s in enumerate(names) if np.abs(lost[j]).max() > 1e-6)
-        states = tuple(
-            s for i, s in enumerate(model.plant.names("x")) if np.abs(F[i] @ lost).max() > 1e-9
-        )
-        raise StructureError(
-            f"rank(C F) = {rank_CF} but there are {q} faults and unknown inputs: "
-            f"{', '.join(symbols)} acts on {', '.join(states)}, and no output "
-            f"({', '.join(model.plant.output_names)}) shows it one step later. Full rank of C and "
-            f"of F (Assumption 3) is not enough: measure {states[0]}, or treat {symbols[0]} as a "
-            "bounded disturbance",
-            condition="rank(C F) = q",
-            symbols=symbols,
-            states=states,
-            rank_F=rank_F,
-            rank_CF=rank_CF,
-            q=q,
-        )
-
-
-def _rank(matrix: FloatArray) -> int:
-    if matrix.size == 0:
-        return 0
-    size = np.linalg.norm(matrix, axis=0)
-    return int(np.linalg.matrix_rank(matrix / np.where(size > 0.0, size, 1.0), tol=RANK))
 
 
 def decouple_exactly(model: IntervalModel, chosen: Transformation) -> Decoupled:

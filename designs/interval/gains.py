@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.rigour import nearest
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.interval.decoupling import Decoupled
-from obsynth.designs.interval.model import IntervalModel, columns_of
+from obsynth.designs.interval.decoupling import Reduced
 from obsynth.designs.lmi import Problem, diagonal, full
-from obsynth.symbolic import ObsynthError
+from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
 MODE = 1e-9
@@ -21,62 +18,9 @@ MOST_SKEW = 1e7
 UNBOUNDED = 1e6
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """The plant without its faults, in doubles, one matrix per vertex.
-
-    A: T2 A_i W
-    D: T2 A_i Phi
-    W1, W2: T2 W1, and W2
-    y_size: largest |y| over the declared boxes
-    W: x = W z2 and a share that the measurement gives
-    changes: T2 times what every scheduling scalar changes over its range in [A B o]
-    signals: largest |x|, |u| and 1
-    """
-
-    A: FloatArray
-    D: FloatArray
-    C2: FloatArray
-    N12: FloatArray
-    W1: FloatArray
-    W2: FloatArray
-    w_width: FloatArray
-    y_size: FloatArray
-    W: FloatArray
-    changes: FloatArray
-    signals: FloatArray
-
-    @classmethod
-    def of(cls, model: IntervalModel, plant: Decoupled) -> Reduced:
-        """Round the exact matrices."""
-        a, _, _ = columns_of(model)
-        n2, m = plant.T2.shape[0], len(model.C)
-        A = [nearest(plant.T2 @ v[:, a] @ plant.W) for v in model.vertices]
-        D = [nearest(plant.T2 @ v[:, a] @ plant.Phi) for v in model.vertices]
-        box = nearest(model.box("w")).reshape(-1, 2)
-        C, W2 = nearest(model.C), nearest(model.W2)
-        x = nearest(model.size("x"))
-        size = np.abs(C) @ x + np.abs(W2) @ np.abs(box).max(axis=1, initial=0.0)
-        ranges = model.family.ranges[:, 1] - model.family.ranges[:, 0]
-        return cls(
-            np.array(A).reshape(len(A), n2, n2),
-            np.array(D).reshape(len(D), n2, m),
-            nearest(plant.C2),
-            nearest(plant.N12),
-            nearest(plant.T2 @ model.W1),
-            W2,
-            box[:, 1] - box[:, 0],
-            size,
-            nearest(plant.W),
-            nearest(plant.T2) @ (ranges[:, None, None] * model.family.directions),
-            np.concatenate([x, nearest(model.size("u")), [1.0]]),
-        )
-
-
-def check_detectable(model: IntervalModel, plant: Decoupled) -> None:
+def check_detectable(plant: Plant, data: Reduced) -> None:
     """Refuse a pair (A2, C2) with a mode that does not decay and is not seen, Assumption 4."""
-    data = Reduced.of(model, plant)
-    names = model.plant.names("x")
+    names = plant.names("x")
     for number, A in enumerate(data.A):
         for mode in np.linalg.eigvals(A):
             if abs(mode) < 1.0 - MODE:
@@ -87,7 +31,7 @@ def check_detectable(model: IntervalModel, plant: Decoupled) -> None:
             _, values, vectors = np.linalg.svd(pencil / size)
             if values[-1] > MODE:
                 continue
-            motion = np.abs(nearest(plant.W) @ (vectors[-1].conj() / size))
+            motion = np.abs(data.W @ (vectors[-1].conj() / size))
             moving = tuple(
                 name for name, v in zip(names, motion, strict=True) if v > 1e-6 * motion.max()
             )
@@ -95,7 +39,7 @@ def check_detectable(model: IntervalModel, plant: Decoupled) -> None:
             raise StructureError(
                 f"the pair (A2, C2) is not detectable: once the faults are removed, a motion of "
                 f"{', '.join(moving)} with the mode {text}, which does not decay, leaves the "
-                f"outputs {', '.join(model.plant.output_names)} unchanged (vertex {number + 1}). "
+                f"outputs {', '.join(plant.output_names)} unchanged (vertex {number + 1}). "
                 f"Measure {moving[0]} as well",
                 condition="detectability",
                 symbols=moving,

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
-from obsynth.derive.rigour import UNIT
-from obsynth.designs.interval.decoupling import decouple_exactly, transformation
-from obsynth.designs.interval.gains import Reduced, check_detectable, lp_problem
-from obsynth.designs.interval.model import IntervalModel, model_of
+from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import MATRIX, read_rows
+from obsynth.designs.interval.claims import claims, covers
+from obsynth.designs.interval.decoupling import find_transformation
+from obsynth.designs.interval.gains import check_detectable, lp_problem
+from obsynth.designs.interval.guarantee import guarantee, numbers
+from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
+from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
 from obsynth.designs.interval.rows import Precision
+from obsynth.designs.interval.step import build_step, first_memory, memory_sizes
 from obsynth.designs.interval.synthesis import (
+    fitting_gains,
     given_gains,
     lp_design,
-    read_gains,
     search_design,
     sylvester_design,
     with_gains,
@@ -29,18 +36,14 @@ from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
-    import casadi as ca
-
-    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
 
 
-TRANSFORMATION = ("H", "R0", "K0", "N", "R1", "K1")
-Matrix = tuple[tuple[float, ...], ...]
+Matrix = Annotated[ArrayLike | None, MATRIX]
 
 
 @dataclass(frozen=True)
-class IntervalObserver:
+class IntervalObserver(Method):
     """Interval observer for states and actuator faults of parameter-varying plants.
 
     For discrete-time plants ``x+ = A(rho) x + B(rho) u + o(rho) + F f + W1 w``, ``y = C x + W2 w``
@@ -116,48 +119,42 @@ class IntervalObserver:
     'lp'
     """
 
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="interval_observer",
+        record=IntervalDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+        fault_delay=1,
+    )
+
     gains: Any = "lp"
     centred: bool = True
     bound: Bound = "vertex"
     contraction: bool = True
     form: Literal["corrected", "printed"] = "corrected"
-    nominal: Any = None
+    nominal: Matrix = None
     precision: Precision = "double"
-    R: Any = None
-    Q: Any = None
-    H: Any = None
-    R0: Any = None
-    K0: Any = None
-    N: Any = None
-    R1: Any = None
-    K1: Any = None
-    prefer: Any = None
+    R: Matrix = None
+    Q: Matrix = None
+    H: Matrix = None
+    R0: Matrix = None
+    K0: Matrix = None
+    N: Matrix = None
+    R1: Matrix = None
+    K1: Matrix = None
+    prefer: Prefer = None
 
-    def __post_init__(self) -> None:
-        allowed: dict[str, tuple[Any, ...]] = {
-            "centred": (True, False),
-            "bound": ("vertex", "paper"),
-            "contraction": (True, False),
-            "form": ("corrected", "printed"),
-            "precision": tuple(UNIT),
-        }
-        for name, values in allowed.items():
-            given = getattr(self, name)
-            if given not in values:
-                raise ObsynthError(
-                    f"{name} is {given!r}; it has to be one of {', '.join(map(repr, values))}",
-                    option=name,
-                )
-        for name in ("nominal", "R", "Q", *TRANSFORMATION):
-            object.__setattr__(self, name, _read_matrix(name, getattr(self, name)))
-        if not isinstance(self.gains, str):
-            object.__setattr__(self, "gains", _read_pair(self.gains))
-        elif self.gains not in ("lp", "search", "sylvester"):
-            raise ObsynthError(
-                f"gains is {self.gains!r}; it has to be 'lp', 'search', 'sylvester' or a pair "
-                "(P, L)",
-                option="gains",
-            )
+    def check(self) -> None:
+        """Refuse options that do not fit each other."""
+        object.__setattr__(self, "gains", _read_pair(self.gains))
+        object.__setattr__(self, "prefer", _in_words(self.prefer))
         if self.centred and self.nominal is not None:
             raise ObsynthError(
                 "nominal is the A of centred=False; with centred=True it is the middle",
@@ -179,62 +176,30 @@ class IntervalObserver:
         if self.R is None and self.Q is not None:
             raise ObsynthError("Q is given without R: they belong together", option="Q")
 
-    def design(self, model_or_form: Plant | QuasiLPV) -> Observer:
-        """Design, prove and return the observer.
+    def read(self, given: Plant | QuasiLPV) -> IntervalModel:
+        """Read the matrices and check the ranks; a form has to be the one of `prefer`."""
+        return read(given, self.prefer)
 
-        Parameters
-        ----------
-        model_or_form : Plant or QuasiLPV
-            Discrete time; a form has to be the one that `obsynth.quasi_lpv` gives for its plant
-            and this method's `prefer`.
-
-        Returns
-        -------
-        Observer
-            With a certificate in which every claim is proved; ``fault_delay`` is 1.
-
-        Raises
-        ------
-        StructureError
-            If the model is outside the class, rank(C F) < q, or the pair (A2, C2) is not
-            detectable.
-        InfeasibleDesign
-            If the bounds diverge; ``radius``, ``alpha`` and ``largest_alpha`` are the numbers.
-        UnboundedError
-            If a matrix is unbounded over the declared ranges.
-        """
-        from obsynth.designs.interval.assembly import assemble
-
-        model, start = self._prepare(model_or_form)
-        check_detectable(model, start.plant)
+    def solve(self, model: IntervalModel) -> IntervalDesign:
+        """Find gains whose bounds stay bounded, or complete the given ones."""
+        start = self._start(model)
+        check_detectable(model.plant, start.reduced)
+        if self.gains == "sylvester":
+            design = sylvester_design(start, self.R, self.Q)
+        elif isinstance(self.gains, str):
+            design = search_design(start) if self.gains == "search" else lp_design(start)
+        else:
+            design = given_gains(start, *self.gains)
         if self.form == "printed":
-            from obsynth.designs.interval.printed import refuse_printed
+            raise refuse_printed(design)
+        return design
 
-            raise refuse_printed(self._finish(start))
-        return assemble(self._finish(start), derived=model)
-
-    def analyse(self, model_or_form: Plant | QuasiLPV, gains: Mapping[str, ArrayLike]) -> Observer:
-        """Return what given gains guarantee, proved.
-
-        Parameters
-        ----------
-        model_or_form : Plant or QuasiLPV
-        gains : mapping
-            ``P`` of shape (n - q, n - q), the identity where it is missing, and ``L`` of shape
-            (n - q, m - q).
-
-        Raises
-        ------
-        InfeasibleDesign
-            If the bounds diverge.
-        """
-        from dataclasses import replace
-
-        if "L" not in gains:
-            raise ObsynthError("gains needs L, and P unless it is the identity", option="gains")
-        L = np.asarray(gains["L"], dtype=float)
-        P = np.eye(len(L)) if "P" not in gains else gains["P"]
-        return replace(self, gains=(P, L), R=None, Q=None).design(model_or_form)
+    def fix(self, model: IntervalModel, gains: Mapping[str, ArrayLike]) -> IntervalDesign:
+        """Complete ``L`` of shape (n - q, m - q) and ``P``, by default the identity."""
+        n2, m2 = model.n - model.q, len(model.C) - model.q
+        found = read_gains(gains, {"L": (n2, m2), "P": (n2, n2)}, optional=("P",))
+        pair = found.get("P", np.eye(n2)), found["L"]
+        return replace(self, gains=pair, R=None, Q=None).solve(model)
 
     def unproved(
         self, model_or_form: Plant | QuasiLPV
@@ -257,16 +222,13 @@ class IntervalObserver:
         ObsynthError
             If no pair (P, L) is given.
         """
-        from obsynth.designs.interval.start import make_start
-        from obsynth.designs.interval.step import build_step
-
         if isinstance(self.gains, str) or self.gains[1] is None:
             raise ObsynthError(
                 "only given gains can go unproved: gains=(P, L)", option="gains", given=self.gains
             )
-        _, start = self._prepare(model_or_form)
-        design = with_gains(start, *read_gains(start, *map(np.array, self.gains)))
-        return build_step(design), make_start(design)
+        start = self._start(self._checked(model_or_form))
+        design = with_gains(start, *fitting_gains(start, *self.gains))
+        return build_step(design), partial(self.CONTRACT.start, design)
 
     def problem(self, model_or_form: Plant | QuasiLPV) -> Problem:
         """Return the linear programme of L, for the given P or the identity.
@@ -275,40 +237,25 @@ class IntervalObserver:
         --------
         obsynth.designs.lmi.Problem.to_cvxpy
         """
-        _, start = self._prepare(model_or_form)
-        data = Reduced.of(start.model, start.plant)
+        data = self._start(self._checked(model_or_form)).reduced
         P = np.eye(data.A.shape[1]) if isinstance(self.gains, str) else np.array(self.gains[0])
         return lp_problem(data, P)
 
-    def _prepare(self, model_or_form: Plant | QuasiLPV) -> tuple[IntervalModel, IntervalDesign]:
-        form = model_or_form
-        if isinstance(form, Plant):
-            if form.Ts is None:
-                raise _continuous(form)
-            form = quasi_lpv(form, prefer=_plain(self.prefer))
-        elif quasi_lpv(form.model, prefer=_plain(self.prefer)).matrix != form.matrix:
-            raise ObsynthError(
-                "the form is not the one that is derived from its plant; give the plant, and "
-                "prefer= to choose how it is written",
-                option="prefer",
-            )
-        model = model_of(form)
-        given = {name: _array(getattr(self, name)) for name in TRANSFORMATION}
-        chosen = transformation(model, given)
+    def _start(self, model: IntervalModel) -> IntervalDesign:
+        """Return the design without gains."""
         n, n2, m2 = model.n, model.n - model.q, len(model.C) - model.q
-        nominal = model.middle if self.centred else _array(self.nominal)
-        if nominal is None or nominal.shape != (n, n):
+        nominal = model.middle if self.centred else np.array(self.nominal)
+        if nominal.shape != (n, n):
             raise ObsynthError(f"nominal has to have the shape {(n, n)}", option="nominal")
-        constant = model.family.directions[:, :, n:]
-        if self.bound == "paper" and constant.any():
+        if self.bound == "paper" and model.family.directions[:, :, n:].any():
             raise ObsynthError(
                 "the input matrix or the offset varies with the scheduling variables, which the "
                 "paper's bound does not have; use bound='vertex'",
                 option="bound",
             )
-        start = IntervalDesign(
+        return IntervalDesign(
             model,
-            chosen,
+            find_transformation(model, vars(self)),
             nominal,
             np.eye(n2),
             np.zeros((n2, m2)),
@@ -317,72 +264,26 @@ class IntervalObserver:
             self.precision,
             np.zeros(0),
             np.zeros(0),
-            self._options(),
+            self.options(),
         )
-        decouple_exactly(model, chosen)
-        return model, start
-
-    def _finish(self, start: IntervalDesign) -> IntervalDesign:
-        if not isinstance(self.gains, str):
-            P, L = self.gains
-            return given_gains(start, np.array(P), None if L is None else np.array(L))
-        if self.gains == "search":
-            return search_design(start)
-        if self.gains == "sylvester":
-            return sylvester_design(start, _array(self.R), _array(self.Q))
-        return lp_design(start)
-
-    def _options(self) -> dict[str, Any]:
-        def listed(value: Any) -> Any:
-            return [listed(v) for v in value] if isinstance(value, tuple) else value
-
-        values = {field.name: listed(getattr(self, field.name)) for field in fields(self)}
-        values["prefer"] = _plain(self.prefer)
-        return values
 
 
-def _continuous(plant: Plant) -> Exception:
-    from obsynth.derive.errors import StructureError
+def _read_pair(value: Any) -> Any:
+    named = isinstance(value, str)
+    if named and value in ("lp", "search", "sylvester"):
+        return value
+    if named or not hasattr(value, "__len__") or len(value) != 2:
+        raise ObsynthError(
+            f"gains is {value!r}; it has to be 'lp', 'search', 'sylvester' or a pair (P, L)",
+            option="gains",
+        )
+    P, L = value
+    return read_rows("P", P), None if L is None else read_rows("L", L)
 
-    return StructureError(
-        f"{plant.name} is in continuous time and the interval observer works in discrete time: "
-        'call discretise("euler", Ts=...) first'
-    )
 
-
-def _plain(prefer: Any) -> Any:
-    """Return the option as JSON-able data."""
+def _in_words(prefer: Any) -> Prefer:
     if prefer is None:
         return None
     if isinstance(prefer, Mapping):
         return {str(key): str(value) for key, value in prefer.items()}
-    return [str(value) for value in prefer]
-
-
-def _array(matrix: Any) -> FloatArray | None:
-    return None if matrix is None else np.array(matrix, dtype=float)
-
-
-def _read_matrix(name: str, value: Any) -> Any:
-    if value is None:
-        return None
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ObsynthError(f"{name} is no matrix: {value!r}", option=name) from error
-    if array.ndim == 1:
-        array = array[:, None]
-    if array.ndim != 2 or not np.isfinite(array).all():
-        raise ObsynthError(f"{name} has to be a finite matrix; got {value!r}", option=name)
-    return tuple(tuple(float(v) for v in row) for row in array)
-
-
-def _read_pair(value: Any) -> tuple[Any, Any]:
-    try:
-        P, L = value
-    except (TypeError, ValueError) as error:
-        raise ObsynthError(
-            f"gains is {value!r}; it has to be 'lp', 'search', 'sylvester' or a pair (P, L)",
-            option="gains",
-        ) from error
-    return _read_matrix("P", P), _read_matrix("L", L)
+    return tuple(map(str, [prefer] if isinstance(prefer, str) else prefer))

@@ -1,45 +1,65 @@
-"""The plant as the method sees it: matrices in a polytope, exact constant blocks, boxes."""
+"""What is read of a plant: matrices in a polytope, exact constant blocks, boxes, and two ranks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from obsynth.derive.errors import StructureError
+from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.rigour import Exact, exact, from_text, to_text
-from obsynth.designs.core.record import plain, read_family, reading
-from obsynth.symbolic import Plant, Role
+from obsynth.derive.rigour import Exact, exact, nearest
+from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.record import Record
+from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from obsynth.designs.interval.record import IntervalDesign
 
 MOST_VERTICES = 1024
 LARGEST_SIGNAL = 1e6
 """Magnitude up to which rounding is accounted for where a signal has no declared range."""
+RANK = 1e-9
+CLASS = PlantClass(
+    who="the interval observer",
+    time="discrete",
+    finite={
+        "w": " has no bound, so no interval can be given; declare it with bound= or range=",
+    },
+)
+Prefer = Sequence[str] | Mapping[str, str] | None
 
 
 @dataclass(frozen=True, eq=False)
-class IntervalModel:
+class IntervalModel(Record):
     """x+ = A(rho) x + B(rho) u + o(rho) + F (f, d) + W1 w and y = C x + W2 w.
 
     plant: discrete
-    family: the stacked matrix [A B o], shape (n, n + n_u + 1), affine in independent scalars
+    family: the stacked matrix [A B o], affine in independent scalars
     F: columns of the faults, then of the unknown inputs
     scheduled: states and inputs on whose declared range the family rests
     """
 
     plant: Plant
-    family: AffineFamily
-    F: Exact
-    C: Exact
-    W1: Exact
-    W2: Exact
+    family: Annotated[AffineFamily, "n n+n_u+1"]
+    F: Annotated[Exact, "n n_f+q"]
+    C: Annotated[Exact, "m n"]
+    W1: Annotated[Exact, "n n_w"]
+    W2: Annotated[Exact, "m n_w"]
     scheduled: tuple[str, ...]
+
+    def check(self) -> None:
+        """Refuse disturbances without bounds."""
+        if not np.isfinite(self.plant.box("w")).all():
+            raise CertificateError("a disturbance of the stored design has no bound")
 
     @property
     def n(self) -> int:
@@ -51,20 +71,20 @@ class IntervalModel:
         """Number of faults and unknown inputs."""
         return int(self.F.shape[1])
 
+    @property
+    def columns(self) -> tuple[slice, slice, slice]:
+        """Where A, B and o stand in the stacked matrix."""
+        n, n_u = self.n, len(self.plant.u)
+        return slice(0, n), slice(n, n + n_u), slice(n + n_u, n + n_u + 1)
+
     @cached_property
     def vertices(self) -> tuple[Exact, ...]:
         """All different matrices [A B o] at the ends of the ranges, exact."""
         constant, directions = exact(self.family.constant), exact(self.family.directions)
-        ends = [
-            sorted({float(low), float(high)})
-            for (low, high), direction in zip(
-                self.family.ranges, self.family.directions, strict=True
-            )
-            if direction.any()
-        ]
-        moving = [d for d, f in zip(directions, self.family.directions, strict=True) if f.any()]
+        moving = [k for k, direction in enumerate(directions) if direction.any()]
+        ends = [exact(sorted(set(self.family.ranges[k].tolist()))) for k in moving]
         return tuple(
-            sum((exact([[s]]) * d for s, d in zip(point, moving, strict=True)), constant)
+            sum((directions[k] * s for k, s in zip(moving, point, strict=True)), constant)
             for point in product(*ends)
         )
 
@@ -82,39 +102,39 @@ class IntervalModel:
         sizes: Exact = np.abs(self.box(kind)).max(axis=1, initial=0)
         return sizes
 
-    def to_record(self) -> dict[str, Any]:
-        """Return the model as JSON-able data."""
-        return {
-            "plant": self.plant.to_dict(),
-            "family": plain(self.family),
-            **{name: to_text(getattr(self, name)) for name in ("F", "C", "W1", "W2")},
-            "scheduled": list(self.scheduled),
-        }
 
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> IntervalModel:
-        """Read the data of `to_record`."""
-        with reading():
-            plant = Plant.from_dict(record["plant"])
-            n, m, n_w = len(plant.x), len(plant.output), len(plant.w)
-            family = read_family(record["family"], (n, n + len(plant.u) + 1))
-            if np.any(family.ranges[:, 0] > family.ranges[:, 1]):
-                raise ValueError("a range has lower above upper")
-            return cls(
-                plant,
-                family,
-                from_text(record["F"], (n, len(plant.f) + len(plant.d))),
-                from_text(record["C"], (m, n)),
-                from_text(record["W1"], (n, n_w)),
-                from_text(record["W2"], (m, n_w)),
-                tuple(record["scheduled"]),
+def read(given: Plant | QuasiLPV, prefer: Prefer = None) -> IntervalModel:
+    """Read the matrices of the quasi-LPV form of a plant and check their ranks."""
+    form = quasi_lpv(given if isinstance(given, Plant) else given.model, prefer=prefer)
+    if isinstance(given, QuasiLPV):
+        if given.matrix != form.matrix or not given.centre.is_origin:
+            raise ObsynthError(
+                "the form is not the one that is derived from its plant; give the plant, and "
+                "prefer= to choose how it is written",
+                option="prefer",
             )
+        form = given
+    model = _matrices(form)
+    _check_ranks(model)
+    return model
 
 
-def model_of(form: QuasiLPV) -> IntervalModel:
-    """Read the matrices of a quasi-LPV form, refusing what is outside the class."""
+def read_again(design: IntervalDesign) -> IntervalModel:
+    """Read the stored equations as they were read."""
+    return read(CLASS.check(design.plant), design.options.get("prefer"))
+
+
+def _matrices(form: QuasiLPV) -> IntervalModel:
     plant = form.model
-    _check_class(form)
+    for name in ("feedthrough", "D_y", "D_f", "output_offset"):
+        for i, output in enumerate(plant.output_names):
+            if any(entry != 0 for entry in form.block(name)[i, :]):
+                raise StructureError(
+                    f"the output {output} has more than states and disturbances in it ({name}); "
+                    "this method needs y = C x + W2 w",
+                    symbol=output,
+                    row=output,
+                )
     polytope = form.vertices()
     family = polytope.family
     rows = slice(0, len(plant.x))
@@ -136,7 +156,6 @@ def model_of(form: QuasiLPV) -> IntervalModel:
             f"{', '.join(small.labels)}",
             condition="vertices",
         )
-    own = set(plant.names("x")) | set(plant.names("u"))
     used = {
         name
         for variable, moves in zip(form.scheduling, moving, strict=True)
@@ -151,65 +170,62 @@ def model_of(form: QuasiLPV) -> IntervalModel:
         blocks["C"],
         blocks["W1"],
         blocks["W2"],
-        tuple(sorted(used & own)),
+        tuple(sorted(used & {*plant.names("x"), *plant.names("u")})),
     )
-
-
-def _check_class(form: QuasiLPV) -> None:
-    plant = form.model
-    if plant.Ts is None:
-        raise StructureError(
-            f"{plant.name} is in continuous time and the interval observer works in discrete "
-            'time: call discretise("euler", Ts=...) first'
-        )
-    if not form.centre.is_origin:
-        raise StructureError(
-            "the quasi-LPV form is taken about another point than the origin; this method needs "
-            'centre="origin"'
-        )
-    sensors = [s.name for s in plant.f if s.role is Role.SENSOR_FAULT]
-    if sensors:
-        raise StructureError(
-            f"sensor fault {', '.join(sensors)}: this method estimates faults that enter the "
-            "dynamics (actuator and process faults)",
-            symbols=tuple(sensors),
-        )
-    for name in ("feedthrough", "D_y", "D_f", "output_offset"):
-        block = form.block(name)
-        for i in range(block.rows):
-            if any(entry != 0 for entry in block[i, :]):
-                output = plant.output_names[i]
-                raise StructureError(
-                    f"the output {output} has more than states and disturbances in it ({name}); "
-                    "this method needs y = C x + W2 w",
-                    symbol=output,
-                    row=output,
-                )
-    loose = [s.name for s in plant.w if not np.isfinite([s.lower, s.upper]).all()]
-    if loose:
-        raise StructureError(
-            f"disturbance {', '.join(loose)} has no bound, so no interval can be given; declare "
-            "it with bound= or range=",
-            symbols=tuple(loose),
-        )
 
 
 def _rational_block(form: QuasiLPV, name: str) -> Exact:
     form.constant(name)
     block = form.block(name)
-    for i in range(block.rows):
-        for j in range(block.cols):
-            if not block[i, j].is_Rational:
-                raise StructureError(
-                    f"{name}[{i + 1},{j + 1}] = {block[i, j]} is irrational; the exact decoupling "
-                    "needs rational numbers: give the constant as a number",
-                    entry=(i, j),
-                    condition="rational block",
-                )
+    for i, j in np.ndindex(block.shape):
+        if not block[i, j].is_Rational:
+            raise StructureError(
+                f"{name}[{i + 1},{j + 1}] = {block[i, j]} is irrational; the exact decoupling "
+                "needs rational numbers: give the constant as a number",
+                entry=(i, j),
+                condition="rational block",
+            )
     return exact(np.array(block.tolist(), dtype=object).reshape(block.shape))
 
 
-def columns_of(model: IntervalModel) -> tuple[slice, slice, slice]:
-    """Return where A, B and o stand in the stacked matrix."""
-    n, n_u = model.n, len(model.plant.u)
-    return slice(0, n), slice(n, n + n_u), slice(n + n_u, n + n_u + 1)
+def _check_ranks(model: IntervalModel) -> None:
+    """Refuse rank(C F) < q, and rank(F) < q before it."""
+    plant, q, F = model.plant, model.q, nearest(model.F)
+    CF = nearest(model.C) @ F
+    names = (*plant.names("f"), *plant.names("d"))
+    facts: dict[str, Any] = {"rank_F": _rank(F), "rank_CF": _rank(CF), "q": q}
+    if facts["rank_F"] < q:
+        raise StructureError(
+            f"rank(F) = {facts['rank_F']} for {q} faults and unknown inputs: {', '.join(names)} "
+            "act on the states in the same way and cannot be told apart; merge or remove them",
+            condition="rank(F) = q",
+            symbols=names,
+            **facts,
+        )
+    if facts["rank_CF"] < q:
+        _, values, vectors = np.linalg.svd(CF, full_matrices=True)
+        full = np.zeros(q)
+        full[: len(values)] = values
+        lost = vectors[full <= RANK * max(1.0, float(full.max()))].T
+        symbols = tuple(s for j, s in enumerate(names) if np.abs(lost[j]).max() > 1e-6)
+        states = tuple(
+            s for i, s in enumerate(plant.names("x")) if np.abs(F[i] @ lost).max() > 1e-9
+        )
+        raise StructureError(
+            f"rank(C F) = {facts['rank_CF']} but there are {q} faults and unknown inputs: "
+            f"{', '.join(symbols)} acts on {', '.join(states)}, and no output "
+            f"({', '.join(plant.output_names)}) shows it one step later. Full rank of C and "
+            f"of F (Assumption 3) is not enough: measure {states[0]}, or treat {symbols[0]} as a "
+            "bounded disturbance",
+            condition="rank(C F) = q",
+            symbols=symbols,
+            states=states,
+            **facts,
+        )
+
+
+def _rank(matrix: FloatArray) -> int:
+    if matrix.size == 0:
+        return 0
+    size = np.linalg.norm(matrix, axis=0)
+    return int(np.linalg.matrix_rank(matrix / np.where(size > 0.0, size, 1.0), tol=RANK))

@@ -1,4 +1,4 @@
-"""The paper's forms as printed: equation (32) with each of its flaws, and what refuses them."""
+"""The paper's forms as printed: Theorem 1 and equation (32), and what refuses them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,96 @@ from collections.abc import Collection
 
 import numpy as np
 
-from obsynth.derive.rigour import exact, inverse, nearest, negative, positive
+from obsynth.derive.rigour import exact, image, inverse, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.interval.model import columns_of
-from obsynth.designs.interval.record import IntervalDesign
+from obsynth.designs.interval.record import NEGATIVE, IntervalDesign
 from obsynth.designs.interval.rows import Part
 from obsynth.symbolic import ObsynthError
 from obsynth.symbolic.arrays import FloatArray
 
 FLAWS = ("y", "theta", "product")
 """Of (32): y_{k+1} in place of y_k; the upper theta_1 in the lower bound; K0 R0^-1 times bounds."""
+
+
+def lipschitz_alpha(sigma_lower: FloatArray, sigma_upper: FloatArray) -> float:
+    """Return alpha = 2 max{a1 + b1, a2 + b2} of Theorem 1, with the constants of (14)."""
+    up = float(np.linalg.norm(positive(sigma_upper), 2))
+    down = float(np.linalg.norm(negative(sigma_lower), 2))
+    return 2.0 * (up + down)
+
+
+def largest_alpha(R: FloatArray) -> float:
+    """Return the largest alpha of (20): 1 / ||(z I - R)^-1||_inf, 0 if unstable."""
+    if np.abs(np.linalg.eigvals(R)).max(initial=0.0) >= 1.0:
+        return 0.0
+    eye = np.eye(len(R))
+
+    def smallest(angles: FloatArray) -> FloatArray:
+        pencils = np.exp(1j * angles)[:, None, None] * eye - R
+        values: FloatArray = np.linalg.svd(pencils, compute_uv=False)[:, -1]
+        return values
+
+    angles = np.linspace(0.0, np.pi, 721)
+    step = angles[1]
+    for _ in range(6):
+        best = angles[int(np.argmin(smallest(angles)))]
+        angles = np.clip(best + np.linspace(-step, step, 41), 0.0, np.pi)
+        step /= 20.0
+    return float(smallest(angles).min())
+
+
+def divergence(design: IntervalDesign, headline: str = "the bounds diverge") -> InfeasibleDesign:
+    """Return the refusal for gains whose bounds are not bounded, with the numbers of Theorem 1."""
+    radius = design.spectral_radius
+    parts = design.prediction.split(exact(design.nominal))
+    R = nearest(parts.R)
+    least = float(R.min(initial=0.0))
+    alpha = lipschitz_alpha(nearest(parts.sigma_lower), nearest(parts.sigma_upper))
+    limit = largest_alpha(R)
+    details = [
+        f"the errors of one step grow by the factor {radius:.6g} (spectral radius; below 1 needed)",
+        f"the condition of Theorem 1 {'is' if alpha < limit else 'is not'} met: alpha = "
+        f"{alpha:.6g}, (20) is feasible for alpha below {limit:.6g}",
+        'use gains="lp" with centred=True, narrower ranges of the scheduling variables, or measure '
+        "more states",
+    ]
+    if design.bound == "paper" and least < -NEGATIVE:
+        details.insert(
+            0,
+            f"R = P (A2 - L C2) P^-1 has an entry {least:.4g} below zero, which Theorem 1 does "
+            'not allow; bound="vertex" needs no sign',
+        )
+        headline = "R is not nonnegative" if radius < 1.0 else headline
+    return InfeasibleDesign(
+        f"{headline}: spectral radius {radius:.6g}",
+        details,
+        radius=radius,
+        alpha=alpha,
+        largest_alpha=limit,
+        least_entry=least,
+    )
+
+
+def refuse_printed(design: IntervalDesign) -> InfeasibleDesign:
+    """Return the refusal of (32) as printed, for gains whose bounds are stable.
+
+    Gains whose bounds diverge are refused before, with the numbers of Theorem 1.
+    """
+    chosen = design.transformation
+    least = float(nearest(exact(chosen.K0) @ inverse(exact(chosen.R0))).min(initial=0.0))
+    details = [
+        "Gamma_f takes y_{k+1} where (31) has y_k: the bounds belong to no instant",
+        "the lower bound adds the upper theta_1",
+        "f_k needs y_{k+1} and z_{2,k+1}: what (32) returns at k is f_{k-1}",
+    ]
+    if least < 0.0:
+        details.append(
+            f"K0 R0^-1 has an entry {least:.4g} below zero and exchanges lower and upper bounds"
+        )
+    details.append('form="corrected" repairs all of them')
+    return InfeasibleDesign(
+        "(32) as printed does not enclose the fault", details, least_entry=least
+    )
 
 
 def printed_faults(
@@ -30,16 +110,15 @@ def printed_faults(
     unknown = set(flaws) - set(FLAWS)
     if unknown:
         raise ObsynthError(f"flaws {sorted(unknown)} are not among {FLAWS}", option="flaws")
-    model, plant, q = design.model, design.plant, design.model.q
-    K = exact(design.chosen.K0) @ inverse(exact(design.chosen.R0))
-    rows = inverse(K) @ plant.F_left
-    zero = np.full((q, len(plant.N12)), exact(0.0).item(), dtype=object)
-    part = Part(model, plant, design.S, -rows, zero)
+    model, free, chosen = design.model, design.decoupled, design.transformation
+    K = exact(chosen.K0) @ inverse(exact(chosen.R0))
+    rows = inverse(K) @ free.F_left
+    part = Part(model, free, design.S, -rows, exact(np.zeros((model.q, len(free.N12)))))
     parts = part.split(exact(design.nominal))
-    _, b, o = columns_of(model)
+    _, b, o = model.columns
     constant = model.vertices[0]
-    v_lower, v_upper = _box(nearest(model.W2), nearest(model.box("w")))
-    Phi, W = nearest(rows @ plant.Phi), nearest(rows @ plant.W @ design.S)
+    Phi, W = nearest(rows @ free.Phi), nearest(rows @ free.W @ design.S)
+    theta = image(-Phi, *image(nearest(model.W2), *nearest(model.box("w")).T))
     R, B = nearest(parts.R), nearest(part.X @ constant[:, b])
     sigma_lower, sigma_upper = nearest(parts.sigma_lower), nearest(parts.sigma_upper)
     M_lower, M_upper = nearest(parts.M_lower), nearest(parts.M_upper)
@@ -56,25 +135,13 @@ def printed_faults(
     lower += low @ positive(R).T - high @ negative(R).T
     upper += _product(sigma_lower, sigma_upper, low, high)
     lower -= _product(-sigma_upper, -sigma_lower, low, high)
-    theta_lower, theta_upper = _ends(-Phi, v_lower, v_upper)
-    upper += theta_upper
-    lower += theta_upper if "theta" in flaws else theta_lower
-    upper += nearest(parts.noise[1])
-    lower += nearest(parts.noise[0])
+    upper += theta[1] + nearest(parts.noise[1])
+    lower += theta[1 if "theta" in flaws else 0] + nearest(parts.noise[0])
     gain = nearest(K)
     if "product" in flaws:
         return lower @ gain.T, upper @ gain.T
     plus, minus = positive(gain), negative(gain)
     return lower @ plus.T - upper @ minus.T, upper @ plus.T - lower @ minus.T
-
-
-def _box(matrix: FloatArray, box: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return _ends(matrix, box[:, 0], box[:, 1])
-
-
-def _ends(matrix: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    plus, minus = positive(matrix), negative(matrix)
-    return plus @ low - minus @ high, plus @ high - minus @ low
 
 
 def _product(
@@ -88,24 +155,3 @@ def _product(
         + negative(r_lower) @ negative(lower).T
     )
     return value
-
-
-def refuse_printed(design: IntervalDesign) -> InfeasibleDesign:
-    """Return the refusal of (32) as printed, for gains whose bounds are stable.
-
-    Gains whose bounds diverge are refused before, with the numbers of Theorem 1.
-    """
-    K = nearest(exact(design.chosen.K0) @ inverse(exact(design.chosen.R0)))
-    details = [
-        "Gamma_f takes y_{k+1} where (31) has y_k: the bounds belong to no instant",
-        "the lower bound adds the upper theta_1",
-        "f_k needs y_{k+1} and z_{2,k+1}: what (32) returns at k is f_{k-1}",
-    ]
-    if K.min(initial=0.0) < 0.0:
-        details.append(
-            f"K0 R0^-1 has an entry {K.min():.4g} below zero and exchanges lower and upper bounds"
-        )
-    details.append('form="corrected" repairs all of them')
-    return InfeasibleDesign(
-        "(32) as printed does not enclose the fault", details, least_entry=float(K.min(initial=0.0))
-    )

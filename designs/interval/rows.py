@@ -15,8 +15,9 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.derive.rigour import UNIT, Exact, above, exact, image, magnitude, negative, positive
+from obsynth.designs.core.stepping import slices
 from obsynth.designs.interval.decoupling import Decoupled
-from obsynth.designs.interval.model import IntervalModel, columns_of
+from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic.arrays import FloatArray
 
 Precision = Literal["double", "single"]
@@ -42,6 +43,11 @@ class Rows:
         """Number of rows."""
         return int(self.radius.shape[0])
 
+    @property
+    def places(self) -> dict[str, slice]:
+        """Where the parts of s stand."""
+        return slices(self.sizes)
+
     def slack(self, precision: Precision) -> FloatArray:
         """Coefficients of |s| by which a bound is widened at run time, shape (rows, len(s)).
 
@@ -56,18 +62,15 @@ class Rows:
         terms = (every != 0).sum(axis=2).max(axis=0)
         counts = exact(np.asarray(terms + 6, dtype=float))[:, None]
         table = above(largest * counts * exact(unit) + self.radius)
-        start = list(self.sizes).index("one")
-        place = sum(list(self.sizes.values())[:start])
-        table[:, place] += SMALLEST[precision]
+        table[:, self.places["one"]] += SMALLEST[precision]
         return table * (1.0 + 2.0**-50)
 
 
 def _stack(sizes: Mapping[str, int], count: int, parts: Mapping[str, Any]) -> Exact:
     """Put named blocks side by side; a missing block is zero."""
-    zero = exact(0.0).item()
     blocks = []
     for name, size in sizes.items():
-        block = np.full((count, size), zero, dtype=object)
+        block = exact(np.zeros((count, size)))
         if name in parts:
             block[:] = np.asarray(parts[name], dtype=object).reshape(count, size)
         blocks.append(block)
@@ -85,19 +88,19 @@ class Part:
     """
 
     model: IntervalModel
-    plant: Decoupled
+    decoupled: Decoupled
     S: Exact
     X: Exact
     Y: Exact
 
     def on_r(self, A: Exact) -> Exact:
         """Return the coefficients of r for a matrix A."""
-        value: Exact = (self.X @ A @ self.plant.W - self.Y @ self.plant.C2) @ self.S
+        value: Exact = (self.X @ A @ self.decoupled.W - self.Y @ self.decoupled.C2) @ self.S
         return value
 
     def on_y(self, A: Exact) -> Exact:
         """Return the coefficients of y for a matrix A."""
-        value: Exact = self.X @ A @ self.plant.Phi + self.Y @ self.plant.N12
+        value: Exact = self.X @ A @ self.decoupled.Phi + self.Y @ self.decoupled.N12
         return value
 
     def on_w(self, A: Exact) -> Exact:
@@ -108,11 +111,11 @@ class Part:
     @property
     def radius(self) -> tuple[Exact, Exact, Exact, Exact]:
         """What rounding in the family may add to the coefficients of r, y, u and 1."""
-        a, b, o = columns_of(self.model)
+        a, b, o = self.model.columns
         rho = exact(self.model.family.radius)
         X = magnitude(self.X)
-        r = X @ rho[:, a] @ magnitude(self.plant.W @ self.S)
-        y = X @ rho[:, a] @ magnitude(self.plant.Phi)
+        r = X @ rho[:, a] @ magnitude(self.decoupled.W @ self.S)
+        y = X @ rho[:, a] @ magnitude(self.decoupled.Phi)
         noise = y @ magnitude(self.model.W2) @ self.model.size("w")
         return r, y, X @ rho[:, b], X @ rho[:, o] + noise[:, None]
 
@@ -128,7 +131,7 @@ class Part:
 
     def vertex_rows(self) -> Rows:
         """Bound at the vertices of the polytope: one vertex for y, w and r together."""
-        a, b, o = columns_of(self.model)
+        a, b, o = self.model.columns
         low, high = self.model.box("w").T
         sizes = _sizes(self, ("r_upper", "r_lower", "y", "u", "one"))
         count = len(self.X)
@@ -155,7 +158,7 @@ class Part:
 
         The input matrix and the offset have to be constant.
         """
-        _, b, o = columns_of(self.model)
+        _, b, o = self.model.columns
         names = ("r_upper+", "r_upper-", "r_lower+", "r_lower-", "r_upper", "r_lower")
         sizes = _sizes(self, (*names, "y+", "y-", "u", "one"))
         count, parts = len(self.X), self.split(nominal)
@@ -213,11 +216,11 @@ class Remainder:
     @classmethod
     def of(cls, part: Part, nominal: Exact) -> Remainder:
         """Bound every coefficient apart over the elementwise box of A - nominal."""
-        a, _, _ = columns_of(part.model)
+        a, _, _ = part.model.columns
         around = np.stack([vertex[:, a] - nominal for vertex in part.model.vertices])
         low, high = around.min(axis=0), around.max(axis=0)
-        sigma = _image(part.X, low, high, part.plant.W @ part.S)
-        change = _image(part.X, low, high, part.plant.Phi)
+        sigma = _image(part.X, low, high, part.decoupled.W @ part.S)
+        change = _image(part.X, low, high, part.decoupled.Phi)
         M = part.on_y(nominal)
         M_lower, M_upper = M + change[0], M + change[1]
         w_low, w_high = part.model.box("w").T
@@ -235,14 +238,12 @@ class Remainder:
 def _image(left: Exact, low: Exact, high: Exact, right: Exact) -> tuple[Exact, Exact]:
     """Return elementwise bounds of left D right over low <= D <= high, every entry bounded once."""
     rows, columns = left.shape[0], right.shape[1]
-    lower = np.full((rows, columns), exact(0.0).item(), dtype=object)
-    upper = lower.copy()
-    for i in range(rows):
-        for j in range(columns):
-            weights = np.outer(left[i], right[:, j])
-            plus, minus = positive(weights), negative(weights)
-            lower[i, j] = lower[i, j] + (plus * low - minus * high).sum()
-            upper[i, j] = upper[i, j] + (plus * high - minus * low).sum()
+    lower, upper = exact(np.zeros((2, rows, columns)))
+    for i, j in np.ndindex(rows, columns):
+        weights = np.outer(left[i], right[:, j])
+        plus, minus = positive(weights), negative(weights)
+        lower[i, j] = lower[i, j] + (plus * low - minus * high).sum()
+        upper[i, j] = upper[i, j] + (plus * high - minus * low).sum()
     return lower, upper
 
 
@@ -272,16 +273,16 @@ def _linear(
 def state_rows(part: Part) -> Rows:
     """Bounds of x from r and y of the same instant, (26)."""
     low, high = part.model.box("w").T
-    noise = image(-part.plant.Phi @ part.model.W2, low, high)
+    noise = image(-part.decoupled.Phi @ part.model.W2, low, high)
     sizes = _sizes(part, ("r_upper", "r_lower", "y", "one"))
-    return _linear(sizes, part.plant.W @ part.S, part.plant.Phi, noise, {})
+    return _linear(sizes, part.decoupled.W @ part.S, part.decoupled.Phi, noise, {})
 
 
 def estimate_rows(part: Part, faults: int) -> Rows:
     """Bounds of the first faults from their earlier share and r and y of the next instant, (32)."""
-    left = part.plant.F_left[:faults]
+    left = part.decoupled.F_left[:faults]
     low, high = part.model.box("w").T
-    noise = image(-left @ part.plant.Phi @ part.model.W2, low, high)
+    noise = image(-left @ part.decoupled.Phi @ part.model.W2, low, high)
     sizes = {
         "share_upper": faults,
         "share_lower": faults,
@@ -289,13 +290,13 @@ def estimate_rows(part: Part, faults: int) -> Rows:
     }
     same = exact(np.eye(faults))
     more = {"share_upper": same, "share_lower": same}
-    return _linear(sizes, left @ part.plant.W @ part.S, left @ part.plant.Phi, noise, more)
+    return _linear(sizes, left @ part.decoupled.W @ part.S, left @ part.decoupled.Phi, noise, more)
 
 
 def measured_rows(part: Part, output: int, component: int) -> Rows:
     """Bounds of one component of r from one row of N12 y = C2 S r + N12 W2 w."""
-    Q = part.plant.C2 @ part.S
-    row = part.plant.N12[output : output + 1] / Q[output, component]
+    Q = part.decoupled.C2 @ part.S
+    row = part.decoupled.N12[output : output + 1] / Q[output, component]
     others = -Q[output : output + 1] / Q[output, component]
     others[0, component] = exact(0.0).item()
     low, high = part.model.box("w").T

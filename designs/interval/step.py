@@ -8,14 +8,17 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import Exact, exact, image, nearest
+from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import (
     all_finite,
     finite_or,
     inside,
     make_step,
     select,
+    slices,
     status_word,
 )
 from obsynth.designs.interval.record import SWEEPS, IntervalDesign
@@ -23,7 +26,7 @@ from obsynth.designs.interval.rows import Rows
 from obsynth.symbolic.arrays import FloatArray
 
 
-def memory_layout(n: int, n2: int, n_f: int) -> dict[str, slice]:
+def memory_sizes(design: IntervalDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
     ``r_lower`` and ``r_upper`` (bounds of r = P z2 at the instant of the next call),
@@ -31,7 +34,8 @@ def memory_layout(n: int, n2: int, n_f: int) -> dict[str, slice]:
     ``prediction`` (of the state, shown when a measurement is missing), ``known`` (whether the
     share is) and ``initialised`` (0 or 1).
     """
-    sizes = {
+    n, n2, n_f = design.model.n, len(design.P), design.n_f
+    return {
         "r_lower": n2,
         "r_upper": n2,
         "share_lower": n_f,
@@ -40,12 +44,12 @@ def memory_layout(n: int, n2: int, n_f: int) -> dict[str, slice]:
         "known": 1,
         "initialised": 1,
     }
-    layout: dict[str, slice] = {}
-    at = 0
-    for name, size in sizes.items():
-        layout[name] = slice(at, at + size)
-        at += size
-    return layout
+
+
+def first_memory(design: IntervalDesign, start: Start) -> dict[str, ArrayLike]:
+    """Start from a box of states; neither the first fault nor y0 are needed."""
+    lower, upper = first_box(design, start.x)
+    return {"r_lower": lower, "r_upper": upper, "prediction": start.guess}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +116,7 @@ def _known(r_lower: ca.SX, r_upper: ca.SX, y: ca.SX, u: ca.SX) -> dict[str, ca.S
 def first_box(design: IntervalDesign, x_range: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return bounds of r for a box of states, rounded outwards in the precision of the step."""
     low, high = exact(np.asarray(x_range, dtype=float)).T
-    lower, upper = image(exact(design.P) @ design.plant.T2, low, high)
+    lower, upper = image(exact(design.P) @ design.decoupled.T2, low, high)
     kind = np.float64 if design.precision == "double" else np.float32
     return -_up(-lower, kind), _up(upper, kind)
 
@@ -143,15 +147,14 @@ def _contract(
 
 def build_step(design: IntervalDesign) -> ca.Function:
     """Build `Observer.step`: contraction, sets of x_k and f_{k-1}, prediction."""
-    model, plant = design.model, design.model.plant
-    n, n2, n_f, m = model.n, len(design.P), design.n_f, len(model.C)
-    layout = memory_layout(n, n2, n_f)
+    plant, C = design.plant, nearest(design.model.C)
+    n2, n_f, m = len(design.P), design.n_f, len(C)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", m)
     part = {name: memory[place] for name, place in layout.items()}
     initialised, known = part["initialised"] > 0.5, part["known"] > 0.5
     y_finite, u_finite = all_finite(y), all_finite(u)
-    C = nearest(model.C)
     y_used = finite_or(y, ca.DM(C) @ part["prediction"])
     u_used = finite_or(
         u, [0.0 if s.nominal is None else float(s.nominal) for s in plant.u] or ca.DM(0, 1)
@@ -227,7 +230,7 @@ def _or_infinite(condition: ca.SX, lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, c
 
 def _in_domain(design: IntervalDesign, x_lower: ca.SX, x_upper: ca.SX, u: ca.SX) -> ca.SX:
     """Whether the states and inputs on which the matrices depend are inside their ranges."""
-    plant, result = design.model.plant, ca.SX(1)
+    plant, result = design.plant, ca.SX(1)
     for kind, lower, upper in (("x", x_lower, x_upper), ("u", u, u)):
         for i, name in enumerate(plant.names(kind)):
             if name in design.model.scheduled:
@@ -239,7 +242,7 @@ def _in_domain(design: IntervalDesign, x_lower: ca.SX, x_upper: ca.SX, u: ca.SX)
 def _predict(design: IntervalDesign, xhat: ca.SX, u: ca.SX, fhat: ca.SX) -> ca.SX:
     """Next state at the middle of all ranges; an estimate only, no bound rests on it."""
     middle, n = design.model.family.midpoint, design.model.n
-    n_u = len(design.model.plant.u)
+    n_u = len(design.plant.u)
     value = ca.DM(middle[:, :n]) @ xhat + ca.DM(middle[:, n + n_u])
     if n_u:
         value = value + ca.DM(middle[:, n : n + n_u]) @ u

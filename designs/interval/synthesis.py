@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import exact, nearest
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.interval.decoupling import Reduced, shaped
 from obsynth.designs.interval.gains import (
-    Reduced,
     lp_gain,
     placed_gains,
     predicted_size,
     refined,
     sylvester_gain,
 )
+from obsynth.designs.interval.printed import divergence
 from obsynth.designs.interval.record import IntervalDesign
-from obsynth.designs.interval.theorem import NEGATIVE, divergence
 from obsynth.designs.interval.widths import steady, steady_holds
 from obsynth.symbolic import ObsynthError
 from obsynth.symbolic.arrays import FloatArray
@@ -32,38 +33,30 @@ def with_gains(design: IntervalDesign, P: FloatArray, L: FloatArray) -> Interval
 
 def complete(design: IntervalDesign) -> IntervalDesign | None:
     """Find the steady widths; None if the bounds diverge or the paper's R is not nonnegative."""
-    if design.bound == "paper":
-        R = nearest(design.prediction.on_r(exact(design.nominal)))
-        if R.min(initial=0.0) < -NEGATIVE:
-            return None
+    if design.bound == "paper" and not design.nonnegative:
+        return None
     found = steady(design.width_map)
     if found is None or not steady_holds(design.width_map, *found)[0]:
         return None
     return replace(design, error=found[0], width=found[1])
 
 
-def read_gains(
-    design: IntervalDesign, P: FloatArray, L: FloatArray
+def fitting_gains(
+    design: IntervalDesign, P: ArrayLike, L: ArrayLike | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Check given gains."""
-    m2, n2 = design.plant.C2.shape
-    P, L = np.asarray(P, dtype=float), np.asarray(L, dtype=float)
-    if P.shape != (n2, n2) or not np.isfinite(P).all() or np.linalg.matrix_rank(P) < n2:
+    """Check given gains; for L = None the linear programme chooses it."""
+    m2, n2 = design.decoupled.C2.shape
+    P = shaped(P, (n2, n2), "P", option="gains")
+    if n2 and np.linalg.matrix_rank(P) < n2:
         raise ObsynthError(f"P has to be regular with shape {(n2, n2)}", option="gains")
-    if L.size == 0:
-        L = L.reshape(n2, m2) if n2 * m2 == 0 else L
-    if L.shape != (n2, m2) or not np.isfinite(L).all():
-        raise ObsynthError(f"L has to be finite with shape {(n2, m2)}", option="gains")
-    return P, L
-
-
-def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> IntervalDesign:
-    """Complete a design with given P and L; for L = None the linear programme chooses it."""
     if L is None:
-        zero = np.zeros((design.plant.C2.shape[1], design.plant.C2.shape[0]))
-        P, _ = read_gains(design, P, zero)
-        L = lp_gain(Reduced.of(design.model, design.plant), P)
-    chosen = with_gains(design, *read_gains(design, P, L))
+        return P, lp_gain(design.reduced, P)
+    return P, shaped(L, (n2, m2), "L", option="gains")
+
+
+def given_gains(design: IntervalDesign, P: ArrayLike, L: ArrayLike | None) -> IntervalDesign:
+    """Complete a design with given P and L."""
+    chosen = with_gains(design, *fitting_gains(design, P, L))
     done = complete(chosen)
     if done is None:
         raise divergence(chosen)
@@ -72,7 +65,7 @@ def given_gains(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> 
 
 def lp_design(design: IntervalDesign) -> IntervalDesign:
     """Gains by the linear programme for P = I; where that has no solution, by `search_design`."""
-    data = Reduced.of(design.model, design.plant)
+    data = design.reduced
     identity = np.eye(data.A.shape[1])
     first = _try(design, identity, _programme(data, identity))
     return search_design(design) if first is None else first
@@ -84,7 +77,7 @@ def search_design(design: IntervalDesign) -> IntervalDesign:
     Starts at the linear programme's gain for P = I and at gains that place real poles; what has
     the smallest steady widths is taken.
     """
-    data = Reduced.of(design.model, design.plant)
+    data = design.reduced
     identity = np.eye(data.A.shape[1])
     starts = list(placed_gains(data))
     programme = _programme(data, identity)
@@ -113,15 +106,15 @@ def _try(design: IntervalDesign, P: FloatArray, L: FloatArray | None) -> Interva
 
 
 def sylvester_design(
-    design: IntervalDesign, R: FloatArray | None, Q: FloatArray | None
+    design: IntervalDesign, R: ArrayLike | None, Q: ArrayLike | None
 ) -> IntervalDesign:
     """Gains by P A2 - R P = Q C2, R nonnegative: given, or the best of several diagonal ones."""
-    data = Reduced.of(design.model, design.plant)
-    A2 = nearest(design.plant.T2 @ exact(design.nominal) @ design.plant.W)
+    data = design.reduced
+    A2 = nearest(design.decoupled.T2 @ exact(design.nominal) @ design.decoupled.W)
     n2, m2 = len(A2), len(data.C2)
     if R is not None:
-        P, L = sylvester_gain(A2, data.C2, R, np.ones((n2, m2)) if Q is None else Q)
-        return given_gains(design, P, L)
+        Q = np.ones((n2, m2)) if Q is None else np.array(Q)
+        return given_gains(design, *sylvester_gain(A2, data.C2, np.array(R), Q))
     done, last = [], None
     for start in (0.0, 0.1, 0.2, 0.3, 0.5):
         poles = start + 0.1 * np.arange(n2) / max(n2 - 1, 1)

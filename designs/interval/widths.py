@@ -9,7 +9,7 @@ in exact arithmetic; it proves stability and the steady widths at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,6 @@ from obsynth.derive.rigour import (
     negative,
     positive,
 )
-from obsynth.designs.interval.model import columns_of
 from obsynth.designs.interval.rows import Part, Rows
 from obsynth.symbolic.arrays import FloatArray
 
@@ -109,7 +108,7 @@ def _sizes_of_signals(part: Part) -> tuple[Exact, Exact, Exact]:
     """Largest |r|, |y| and |u| over the declared boxes."""
     model = part.model
     x, w = model.size("x"), model.size("w")
-    r = magnitude(inverse(part.S) @ part.plant.T2) @ x
+    r = magnitude(inverse(part.S) @ part.decoupled.T2) @ x
     return r, magnitude(model.C) @ x + magnitude(model.W2) @ w, model.size("u")
 
 
@@ -118,10 +117,8 @@ def _widening(rows: Rows, slack: FloatArray, r: Exact, y: Exact, u: Exact) -> tu
     table = exact(2.0 * slack)
     of_e = np.zeros((rows.count, len(r)), dtype=object)
     constant = np.zeros(rows.count, dtype=object)
-    at = 0
-    for name, size in rows.sizes.items():
-        block = table[:, at : at + size]
-        at += size
+    for name, place in rows.places.items():
+        block = table[:, place]
         if name.startswith("r_"):
             of_e = of_e + block
             constant = constant + block @ r
@@ -136,7 +133,7 @@ def _widening(rows: Rows, slack: FloatArray, r: Exact, y: Exact, u: Exact) -> tu
 
 def _vertex_width(part: Part, widening: tuple[Exact, Exact]) -> PartWidth:
     model = part.model
-    a, _, _ = columns_of(model)
+    a, _, _ = model.columns
     M = np.stack([part.on_r(v[:, a]) for v in model.vertices])
     G = np.stack([part.on_w(v[:, a]) for v in model.vertices])
     low, high = model.box("w").T
@@ -197,10 +194,9 @@ def contraction_width(rows: Rows, slack: FloatArray, part: Part, component: int)
     """Return what one row of the contraction does to errors and widths."""
     size_r, size_y, size_u = _sizes_of_signals(part)
     of_e, constant = _widening(rows, slack, size_r, size_y, size_u)
-    start = list(rows.sizes).index("r_upper") * part.S.shape[0]
-    n2 = part.S.shape[0]
-    others = rows.upper[0][0, start : start + n2] - rows.upper[0][0, start + n2 : start + 2 * n2]
-    noise = rows.upper[0][0, -1] - rows.lower[0][0, -1]
+    places, upper = rows.places, rows.upper[0][0]
+    others = upper[places["r_upper"]] - upper[places["r_lower"]]
+    noise = upper[-1] - rows.lower[0][0, -1]
     return Contraction(component, others + of_e[0], noise + constant[0])
 
 
@@ -270,6 +266,21 @@ def steady_holds(step: WidthMap, e: FloatArray, w: FloatArray) -> tuple[bool, fl
         if any(gap < DELTA for gap in left):
             return False, room
     return True, room
+
+
+def linear_widths(
+    rows: Rows, slack: FloatArray, part: Part, w: FloatArray, more: Mapping[str, Exact]
+) -> FloatArray:
+    """Widths of bounds that are linear in r and y; `more`: sizes of what else they take."""
+    places, high = rows.places, rows.upper[0]
+    r, y, _ = _sizes_of_signals(part)
+    r = r + exact(w)
+    known = {"r_upper": r, "r_lower": r, "y": y, "one": exact(np.ones(1)), **more}
+    of_r = magnitude(high[:, places["r_upper"]]) + magnitude(high[:, places["r_lower"]])
+    total = of_r @ exact(w) + high[:, -1] - rows.lower[0][:, -1]
+    for name, size in known.items():
+        total = total + exact(2.0 * slack[:, places[name]]) @ size
+    return above(total)
 
 
 def row_widths(part: PartWidth, e: FloatArray, w: FloatArray) -> FloatArray:

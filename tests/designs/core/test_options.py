@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from obsynth.designs.core.options import POSITIVE, Number, check_options
+from obsynth.designs.core.options import MATRIX, POSITIVE, Number, check_options
 from obsynth.symbolic import ObsynthError
 
 SHARE = Number(0.0, 1.0, because="a share lies between 0 and 1")
@@ -21,6 +21,7 @@ class Options:
     share: Annotated[float, SHARE] = 0.5
     rate: Annotated[float | None, POSITIVE] = None
     weights: Annotated[tuple[float, ...] | None, Number(at_least=0.0)] = None
+    turn: Annotated[Any | None, MATRIX] = None
     own: Any = None
 
     def __post_init__(self) -> None:
@@ -32,6 +33,8 @@ def test_what_fits_is_kept_and_sequences_become_tuples():
     assert given == Options(fine="row", rate=3.0, weights=(1.0, 2.0), own=[1])
     assert (type(given.rate), type(given.weights)) == (float, tuple)
     assert Options(weights=0.5).weights == (0.5,)
+    assert Options(turn=np.eye(2)).turn == ((1.0, 0.0), (0.0, 1.0))
+    assert hash(Options(turn=[3, 4])) == hash(Options(turn=[[3.0], [4.0]]))
 
 
 @pytest.mark.parametrize(
@@ -53,10 +56,13 @@ def test_what_fits_is_kept_and_sequences_become_tuples():
         ("weights", [[1.0]], "it has to be"),
         ("weights", [], "it has to be"),
         ("weights", "many", "it has to be"),
+        ("turn", "far", "no array of numbers"),
+        ("turn", [[np.inf]], "finite numbers in 2 dimensions"),
+        ("turn", np.ones((1, 1, 1)), "finite numbers in 2 dimensions"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(name, value, said):
-    with pytest.raises(ObsynthError, match=f"^{name} is ") as refusal:
+    with pytest.raises(ObsynthError, match=f"^{name} (is|has to hold) ") as refusal:
         Options(**{name: value})
     assert said in str(refusal.value)
     assert refusal.value.option == name

@@ -68,9 +68,10 @@ def test_gains_are_read_by_name_and_shape():
     shapes = {"K": (2, 1), "F": (0, 1)}
     found = read_gains({"K": [[1], [2]], "F": []}, shapes)
     assert found["K"].shape == (2, 1) and found["F"].shape == (0, 1)
+    assert read_gains({"K": [1, 2], "F": []}, shapes)["K"].tolist() == [[1], [2]]
     assert set(read_gains({"K": np.ones((2, 1))}, shapes, optional=("F",))) == {"K"}
     for given, said in (
-        ({"K": [[1], [2]]}, r"it takes K of shape \(2, 1\), F of shape \(0, 1\)"),
+        ({"K": [[1], [2]]}, r"needs F; it takes K of shape \(2, 1\), F of shape \(0, 1\)"),
         ({"K": [[1], [2]], "F": [], "G": 1}, "gains has"),
         ({"K": [[1, 2]], "F": []}, r"K has shape \(1, 2\)"),
         ({"K": [[1], [np.inf]], "F": []}, r"K has shape \(2, 1\)"),

@@ -40,6 +40,7 @@ class Stored(Record):
     plant: Plant
     A: Annotated[FloatArray, "n n"]
     stack: Annotated[FloatArray, "k n m+2"]
+    fewer: Annotated[FloatArray, "n-m 3-n+m"]
     again: Annotated[FloatArray, "k"]
     which: Annotated[IntArray, "m"]
     none: Annotated[FloatArray | None, "n"]
@@ -59,6 +60,7 @@ def stored() -> Stored:
         plant=plant,
         A=np.arange(4.0).reshape(2, 2),
         stack=np.ones((5, 2, 3)),
+        fewer=np.array([[1.0, 2.0]]),
         again=np.arange(5.0),
         which=np.array([1]),
         none=None,
@@ -101,6 +103,7 @@ def test_what_is_read_is_what_was_written():
         ("A", [[1.0, "x"], [0.0, 1.0]], "cannot be read"),
         ("A", [[1.0, 2.0], [0.0]], "cannot be read"),
         ("stack", [[[1.0] * 4] * 2] * 5, "stack has shape"),
+        ("fewer", [[1.0]], r"fewer has shape \(1, 1\) in the stored design; \(1, 2\) is needed"),
         ("again", [1.0] * 4, r"again has shape \(4,\) in the stored design; \(5,\) is needed"),
         ("which", [0.5], "which of the stored design has to hold whole numbers"),
         ("none", [1.0], "none has shape"),

@@ -12,7 +12,6 @@ import sympy as sp
 import obsynth as ob
 from obsynth.codegen import find_compiler
 from obsynth.designs import STATUS
-from obsynth.designs.interval.assembly import prove
 
 BOX = np.tile([0.5, 1.5], (3, 1))
 
@@ -358,8 +357,9 @@ TAMPERED = [
 def test_a_record_that_was_changed_is_not_proved(change, designs):
     record = copy.deepcopy(dict(designs["d1"].record))
     change(record)
-    assert not all(claim.holds for claim in prove(record))
-    assert all(claim.holds for claim in prove(designs["d1"].record))
+    contract = ob.IntervalObserver.CONTRACT
+    assert not contract.certify(contract.record.from_record(record)).valid
+    assert contract.certify(contract.record.from_record(designs["d1"].record)).valid
 
 
 def wrong_shape(record):
@@ -378,7 +378,30 @@ def unknown_bound(record):
     record["bound"] = "box"
 
 
-@pytest.mark.parametrize("change", [wrong_shape, missing, not_finite, unknown_bound])
+def singular(record):
+    record["P"] = [[1.0, 1.0], [1.0, 1.0]]
+
+
+def no_fault_in_R0(record):
+    record["transformation"]["R0"] = [[0.0]]
+
+
+def unbounded_noise(record):
+    record["model"]["plant"]["signals"][-1].update(lower=None, upper=None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        wrong_shape,
+        missing,
+        not_finite,
+        unknown_bound,
+        singular,
+        no_fault_in_R0,
+        unbounded_noise,
+    ],
+)
 def test_a_record_that_cannot_be_read(change, designs, tmp_path):
     record = json.loads(json.dumps(designs["d1"].record))
     change(record)
@@ -393,8 +416,33 @@ def test_analyse_proves_what_given_gains_guarantee(example, designs):
     assert observer.half_widths == pytest.approx(designs["d1"].half_widths, rel=1e-12)
     wider = ob.IntervalObserver().analyse(example, {"L": [[0.6], [-1.0]]})
     assert wider.half_widths[1] > observer.half_widths[1] * 1.01
+    column = ob.IntervalObserver().analyse(example, {"L": [0.4, -1.0]})
+    assert np.array_equal(column.half_widths, observer.half_widths)
     with pytest.raises(ob.ObsynthError, match="needs L"):
         ob.IntervalObserver().analyse(example, {"P": np.eye(2)})
+
+
+def test_given_gains_where_nothing_is_left_to_estimate():
+    plant = lpv([[0.5]], [[1]], [[1]])
+    observer = ob.IntervalObserver().design(plant)
+    given = ob.IntervalObserver().analyse(plant, {"L": np.zeros((0, 0))})
+    assert np.array_equal(given.half_widths, observer.half_widths)
+
+
+def test_equal_options_are_equal_and_can_be_hashed():
+    one = ob.IntervalObserver(gains=(np.eye(2), [1, 2]), H=np.eye(3), prefer="x1")
+    two = ob.IntervalObserver(gains=([[1, 0], [0, 1]], [[1], [2]]), H=np.eye(3), prefer=["x1"])
+    assert one == two and hash(one) == hash(two)
+    assert one != ob.IntervalObserver(gains=(np.eye(2), [1, 3]), H=np.eye(3), prefer="x1")
+
+
+def test_equations_outside_the_class_are_no_certificate(designs):
+    record = copy.deepcopy(dict(designs["d1"].record))
+    record["model"]["plant"]["outputs"][0]["expression"] += " + u"
+    contract = ob.IntervalObserver.CONTRACT
+    certificate = contract.certify(contract.record.from_record(record))
+    assert not certificate["derivation"].holds
+    assert "y = C x + W2 w" in certificate["derivation"].proof
 
 
 def test_searched_gains(example, designs, two_faults):

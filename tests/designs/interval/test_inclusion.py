@@ -1,6 +1,7 @@
 """States and faults inside their intervals at tolerance 0, and mutants that are not."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -233,10 +234,9 @@ def one_vertex(name):
 
 def without_rotation(design):
     """z taken for x: the rows of the identity in place of H2'."""
-    plant = design.plant
-    n2 = len(plant.T2)
-    rotated = type(plant)(**{**vars(plant), "T2": plant.T2[:, ::-1] if n2 else plant.T2})
-    design.__dict__["plant"] = rotated
+    free = design.decoupled
+    rotated = replace(free, T2=free.T2[:, ::-1] if len(free.T2) else free.T2)
+    design.__dict__["decoupled"] = rotated
 
 
 MUTANTS = {
@@ -323,10 +323,8 @@ def largest_deviation(design, name):
     corners.
     """
     rng = np.random.default_rng(9)
-    model, plant = design.model, design.plant
-    Phi, W, S, T2, F_left = (
-        nearest(m) for m in (plant.Phi, plant.W, design.S, plant.T2, plant.F_left)
-    )
+    model, free = design.model, design.decoupled
+    Phi, W, S, T2, F_left = (nearest(m) for m in (free.Phi, free.W, design.S, free.T2, free.F_left))
     W1, W2 = nearest(model.W1), nearest(model.W2)
     box = model.plant.box("w")
     corners = np.array(list(itertools.product(*box)))

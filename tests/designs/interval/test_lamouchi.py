@@ -1,17 +1,21 @@
 """Acceptance of the interval observer on the example of Lamouchi, Raissi, Amairi and Aoun."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import obsynth as ob
 from obsynth.derive.rigour import exact, nearest
-from obsynth.designs.interval.gains import Reduced, lp_problem, sylvester_gain
-from obsynth.designs.interval.printed import FLAWS, printed_faults
+from obsynth.designs.interval.gains import lp_problem, sylvester_gain
+from obsynth.designs.interval.printed import (
+    FLAWS,
+    largest_alpha,
+    lipschitz_alpha,
+    printed_faults,
+)
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.synthesis import with_gains
-from obsynth.designs.interval.theorem import comparison_radius, largest_alpha, lipschitz_alpha
 
 BOX = np.tile([0.5, 1.5], (3, 1))
 P_PAPER = np.array([[10.0, -5.0], [-10.0, 6.0]])
@@ -50,11 +54,11 @@ def test_structure(designs, numbers):
     expected = numbers["example_structure"]
     for case, name in (("b2", "uncentred"), ("c2", "centred")):
         design = stored(designs[case])
-        A2 = nearest(design.plant.T2 @ exact(design.nominal) @ design.plant.W)
-        sign = np.sign(design.chosen.H[1:, 1:].diagonal())
-        assert nearest(design.plant.C2) * sign == pytest.approx(np.array(expected["C2"]))
+        A2 = nearest(design.decoupled.T2 @ exact(design.nominal) @ design.decoupled.W)
+        sign = np.sign(design.transformation.H[1:, 1:].diagonal())
+        assert nearest(design.decoupled.C2) * sign == pytest.approx(np.array(expected["C2"]))
         assert np.outer(sign, sign) * A2 == pytest.approx(np.array(expected[f"A2_{name}"]))
-    moved_by_y = nearest(design.plant.T2 @ exact(design.nominal) @ design.plant.Phi)
+    moved_by_y = nearest(design.decoupled.T2 @ exact(design.nominal) @ design.decoupled.Phi)
     assert moved_by_y == pytest.approx(np.array(expected["D2_centred"]))
     assert np.abs(designs["c2"].gains["E"]) == pytest.approx(np.abs(expected["E"]))
     share = stored(designs["c2"]).share.split(exact(design.nominal))
@@ -84,7 +88,7 @@ def test_linear_programme(example):
     assert second.solve(solver="CLARABEL") == pytest.approx(solution.objective, abs=1e-6)
     chosen = ob.IntervalObserver(gains=(np.diag([1.0, -1.0]), None)).design(example)
     assert chosen.gains["L"] == pytest.approx(np.array([[0.4], [-1.0]]), abs=1e-9)
-    data = Reduced.of(stored(chosen).model, stored(chosen).plant)
+    data = stored(chosen).reduced
     flipped = data.__class__(**{**vars(data), "C2": -data.C2})
     assert lp_problem(flipped, np.eye(2)).solve()["Y"][1, 0] > 0.5
 
@@ -102,7 +106,7 @@ def test_the_theorems_numbers(designs, literal, numbers):
         key = "alpha_max_LMI20" if name == "paper" else f"alphamax_{name}"
         assert limit == pytest.approx(expected[key], rel=1e-6)
         radius = expected[f"comparison_radius_{name}"]
-        assert comparison_radius(design) == pytest.approx(radius, rel=1e-9)
+        assert design.spectral_radius == pytest.approx(radius, rel=1e-9)
     parts = literal.prediction.split(exact(literal.nominal))
     assert nearest(parts.R) == pytest.approx(np.array(expected["R_paper"]), abs=1e-12)
     assert nearest(parts.sigma_lower) == pytest.approx(np.array(expected["sigma_lo_paper"]))
@@ -241,8 +245,8 @@ def test_the_printed_widths_explode(example, designs, numbers, paper_seeds, run_
         nominal=A_PAPER,
     )
     step, memory0 = printed.unproved(example)
-    shown = replace(designs["b2"], start=memory0)
-    run = run_many(shown, *paper_seeds(range(20), 20), feedback, BOX, step=step)
+    shown = SimpleNamespace(model=designs["b2"].model, step=step, memory0=memory0)
+    run = run_many(shown, *paper_seeds(range(20), 20), feedback, BOX)
     widths = (run.x_upper - run.x_lower)[20].mean(axis=0)
     assert widths == pytest.approx(expected[:3], rel=0.01)
     assert widths[1] == pytest.approx(3.9e19, rel=0.01)

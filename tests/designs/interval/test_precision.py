@@ -111,7 +111,7 @@ def test_the_first_box_is_rounded_outwards(precision, two_faults):
     design = IntervalDesign.from_record(observer.record)
     box = np.array([[-0.1, 0.3], [0.7, 0.9], [-1 / 3, 1 / 3], [0.1, 0.1], [-2.3, 1.7]])
     low, high = first_box(design, box)
-    rows = exact(design.P) @ design.plant.T2
+    rows = exact(design.P) @ design.decoupled.T2
     kind = np.float64 if precision == "double" else np.float32
     assert np.array_equal(low.astype(kind), low)
     assert np.array_equal(high.astype(kind), high)
