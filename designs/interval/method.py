@@ -50,6 +50,7 @@ class IntervalObserver(Method):
     with bounded w, rho bounded (values of rho that are measured are not used), faults f and unknown
     inputs of any size, and rank(C F) = q. An orthogonal transformation takes the faults away; what
     remains is bounded from below and above, and the faults follow with a delay of one sample.
+    `analyse` takes ``L`` of shape (n - q, m - q) and ``P``, by default the identity.
 
     Parameters
     ----------
