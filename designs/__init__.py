@@ -13,9 +13,11 @@ from obsynth.designs.core.loading import load
 from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.comparison import Detection, FaultEvent
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.hinf.method import HinfUIO
 from obsynth.designs.hinf.worst_case import WorstCase, worst_case
 from obsynth.designs.interval.method import IntervalObserver
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 __all__ = [
     "STATUS",
@@ -27,11 +29,13 @@ __all__ = [
     "DetectorError",
     "FaultDetector",
     "FaultEvent",
+    "FilterBank",
     "Guarantee",
     "HinfUIO",
     "InfeasibleDesign",
     "IntervalObserver",
     "Observer",
+    "SetAdaptiveObserver",
     "SolverTrouble",
     "WorstCase",
     "load",

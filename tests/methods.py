@@ -64,6 +64,10 @@ def two_tanks_filling() -> ob.Scenario:
     )
 
 
+def sound_tanks() -> ob.Scenario:
+    return ob.scenarios.three_tanks("fault free", end=20.0, noise=None)
+
+
 METHODS = {
     "bounded_error_uio": Entry(
         ob.BoundedErrorUIO(gamma=0.005),
@@ -92,6 +96,23 @@ METHODS = {
         spoilt=(("width", 0), 0.9, "stability"),
         option={"precision": "half"},
         gains=("P", "L"),
+    ),
+    "filter_bank": Entry(
+        ob.FilterBank(),
+        ob.plants.three_tanks,
+        sound_tanks,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("gain", 0), -1.0, "filters"),
+        option={"Ts": -1.0},
+    ),
+    "set_adaptive_observer": Entry(
+        ob.SetAdaptiveObserver(gain_cap=0.5),
+        ob.plants.three_tanks,
+        sound_tanks,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("alpha",), 1.01, "decay"),
+        option={"gain_cap": 0.0},
+        gains=("L",),
     ),
     "luenberger": Entry(
         Luenberger(),

@@ -12,7 +12,8 @@ each kind of number to its law, against exact rationals or balls of 300 bits.
 ``down``, ``up``, ``raised``, ``lowered``, ``add_up``, ``product_up``, ``smallest_above``
     One step of rounding to the named side; sums and products of nonnegative doubles are never
     below (``lowered``: above) the exact value, underflow included. ``middle_and_radius`` and
-    ``outward`` hold the interval or box they are given.
+    ``outward`` hold the interval or box they are given; ``allowance`` is above the rounding of
+    one step of an observer in either precision.
 ``exact``, ``ExactMatrix``
     Rational arrays and matrices: no rounding at all. ``nearest`` and ``above`` turn them into the
     nearest and the smallest not lower doubles; ``image`` is the smallest box that holds M a for
@@ -51,6 +52,7 @@ from obsynth.derive.rigour.rounding import (
     UNIT,
     UNIT_ROUNDOFF,
     add_up,
+    allowance,
     down,
     gamma_bound,
     lowered,
@@ -73,6 +75,7 @@ __all__ = [
     "ProofResult",
     "above",
     "add_up",
+    "allowance",
     "down",
     "enclose_number",
     "exact",

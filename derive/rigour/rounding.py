@@ -80,6 +80,19 @@ def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
     return raised(left @ right, left.shape[-1] + 1)
 
 
+def allowance(precision: str, n: int, product: float = 0.0) -> float:
+    """Return what the rounding of one step may be, relative to the size of its terms.
+
+    What is added to a bound is this share of the sum of the magnitudes of all its terms, so that
+    cancellation does not matter. Making the terms takes at most 24 roundings one after the other;
+    every factor Q = I + M / mu of a transition over h 16 for its entries and n for the product, and
+    the terms with j factors have the weight of a Poisson variable with mean h mu, the `product`,
+    so that h mu factors count. Twice that, and 2^-42 in double precision.
+    """
+    count = 2.0 * (24.0 + (16.0 + n) * (1.0 + product))
+    return max(count * UNIT[precision], 2.0**-42)
+
+
 def outward(box: FloatArray, precision: str) -> FloatArray:
     """Return a box, shape (n, 2), whose ends are numbers of the precision and that holds it."""
     if precision == "double":

@@ -22,7 +22,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.options import check_options
 from obsynth.designs.core.plant_class import PlantClass
 from obsynth.designs.core.record import plain
-from obsynth.designs.core.stepping import slices
+from obsynth.designs.core.stepping import fill, slices
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -126,12 +126,7 @@ class Contract(Generic[D]):
     ) -> FloatArray:
         """Return the memory for the first call of the step, see `Observer.memory0`."""
         given = Start.read(design.plant, guess, x_range, f_range, y0)
-        layout = self.layout(design)
-        memory = np.zeros(layout["initialised"].stop)
-        memory[layout["initialised"]] = 1.0
-        for name, value in self.first(design, given, **options).items():
-            memory[layout[name]] = value
-        return memory
+        return fill(self.layout(design), self.first(design, given, **options))
 
 
 CONTRACTS: dict[str, Contract[Any]] = {}
@@ -178,8 +173,8 @@ class Method:
         ----------
         model : Plant
             Or what `obsynth` derives from it and the method builds on: a `Split` for
-            BoundedErrorUIO, HinfUIO and SetAdaptiveObserver, a `QuasiLPV` for IntervalObserver, a
-            `QPV` for QPVObserver.
+            BoundedErrorUIO, HinfUIO, SetAdaptiveObserver and FilterBank, a `QuasiLPV` for
+            IntervalObserver, a `QPV` for QPVObserver.
         bounds : JacobianBounds, optional
             Of the split's g, where they are at hand, for BoundedErrorUIO and HinfUIO.
 

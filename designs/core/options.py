@@ -40,9 +40,9 @@ MATRIX = "matrix"
 def check_options(method: Any) -> None:
     """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
 
-    Literals, bool, int, float, tuples of floats and their unions with None are checked, numbers
-    also by a `Number` in ``Annotated``, and what is a `MATRIX`; whatever else a method takes it
-    checks by itself.
+    Literals, bool, int, float, tuples of floats or of pairs and their unions with None are
+    checked, numbers also by a `Number` in ``Annotated``, one number or a tuple of them too, and
+    what is a `MATRIX`; whatever else a method takes it checks by itself.
     """
     hints = get_type_hints(type(method), include_extras=True)
     for field in fields(method):
@@ -69,8 +69,12 @@ def read_option(name: str, kind: Any, value: Any) -> Any:
         return _one_of(name, value, [True, False])
     if allowed in ([float], [int]):
         return _number(name, value, limits, whole=allowed == [int])
-    if allowed == [tuple[float, ...]]:
+    if allowed == [float, tuple[float, ...]] and isinstance(value, int | float):
+        return _number(name, value, limits, whole=False)
+    if tuple[float, ...] in allowed:
         return _numbers(name, value, limits)
+    if allowed == [tuple[tuple[float, float], ...]]:
+        return _pairs(name, value)
     return value
 
 
@@ -101,6 +105,15 @@ def _numbers(name: str, value: Any, limits: Number) -> tuple[float, ...]:
     if numbers.ndim != 1 or not numbers.size or not limits.holds(numbers):
         raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
     return tuple(numbers.tolist())
+
+
+def _pairs(name: str, value: Any) -> tuple[tuple[float, float], ...]:
+    try:
+        return tuple((float(low), float(high)) for low, high in value)
+    except (TypeError, ValueError) as error:
+        raise ObsynthError(
+            f"{name} is {value!r}; it has to be pairs (lower, upper)", option=name
+        ) from error
 
 
 def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np.ndarray[Any, Any]:

@@ -27,6 +27,7 @@ class PlantClass:
 
     who: the method as a refusal calls it, "the bounded-error observer"
     time: in which the method works
+    discretised: whether a discretisation stands for the continuous plant that it was made from
     forbids: kind of signal -> why the method has none of it and what to do instead
     finite: kind of signal -> why each of it needs a finite range and how to declare it
     needs: kind of signal -> why at least one is needed
@@ -35,14 +36,15 @@ class PlantClass:
 
     who: str
     time: Literal["discrete", "continuous"]
+    discretised: bool = False
     forbids: Mapping[str, str] = field(default_factory=dict)
     finite: Mapping[str, str] = field(default_factory=dict)
     needs: Mapping[str, str] = field(default_factory=dict)
     faults: tuple[Role, ...] = (Role.ACTUATOR_FAULT, Role.PROCESS_FAULT)
 
     def check(self, plant: Plant) -> Plant:
-        """Return the plant, or refuse it by the user's own names."""
-        self._check_time(plant)
+        """Return the plant in the method's time, or refuse it by the user's own names."""
+        plant = self._in_time(plant)
         for kind, clause in self.forbids.items():
             self._refuse(kind, plant.names(kind), clause)
         sensors = [s.name for s in plant.f if s.role not in self.faults]
@@ -65,19 +67,25 @@ class PlantClass:
                 )
         return plant
 
-    def _check_time(self, plant: Plant) -> None:
-        if self.time == "discrete" and plant.Ts is None:
+    def _in_time(self, plant: Plant) -> Plant:
+        if self.time == "continuous":
+            behind = plant.continuous if self.discretised and plant.Ts is not None else plant
+            if behind is None or behind.Ts is not None:
+                raise StructureError(
+                    f"{plant.name!r} is a discrete plant and {self.who} does not work in discrete "
+                    "time: give the continuous plant, and Ts= of the observer for the sampling of "
+                    "its step",
+                    symbol=plant.name,
+                    condition="continuous time",
+                )
+            return behind
+        if plant.Ts is None:
             raise StructureError(
                 f"{plant.name} is in continuous time and {self.who} works in discrete time: "
                 'call discretise("euler", Ts=...) first',
                 condition="discrete time",
             )
-        if self.time == "continuous" and plant.Ts is not None:
-            raise StructureError(
-                f"{plant.name} is in discrete time and {self.who} works in continuous time: give "
-                "the continuous plant, and Ts= of the observer for the sampling of its step",
-                condition="continuous time",
-            )
+        return plant
 
     @staticmethod
     def _refuse(kind: str, names: tuple[str, ...], clause: str) -> None:

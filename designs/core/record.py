@@ -178,7 +178,7 @@ def _read_array(stored: Any, letters: str, name: str, context: Context, kind: An
     if kind is not float and not np.array_equal(array, np.asarray(stored, dtype=float)):
         raise CertificateError(f"{name} of the stored design has to hold whole numbers")
     shape = context.shape(letters, array.shape)
-    if array.size == 0 and 0 in shape:
+    if array.shape == (0,) and 0 in shape:
         array = np.zeros(shape, dtype=kind)
     if array.shape != shape:
         raise CertificateError(

@@ -8,17 +8,27 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
-from obsynth.designs.filter_bank.model import UNKNOWN, BankDesign
-from obsynth.designs.set_adaptive.inputs import known_signals
+from obsynth.designs.core.given import Start
+from obsynth.designs.core.stepping import (
+    all_finite,
+    fill,
+    finite_or,
+    known_signals,
+    make_step,
+    select,
+    slices,
+    status_word,
+)
+from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
 
 _PASSES = 3
 _WIDER = 1.05
 _EXTRA = 1e-12
 
 
-def bank_layout(design: BankDesign) -> dict[str, slice]:
+def memory_sizes(design: BankDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
     ``hidden`` are the two ends of the unmeasured states, ``filter`` those of the filters (faults
@@ -38,27 +48,34 @@ def bank_layout(design: BankDesign) -> dict[str, slice]:
         "left": 1,
         "initialised": 1,
     }
-    layout, at = {}, 0
-    for name, size in sizes.items():
-        if size:
-            layout[name] = slice(at, at + size)
-            at += size
-    return layout
+    return {name: size for name, size in sizes.items() if size}
 
 
-def first_memory(design: BankDesign, x_box: FloatArray) -> FloatArray:
-    """Return the memory for a first state in a box."""
-    layout = bank_layout(design)
+def first_memory(design: BankDesign, start: Start) -> dict[str, FloatArray]:
+    """Start from a box of the state; guess and y0 are not used, faults have declared ranges."""
+    if start.x_range is None:
+        return _parts(design, design.region)
+    box = np.column_stack(
+        [
+            np.maximum(start.x_range[:, 0], design.region[:, 0]),
+            np.minimum(start.x_range[:, 1], design.region[:, 1]),
+        ]
+    )
+    if np.any(box[:, 0] > box[:, 1]):
+        raise ObsynthError("x_range lies outside of the region of the bank", option="x_range")
+    return _parts(design, box)
+
+
+def _parts(design: BankDesign, x_box: FloatArray) -> dict[str, FloatArray]:
+    """Return the parts of the memory that are not zero for a state in a box."""
     x_box = outward(x_box, design.precision)
-    memory = np.zeros(layout["initialised"].stop)
-    rates = len(design.filters)
-    for side, end in (("lower", 0), ("upper", 1)):
+    parts = {}
+    for side, ends in zip(("lower", "upper"), x_box.T, strict=True):
         if design.hidden:
-            memory[layout[f"hidden_{side}"]] = x_box[design.hidden, end]
-        memory[layout[f"filter_{side}"]] = np.repeat(x_box[design.fault_rows, end], rates)
-        memory[layout[f"shown_{side}"]] = x_box[design.outputs, end]
-    memory[layout["initialised"]] = 1.0
-    return memory
+            parts[f"hidden_{side}"] = ends[design.hidden]
+        parts[f"filter_{side}"] = np.repeat(ends[design.fault_rows], len(design.filters))
+        parts[f"shown_{side}"] = ends[design.outputs]
+    return parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +128,8 @@ class Corners:
         return value
 
 
-def build_bank_step(design: BankDesign) -> ca.Function:
-    """Build `Observer.step` of the bank.
+def build_step(design: BankDesign) -> ca.Function:
+    """Build `Observer.step`.
 
     Over a step every state stays in an envelope X with X_0 + [0, Ts] f(X) inside X (checked each
     time; without that check nothing is known). The unmeasured states then move by their own
@@ -121,7 +138,7 @@ def build_bank_step(design: BankDesign) -> ca.Function:
     its state without fault, from below and from above, and its exact exponential.
     """
     plant = design.plant
-    layout = bank_layout(design)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
@@ -138,7 +155,7 @@ def build_bank_step(design: BankDesign) -> ca.Function:
         inside = ca.logic_and(inside, told[0][k] <= design.region[i, 1])
     inside = ca.logic_and(ca.if_else(y_finite, inside, 1), covered)
     again = ca.logic_and(memory[layout["left"]] > 0.5, inside)
-    memory_now = select(again, ca.SX(first_memory(design, design.region)), memory)
+    memory_now = select(again, ca.SX(fill(layout, _parts(design, design.region))), memory)
     parts = {name: memory_now[part] for name, part in layout.items()}
 
     expected = parts["shown_lower"], parts["shown_upper"]
@@ -194,10 +211,10 @@ def build_bank_step(design: BankDesign) -> ca.Function:
     )
 
 
-def build_bank_ode(design: BankDesign) -> ca.Function:
+def build_ode(design: BankDesign) -> ca.Function:
     """Build the continuous form of the bank, with y(t) known at all times up to its noise."""
     plant = design.plant
-    layout = bank_layout(design)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))

@@ -9,7 +9,7 @@ from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import substitute
-from obsynth.designs.filter_bank.model import BankDesign
+from obsynth.designs.filter_bank.record import BankDesign
 from obsynth.symbolic.arrays import FloatArray
 
 # far above the rounding of the sums below

@@ -21,6 +21,7 @@ from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.rigour import substitute
+from obsynth.designs.core.record import Context
 from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text
 from obsynth.symbolic.arrays import FloatArray
 
@@ -109,25 +110,26 @@ class EndBounds:
         }
 
     @classmethod
-    def from_record(cls, record: Mapping[str, Any], plant: Plant) -> EndBounds:
-        """Read the text of `to_record` with the signals of a plant."""
-        states = tuple(_signal(plant.x, name) for name in record["states"])
-        exact = tuple(_signal((*plant.u, *plant.rho), name) for name in record["exact"])
+    def from_record(cls, stored: Mapping[str, Any], context: Context) -> EndBounds:
+        """Read the text of `to_record` with the signals of the plant that was read before."""
+        plant = context.plant
+        if plant is None:
+            raise ValueError("bounds without a plant")
+        states = tuple(_signal(plant.x, name) for name in stored["states"])
+        exact = tuple(_signal((*plant.u, *plant.rho), name) for name in stored["exact"])
         symbols = {str(e): e for s in states for e in end_symbols(s)}
         symbols |= {s.name: s.symbol for s in exact}
-        sides = []
-        for side in _SIDES:
-            stored = record[side]
-            sides.append(
-                {
-                    block: sp.ImmutableMatrix(
-                        len(plant.x),
-                        _width(plant, block),
-                        [read_text(text, symbols) for row in stored[block] for text in row],
-                    )
-                    for block in BLOCKS
-                }
-            )
+        sides = (
+            {
+                block: sp.ImmutableMatrix(
+                    len(plant.x),
+                    _width(plant, block),
+                    [read_text(text, symbols) for row in stored[side][block] for text in row],
+                )
+                for block in BLOCKS
+            }
+            for side in _SIDES
+        )
         return cls(states, exact, *sides)
 
 
@@ -177,7 +179,7 @@ def _matrix(matrix: sp.Matrix, table: Mapping[sp.Symbol, ca.SX], label: str) -> 
 
 
 def _signal(signals: tuple[Signal, ...], name: str) -> Signal:
-    return next(s for s in signals if s.name == name)
+    return {s.name: s for s in signals}[name]
 
 
 def _width(plant: Plant, block: str) -> int:

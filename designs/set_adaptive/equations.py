@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
+from obsynth.designs.core.stepping import slices
 from obsynth.designs.set_adaptive.record import SetDesign
 
-_PARTS = (
-    ("zeta_m", "n"),
-    ("zeta_M", "n"),
-    ("Omega_m", "nq"),
-    ("Omega_M", "nq"),
-    ("theta_m", "q"),
-    ("theta_M", "q"),
-    ("xi_m", "n"),
-    ("xi_M", "n"),
-    ("R_m", "qq"),
-    ("R_M", "qq"),
-    ("b_m", "q"),
-    ("b_M", "q"),
-    ("weight", "1"),
-    ("left", "1"),
-    ("initialised", "1"),
-)
+_PARTS = {
+    "zeta_m": "n",
+    "zeta_M": "n",
+    "Omega_m": "nq",
+    "Omega_M": "nq",
+    "theta_m": "q",
+    "theta_M": "q",
+    "xi_m": "n",
+    "xi_M": "n",
+    "R_m": "qq",
+    "R_M": "qq",
+    "b_m": "q",
+    "b_M": "q",
+    "weight": "1",
+    "left": "1",
+    "initialised": "1",
+}
 
 
-def memory_layout(n: int, q: int) -> dict[str, slice]:
+def memory_sizes(design: SetDesign) -> dict[str, int]:
     """Return the parts of the memory vector; matrices are stored row by row.
 
     ``zeta`` (6), ``Omega`` (7), ``theta`` (8) and ``xi`` (14), each with the index m, then M: in
@@ -36,25 +38,23 @@ def memory_layout(n: int, q: int) -> dict[str, slice]:
     fault. ``R``, ``b`` and ``weight`` are the integrals of the monitors (13), ``left`` is 1 from
     an output outside its range until the method has started again.
     """
-    sizes = {"n": n, "q": q, "1": 1}
-    layout, at = {}, 0
-    for name, letters in _PARTS:
-        size = int(np.prod([sizes[letter] for letter in letters]))
-        layout[name] = slice(at, at + size)
-        at += size
-    return layout
+    return {name: math.prod(_shape(design, letters)) for name, letters in _PARTS.items()}
+
+
+def _shape(design: SetDesign, letters: str) -> tuple[int, ...]:
+    n, q = design.G.shape
+    return tuple({"n": n, "q": q, "1": 1}[letter] for letter in letters)
 
 
 class Memory:
     """The memory taken apart: vectors as columns, matrices in their shape."""
 
-    def __init__(self, vector: ca.SX, n: int, q: int) -> None:
+    def __init__(self, vector: ca.SX, design: SetDesign) -> None:
         self.parts: dict[str, ca.SX] = {}
-        sizes = {"n": n, "q": q, "1": 1}
-        for (name, letters), part in zip(_PARTS, memory_layout(n, q).values(), strict=True):
+        for name, part in slices(memory_sizes(design)).items():
             value = vector[part]
-            if len(letters) == 2:
-                rows, columns = (sizes[letter] for letter in letters)
+            if len(_PARTS[name]) == 2:
+                rows, columns = _shape(design, _PARTS[name])
                 value = ca.reshape(value, columns, rows).T
             self.parts[name] = value
 
@@ -67,7 +67,7 @@ class Memory:
         return ca.vertcat(
             *(
                 ca.vec(values[name].T) if len(letters) == 2 else values[name]
-                for name, letters in _PARTS
+                for name, letters in _PARTS.items()
             )
         )
 

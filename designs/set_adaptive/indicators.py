@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.filter_bank.model import BankDesign
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.designs.core.observer import Observer
-
 
 Flags = NDArray[np.bool_]
 
@@ -99,37 +95,6 @@ def fault_indicators(
     return Indicators(outside("zeta"), np.asarray((first > 0.0) | (second < 0.0)), outside("xi"))
 
 
-def bank_intervals(
-    observer: Observer, memory: ArrayLike, y: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    """Return the fault intervals of every filter of a bank.
-
-    Each holds the mean of the fault with the weights exp(-rate age); an alarm of any of them, zero
-    outside of it, proves a fault.
-
-    Shapes: memory (..., n_memory), y (..., m).
-    """
-    if observer.record.get("kind") != "bank":
-        raise ObsynthError(
-            f"the observer of the method {observer.method!r} is no bank (robust=True)",
-            method=observer.method,
-        )
-    design = BankDesign.from_record(observer.record)
-    parts, layout = np.asarray(memory, dtype=float), observer.memory_layout
-    shown = np.asarray(y, dtype=float)[..., None]
-    outputs, rates = design.outputs.tolist(), len(design.filters)
-    places = [outputs.index(i) for i in design.fault_rows.tolist()]
-    shape = (*parts.shape[:-1], len(places), rates)
-    N = parts[..., layout["response"]].reshape(shape)
-    found = []
-    for noise, side in ((1, "upper"), (0, "lower")):
-        ends = (shown[..., 0] - design.noise[:, noise]) / design.scale
-        rest = ends[..., places][..., None] - parts[..., layout[f"filter_{side}"]].reshape(shape)
-        open_end = np.full(shape, -np.inf if noise else np.inf)
-        found.append(np.divide(rest, N, out=open_end, where=N > 0.0))
-    return found[0], found[1]
-
-
 def monitors(observer: Observer, memory: ArrayLike) -> Monitors:
     """Return the monitors (13) of a memory. Shapes: memory (n_memory,)."""
     design = _design(observer)
@@ -153,10 +118,10 @@ def monitors(observer: Observer, memory: ArrayLike) -> Monitors:
 
 
 def _design(observer: Observer) -> SetDesign:
-    if observer.record.get("kind") != "adaptive":
+    if observer.method != "set_adaptive_observer":
         raise ObsynthError(
-            f"an observer of the method {observer.method!r} and kind "
-            f"{observer.record.get('kind')!r} has no indicators (16)-(18)",
+            f"an observer of the method {observer.method!r} has no indicators (16)-(18)",
             method=observer.method,
         )
-    return SetDesign.from_record(observer.record)
+    design: SetDesign = observer.certificate.design
+    return design

@@ -2,40 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.set_adaptive.transition import PRECISIONS
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import POSITIVE
+from obsynth.designs.filter_bank.method import FilterBank
+from obsynth.designs.set_adaptive.claims import claims, covers
+from obsynth.designs.set_adaptive.equations import memory_sizes
+from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, design_gain, gain_problem
+from obsynth.designs.set_adaptive.guarantee import guarantee, numbers
+from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
+from obsynth.designs.set_adaptive.printed import printed_gain
+from obsynth.designs.set_adaptive.record import SetDesign, System
+from obsynth.designs.set_adaptive.step import build_ode, build_step, first_memory
+from obsynth.designs.set_adaptive.transition import uniformisation
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
-    from obsynth.derive import Split
+    from obsynth.derive import JacobianBounds, Split
     from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.set_adaptive.gain import Gain
-    from obsynth.designs.set_adaptive.model import Structure
-    from obsynth.designs.set_adaptive.record import SetDesign
     from obsynth.symbolic import Plant
 
 
-_LAWS = ("cooperative", "printed")
-_FORMS = ("corrected", "printed")
 _DECADE = (5.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True)
-class SetAdaptiveObserver:
+class SetAdaptiveObserver(Method):
     """Intervals of states and constant faults by two bounding systems.
 
     For continuous plants x' = A(rho) x + B u + phi + G theta + W1 w, y = C x + v with
-    nonnegative states, C >= 0 and G >= 0, every output showing one state; or, with
-    ``robust=True``, for monotone balances whose faults enter measured states only.
+    nonnegative states, C >= 0 and G >= 0, every output showing one state.
 
     Parameters
     ----------
@@ -60,12 +65,10 @@ class SetAdaptiveObserver:
     window : float, optional
         Time constant in seconds of the monitors (13); all time by default.
     robust : bool
-        The bank of filters in place of (6)-(8), see Notes.
-    filters : sequence of float
-        Rates of the bank per second; the first one gives ``f_lower`` and ``f_upper``.
-    region : sequence of (float, float), optional
-        Box of the states in which the bank's monotonicity is proved and which it assumes; the
-        declared ranges by default.
+        Design a `FilterBank` with the options ``filters``, ``region``, ``Ts`` and ``precision``
+        instead; the others are ignored.
+    filters, region
+        Of the `FilterBank`.
     precision : {"double", "single"}
         In which the step runs: what its rounding may do is added to the bounds.
     form : {"corrected", "printed"}
@@ -75,6 +78,10 @@ class SetAdaptiveObserver:
     ------
     ObsynthError
         For an option that is not known or out of range.
+
+    See Also
+    --------
+    FilterBank
 
     Notes
     -----
@@ -102,45 +109,42 @@ class SetAdaptiveObserver:
                         221.5 s (x1), 297.3 s (x3) and 304.2 s (x2)
     ==================  =======================================================================
 
-    The bank, for ``robust=True``: the unmeasured states come from both ends of their own
-    monotone equations, which no fault enters; every measured state with a fault gets filters
-    z' = c + l (y - z) from below and from above, and its interval encloses the mean of the fault
-    with the weights exp(-l age). Nothing singular is evaluated and no gain is needed.
-
     Examples
     --------
     >>> SetAdaptiveObserver(Gamma=0.02).law
     'cooperative'
     """
 
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="set_adaptive_observer",
+        record=SetDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+        ode=build_ode,
+        step_covered=True,
+    )
+
     law: Literal["cooperative", "printed"] = "cooperative"
-    Gamma: float | Sequence[float] = 0.01
-    gain_cap: float = 3.0
-    Ts: float | None = None
+    Gamma: Annotated[float | tuple[float, ...], POSITIVE] = 0.01
+    gain_cap: Annotated[float, POSITIVE] = 3.0
+    Ts: Annotated[float | None, POSITIVE] = None
     noise: bool = True
-    window: float | None = None
+    window: Annotated[float | None, POSITIVE] = None
     robust: bool = False
-    filters: Sequence[float] = (0.1, 0.2, 0.3, 0.5)
-    region: Sequence[Sequence[float]] | None = None
+    filters: Annotated[tuple[float, ...], POSITIVE] = FilterBank.filters
+    region: tuple[tuple[float, float], ...] | None = None
     precision: Literal["double", "single"] = "double"
     form: Literal["corrected", "printed"] = "corrected"
 
-    def __post_init__(self) -> None:
-        for name, values in (("law", _LAWS), ("form", _FORMS), ("precision", PRECISIONS)):
-            if getattr(self, name) not in values:
-                raise ObsynthError(
-                    f"{name} is {getattr(self, name)!r}; it has to be one of "
-                    f"{', '.join(map(repr, values))}",
-                    option=name,
-                )
-        for name in ("Gamma", "gain_cap", "Ts", "window", "filters"):
-            given = getattr(self, name)
-            if given is None and name in ("Ts", "window"):
-                continue
-            if not _positive(given):
-                raise ObsynthError(
-                    f"{name} is {given!r}; it has to be positive and finite", option=name
-                )
+    def check(self) -> None:
+        """Refuse a printed bank; the printed form has the printed law and no noise."""
         if self.form == "printed":
             if self.robust:
                 raise ObsynthError(
@@ -150,94 +154,43 @@ class SetAdaptiveObserver:
                 )
             object.__setattr__(self, "law", "printed")
             object.__setattr__(self, "noise", False)
-        if np.ndim(self.Gamma) == 1:
-            object.__setattr__(self, "Gamma", tuple(np.asarray(self.Gamma, dtype=float).tolist()))
-        rates = np.atleast_1d(np.asarray(self.filters, dtype=float))
-        object.__setattr__(self, "filters", tuple(rates.tolist()))
-        if self.region is not None:
-            box = tuple((float(low), float(high)) for low, high in self.region)
-            object.__setattr__(self, "region", box)
 
-    def design(self, model: Plant | Split) -> Observer:
-        """Design, prove and return the observer.
-
-        Parameters
-        ----------
-        model : Plant or Split
-            Continuous, or a discretisation of a continuous plant; of a split only the plant is
-            used.
-
-        Returns
-        -------
-        Observer
-
-        Raises
-        ------
-        StructureError
-            If the plant is outside the class; the signal is named.
-        InfeasibleDesign
-            If no gain makes the bounds Metzler and Hurwitz.
-        UnboundedError
-            If an entry of A has no bound over the declared ranges.
-        """
-        from obsynth.designs.set_adaptive.assembly import assemble
-        from obsynth.designs.set_adaptive.gain import design_gain
-        from obsynth.designs.set_adaptive.model import read_structure
-
+    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer, see `Method.design`, or that of the bank."""
         if self.robust:
-            from obsynth.designs.filter_bank.model import design_bank
+            return FilterBank(self.filters, self.region, self.Ts, self.precision).design(model)
+        return super().design(model, bounds)
 
-            return assemble(design_bank(model, self), level="full")
-        structure = read_structure(model, self.noise)
-        A_lower, A_upper = structure.bounds.extremes(structure.reach(0.0))
-        A_lower_box = structure.bounds.extremes(np.inf)[0]
-        names = structure.form.model.names("x")
+    def read(self, given: Plant | Split) -> SetModel:
+        """Bring the plant into the form (3) and bound its matrices elementwise."""
+        return read(given, self.noise)
+
+    def solve(self, model: SetModel) -> SetDesign:
+        """Find the gain of the fastest decay within the cap, or the printed one."""
+        A_lower, A_upper = model.A_span
         if self.form == "printed":
-            from obsynth.designs.set_adaptive.printed import printed_gain
+            return self._complete(model, printed_gain(A_lower, A_upper, model.C))
+        names = model.plant.names("x")
+        gain = design_gain(model.A_lower_box, A_upper, model.C, self.gain_cap, names)
+        return self._complete(model, gain)
 
-            gain = printed_gain(A_lower, A_upper, structure.C)
-        else:
-            gain = design_gain(A_lower_box, A_upper, structure.C, self.gain_cap, names)
-        return assemble(self._complete(structure, gain, A_lower, A_upper, A_lower_box), structure)
-
-    def analyse(self, model: Plant | Split, gains: Mapping[str, ArrayLike]) -> Observer:
-        """Return what a given gain guarantees, proved.
-
-        Parameters
-        ----------
-        model : Plant or Split
-        gains : mapping
-            ``L`` of shape (n, m).
-
-        Raises
-        ------
-        InfeasibleDesign
-            If A_m - L C is not Metzler or A_M - L C not Hurwitz.
-        """
-        from obsynth.designs.set_adaptive.assembly import assemble
-        from obsynth.designs.set_adaptive.gain import analyse_gain
-        from obsynth.designs.set_adaptive.model import read_structure
-
-        if self.robust:
-            raise ObsynthError("the bank (robust=True) has no gains: use design", option="robust")
-        structure = read_structure(model, self.noise)
+    def fix(self, model: SetModel, gains: Mapping[str, ArrayLike]) -> SetDesign:
+        """Find the decay of a given ``L`` of shape (n, m)."""
         L = np.asarray(gains.get("L"), dtype=float)
-        if set(gains) != {"L"} or L.shape != structure.C.T.shape or not np.all(np.isfinite(L)):
+        if set(gains) != {"L"} or L.shape != model.C.T.shape or not np.all(np.isfinite(L)):
             raise ObsynthError(
-                f"gains has to hold L alone, of shape {structure.C.T.shape}, finite; given were "
+                f"gains has to hold L alone, of shape {model.C.T.shape}, finite; given were "
                 f"{', '.join(gains) or 'none'}",
                 option="gains",
             )
-        A_lower, A_upper = structure.bounds.extremes(structure.reach(0.0))
-        A_lower_box = structure.bounds.extremes(np.inf)[0]
-        gain = analyse_gain(A_lower_box, A_upper, structure.C, L)
+        gain = analyse_gain(model.A_lower_box, model.A_span[1], model.C, L)
         if gain.alpha <= 0.0:
             raise InfeasibleDesign(
                 "A_M - L C is not Hurwitz for this gain",
                 [f"its largest eigenvalue over the range of the outputs is {-gain.alpha:.6g}"],
                 alpha=gain.alpha,
             )
-        return assemble(self._complete(structure, gain, A_lower, A_upper, A_lower_box), structure)
+        return self._complete(model, gain)
 
     def problem(self, model: Plant | Split, alpha: float) -> Problem:
         """Return the gain program for a decay alpha, see `Problem.to_cvxpy`.
@@ -249,49 +202,31 @@ class SetAdaptiveObserver:
         ObsynthError
             For the bank, which needs no program.
         """
-        from obsynth.designs.set_adaptive.gain import gain_problem
-        from obsynth.designs.set_adaptive.model import read_structure
+        found: SetModel = self._checked(model)
+        return gain_problem(found.A_lower_box, found.A_span[1], found.C, self.gain_cap, alpha)
 
+    def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:
         if self.robust:
-            raise ObsynthError("the bank (robust=True) needs no program", option="robust")
-        structure = read_structure(model, self.noise)
-        A_upper = structure.bounds.extremes(structure.reach(0.0))[1]
-        A_lower = structure.bounds.extremes(np.inf)[0]
-        return gain_problem(A_lower, A_upper, structure.C, self.gain_cap, alpha)
-
-    def _complete(
-        self,
-        structure: Structure,
-        gain: Gain,
-        A_lower: FloatArray,
-        A_upper: FloatArray,
-        A_lower_box: FloatArray,
-    ) -> SetDesign:
-        from obsynth.designs.set_adaptive.model import output_of_fault
-        from obsynth.designs.set_adaptive.record import SetDesign
-        from obsynth.designs.set_adaptive.transition import uniformisation
-
-        plant = structure.form.model
-        q = len(plant.f)
-        Gamma = np.atleast_1d(np.asarray(self.Gamma, dtype=float))
-        if Gamma.shape not in ((1,), (q,)):
             raise ObsynthError(
-                f"Gamma has {Gamma.size} numbers; {q} are needed ({', '.join(plant.names('f'))})",
-                option="Gamma",
+                "the bank (robust=True) has no gains and needs no program: use design",
+                option="robust",
             )
-        outputs = output_of_fault(structure.C, A_lower_box, structure.G, plant.names("f"))
-        Gamma = np.broadcast_to(Gamma, (q,)).copy()
+        return super()._checked(given, bounds)
+
+    def _complete(self, model: SetModel, gain: Gain) -> SetDesign:
+        """Add what the step needs to a gain, or refuse its sample time."""
+        A_lower, A_upper = model.A_span
+        C, q = model.C, len(model.plant.f)
+        Gamma = self._adaptation(model.plant)
+        outputs = output_of_fault(C, model.A_lower_box, model.G, model.plant.names("f"))
         # -(A_M - L C)^-1 G is where -Omega settles, and Gamma N^2 how fast theta then moves
-        settled = structure.C @ np.linalg.solve(gain.L @ structure.C - A_upper, structure.G)
+        settled = C @ np.linalg.solve(gain.L @ C - A_upper, model.G)
         adaptation = float((Gamma * settled[outputs, np.arange(q)] ** 2).max())
-        longest = 1.0 / float((-np.diag(A_lower - gain.L @ structure.C)).max())
-        if self.Ts is None:
-            Ts = round_down(min(longest / 32.0, 1.0 / adaptation))
-        else:
-            Ts = float(self.Ts)
-        uniformisation(Ts, float((-np.diag(A_lower_box - gain.L @ structure.C)).max()))
-        A_upper_step = structure.bounds.extremes(structure.reach(Ts))[1]
-        M = A_upper_step - gain.L @ structure.C
+        longest = 1.0 / float((-np.diag(A_lower - gain.L @ C)).max())
+        Ts = round_down(min(longest / 32.0, 1.0 / adaptation)) if self.Ts is None else self.Ts
+        uniformisation(Ts, float((-np.diag(model.A_lower_box - gain.L @ C)).max()))
+        A_upper_step = model.extremes(Ts)[1]
+        M = A_upper_step - gain.L @ C
         alpha_step = float((-(gain.p @ M) / gain.p).min())
         if alpha_step <= 0.0:
             raise InfeasibleDesign(
@@ -301,43 +236,36 @@ class SetAdaptiveObserver:
                 alpha=alpha_step,
             )
         alpha_step -= 1e-12 * (float(np.abs(M).max()) + alpha_step)
-        options = asdict(self)
-        options["filters"] = list(self.filters)
-        options["Gamma"] = np.atleast_1d(self.Gamma).tolist()
-        options["region"] = None
         return SetDesign(
-            plant=plant,
+            **{one.name: getattr(model, one.name) for one in fields(System)},
             Ts=Ts,
-            bounds=structure.bounds,
-            C=structure.C,
-            G=structure.G,
-            W1=structure.W1,
-            W2=structure.W2,
-            w_centre=structure.w_centre,
-            w_radius=structure.w_radius,
-            rate=structure.rate,
-            input_rate=structure.input_rate,
+            noisy=self.noise,
             A_lower=A_lower,
             A_upper=A_upper,
             A_upper_step=A_upper_step,
-            A_lower_box=A_lower_box,
+            A_lower_box=model.A_lower_box,
             L=gain.L,
             p=gain.p,
             alpha=gain.alpha,
             alpha_step=alpha_step,
             Gamma=Gamma,
+            law=self.law,
             fault_outputs=np.array(outputs),
-            options=options,
+            window=self.window,
+            precision=self.precision,
+            options=self.options(),
         )
 
-
-def _positive(given: Any) -> bool:
-    """Return whether something is a number, or some numbers, all positive and finite."""
-    try:
-        numbers = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        return False
-    return bool(numbers.ndim <= 1 and numbers.size and ((numbers > 0) & (numbers < np.inf)).all())
+    def _adaptation(self, plant: Plant) -> FloatArray:
+        """Return Gamma of every fault."""
+        Gamma = np.atleast_1d(np.asarray(self.Gamma, dtype=float))
+        if Gamma.shape not in ((1,), (len(plant.f),)):
+            raise ObsynthError(
+                f"Gamma has {Gamma.size} numbers; {len(plant.f)} are needed "
+                f"({', '.join(plant.names('f'))})",
+                option="Gamma",
+            )
+        return np.broadcast_to(Gamma, (len(plant.f),)).copy()
 
 
 def round_down(value: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import sympy as sp
@@ -10,60 +11,69 @@ import sympy as sp
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import middle_and_radius, round_number, substitute
+from obsynth.designs.core.plant_class import PlantClass
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
+from obsynth.designs.set_adaptive.record import SetDesign, System
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
+_NO_RANGE = " has no range; declare it with range="
+CLASS = PlantClass(
+    who="the set adaptive observer",
+    time="continuous",
+    discretised=True,
+    forbids={
+        "d": " has no bound that this method could use; declare it as a disturbance with bound=, "
+        "or as a fault",
+    },
+    finite={"x": _NO_RANGE, "f": _NO_RANGE},
+    needs={"f": "this method bounds faults"},
+)
+
 
 @dataclass(frozen=True, eq=False)
-class Structure:
-    """The plant in the form (3) of the paper, with bounds.
+class SetModel(System):
+    """A plant of the class with everything derived from it.
 
     form: with the proof that it is the plant
-    C, G, W1, W2: shapes (m, n), (n, q), (n, n_w), (m, n_w)
-    w_centre, w_radius (n_w,): box of the disturbances, zero where the noise is left out
-    rate (m, 2): range of the derivative of C x over the declared ranges, inputs left out where they
-        enter with a constant factor
-    input_rate (m, n_u): these factors
     """
 
     form: QuasiLPV
-    bounds: EndBounds
-    C: FloatArray
-    G: FloatArray
-    W1: FloatArray
-    W2: FloatArray
-    w_centre: FloatArray
-    w_radius: FloatArray
-    rate: FloatArray
-    input_rate: FloatArray
 
-    @property
-    def noise(self) -> FloatArray:
-        """Bound of the measurement noise, shape (m,)."""
-        bound: FloatArray = np.abs(self.W2) @ self.w_radius
-        return bound
-
-    def reach(self, Ts: float) -> FloatArray:
-        """Half width of what is known of every measured state over a step of Ts."""
-        plant = self.form.model
-        box = plant.box("u")
+    def extremes(self, Ts: float) -> tuple[FloatArray, FloatArray]:
+        """Return the least A_m and the largest A_M for what is known over a step of Ts."""
+        box = self.plant.box("u")
         with np.errstate(invalid="ignore"):
             push = np.where(self.input_rate == 0.0, 0.0, self.input_rate * box.T[:, None])
         speed = np.abs(self.rate).max(axis=1) + np.abs(push).max(axis=0, initial=0.0).sum(axis=1)
-        rows = [
-            int(np.argmax(self.C[:, plant.names("x").index(s.name)] != 0.0))
-            for s in self.bounds.states
-        ]
+        names = self.plant.names("x")
+        rows = [int(np.argmax(self.C[:, names.index(s.name)] != 0.0)) for s in self.bounds.states]
         scale = np.array([self.C[k].sum() for k in rows])
-        wide: FloatArray = (self.noise + Ts * speed)[rows] / scale
-        return wide
+        return self.bounds.extremes((self.noise + Ts * speed)[rows] / scale)
+
+    @cached_property
+    def A_span(self) -> tuple[FloatArray, FloatArray]:
+        """The extremes of the continuous form."""
+        return self.extremes(0.0)
+
+    @cached_property
+    def A_lower_box(self) -> FloatArray:
+        """The least A_m for ends anywhere in the declared ranges."""
+        return self.bounds.extremes(np.inf)[0]
 
 
-def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
-    """Read a continuous plant, or refuse it by name."""
-    plant = continuous(plant)
-    _check_signals(plant)
+def read(given: Plant | Split, noise: bool = True) -> SetModel:
+    """Read a plant, with or without its disturbances, or refuse it by name."""
+    plant = CLASS.check(given if isinstance(given, Plant) else given.model)
+    plant.check()
+    for signal in plant.x:
+        if signal.lower < 0.0:
+            raise StructureError(
+                f"the state {signal.name} may be negative ({signal.lower:g}); A_m x <= A x <= A_M "
+                f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state",
+                symbol=signal.name,
+                condition="nonnegative states",
+            )
     form = quasi_lpv(plant)
     faults = {s.symbol for s in plant.f}
     for block in ("A", "B", "offset"):
@@ -104,26 +114,24 @@ def read_structure(plant: Plant | Split, noise: bool = True) -> Structure:
     bounds = derive_bounds(form)
     _check_readings(plant, bounds, C)
     rate, input_rate = _speed(plant, C)
-    return Structure(
-        form, bounds, C, G, W1, W2, box.mean(axis=1), middle_and_radius(*box.T)[1], rate, input_rate
+    return SetModel(
+        plant=plant,
+        bounds=bounds,
+        C=C,
+        G=G,
+        W1=W1,
+        W2=W2,
+        w_centre=box.mean(axis=1),
+        w_radius=middle_and_radius(*box.T)[1],
+        rate=rate,
+        input_rate=input_rate,
+        form=form,
     )
 
 
-def continuous(plant: Plant | Split) -> Plant:
-    """Return the continuous plant of a split or behind a discretisation made by the package."""
-    if isinstance(plant, Split):
-        plant = plant.model
-    if plant.Ts is None:
-        return plant
-    behind = plant.continuous
-    if behind is None:
-        raise StructureError(
-            f"{plant.name!r} is a discrete plant; this method works in continuous time: declare "
-            "dynamics without Ts and give the method its sample time",
-            symbol=plant.name,
-            condition="continuous time",
-        )
-    return behind
+def read_again(design: SetDesign) -> SetModel:
+    """Derive it from the stored equations."""
+    return read(design.plant, design.noisy)
 
 
 def output_of_fault(
@@ -148,44 +156,6 @@ def output_of_fault(
                 condition="a fault that shows",
             )
     return found
-
-
-def _check_signals(plant: Plant) -> None:
-    plant.check()
-    if plant.d:
-        raise StructureError(
-            f"the unknown input {plant.d[0].name} has no bound that this method could use; "
-            "declare it as a disturbance with bound=, or as a fault",
-            symbol=plant.d[0].name,
-            condition="no unknown inputs",
-        )
-    if not plant.f:
-        raise StructureError(
-            f"{plant.name!r} declares no fault; this method bounds faults",
-            symbol=plant.name,
-            condition="faults",
-        )
-    for signal in plant.x:
-        if not signal.bounded:
-            raise StructureError(
-                f"the state {signal.name} has no range; declare it with range=",
-                symbol=signal.name,
-                condition="bounded states",
-            )
-        if signal.lower < 0.0:
-            raise StructureError(
-                f"the state {signal.name} may be negative ({signal.lower:g}); A_m x <= A x <= A_M "
-                f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state",
-                symbol=signal.name,
-                condition="nonnegative states",
-            )
-    for signal in plant.f:
-        if not signal.bounded:
-            raise StructureError(
-                f"the fault {signal.name} has no range; declare it with range=",
-                symbol=signal.name,
-                condition="bounded faults",
-            )
 
 
 def _check_signs(plant: Plant, C: FloatArray, G: FloatArray) -> None:

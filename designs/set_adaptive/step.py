@@ -1,4 +1,4 @@
-"""The guaranteed discrete step of the observer.
+"""The guaranteed discrete step of the observer, and its continuous form.
 
 Between two samples the output moves, so the bounds of A are frozen over everything it may show:
 y - v plus what C x falls in one step at most, up to y + v plus what it rises. The bounding
@@ -14,37 +14,52 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
+from obsynth.designs.core.given import Start
+from obsynth.designs.core.stepping import (
+    all_finite,
+    fill,
+    finite_or,
+    known_signals,
+    make_step,
+    select,
+    slices,
+    status_word,
+)
 from obsynth.designs.set_adaptive.equations import (
     Drive,
     Memory,
     drives,
     ends,
-    memory_layout,
+    memory_sizes,
     residuals,
+    theta_rates,
 )
-from obsynth.designs.set_adaptive.inputs import known_signals
-from obsynth.designs.set_adaptive.ode import exact_arguments
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.transition import SHOWN, apply, uniformisation
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
 
 
-def initial_memory(
-    design: SetDesign, x_box: FloatArray, f_box: FloatArray, initialised: float = 1.0
-) -> FloatArray:
-    """Return the memory for a first state and constant faults in boxes."""
-    x_box, f_box = outward(x_box, design.precision), outward(f_box, design.precision)
-    n, q = len(design.plant.x), len(design.plant.f)
-    layout = memory_layout(n, q)
-    memory = np.zeros(layout["initialised"].stop)
-    for name in ("zeta", "xi"):
-        memory[layout[f"{name}_m"]] = x_box[:, 0]
-        memory[layout[f"{name}_M"]] = x_box[:, 1]
-    memory[layout["theta_m"]] = f_box[:, 1]
-    memory[layout["theta_M"]] = f_box[:, 0]
-    memory[layout["initialised"]] = initialised
-    return memory
+def first_memory(design: SetDesign, start: Start) -> dict[str, FloatArray]:
+    """Start from boxes of the state and of the constant faults; guess and y0 are not used."""
+    if np.any(start.x[:, 0] < 0.0):
+        raise ObsynthError("x_range reaches below zero, which the method excludes")
+    f_box = design.plant.box("f") if start.f_range is None else start.f_range
+    return _parts(design, start.x, f_box)
+
+
+def _parts(design: SetDesign, x_box: FloatArray, f_box: FloatArray) -> dict[str, FloatArray]:
+    """Return the parts of the memory that are not zero, for boxes of the state and the faults."""
+    low, high = outward(x_box, design.precision).T
+    least, largest = outward(f_box, design.precision).T
+    return {
+        "zeta_m": low,
+        "zeta_M": high,
+        "xi_m": low,
+        "xi_M": high,
+        "theta_m": largest,
+        "theta_M": least,
+    }
 
 
 def build_step(design: SetDesign) -> ca.Function:
@@ -55,8 +70,8 @@ def build_step(design: SetDesign) -> ca.Function:
     when the output is back.
     """
     plant = design.plant
-    n, q, m = len(plant.x), len(plant.f), len(plant.output)
-    layout = memory_layout(n, q)
+    q, m = len(plant.f), len(plant.output)
+    layout = slices(memory_sizes(design))
     vector = ca.SX.sym("memory", layout["initialised"].stop)
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", m)
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
@@ -78,8 +93,8 @@ def build_step(design: SetDesign) -> ca.Function:
 
     initialised = vector[layout["initialised"]] > 0.5
     again = ca.logic_and(vector[layout["left"]] > 0.5, inside)
-    fresh = ca.DM(initial_memory(design, x_box, f_box))
-    memory = Memory(select(again, ca.SX(fresh), vector), n, q)
+    fresh = fill(layout, _parts(design, x_box, f_box))
+    memory = Memory(select(again, ca.SX(fresh), vector), design)
 
     r = residuals(design, memory, low, high)
     sizes = ca.fmax(ca.fabs(low), ca.fabs(high))
@@ -102,7 +117,7 @@ def build_step(design: SetDesign) -> ca.Function:
         design, memory, ca.logic_and(inside, consistent), (low, high), row_of
     )
 
-    lower, upper = _frozen(design, low, high, u_used, exact_arguments(design, u_used, theta_used))
+    lower, upper = _frozen(design, low, high, u_used, _exact_arguments(design, u_used, theta_used))
     changed = {"theta_m": theta_m, "theta_M": theta_M}
     changed |= _predict(design, memory, lower, upper, smallest, largest)
     changed |= _monitor(design, memory, r, y_finite)
@@ -147,6 +162,55 @@ def build_step(design: SetDesign) -> ca.Function:
                 }
             ),
         },
+    )
+
+
+def build_ode(design: SetDesign) -> ca.Function:
+    """Build (memory, u, y[, theta]) -> dmemory of equations (6)-(8), (13), (14).
+
+    With noise the bounds are those for states anywhere in y - v to y + v (inside their ranges)
+    and the gain is fed with y -+ v; without, they are the printed functions of y, outside of the
+    ranges too, as far as they are regular.
+    """
+    plant = design.plant
+    vector = ca.SX.sym("memory", sum(memory_sizes(design).values()))
+    u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
+    scheduling = [s for s in design.bounds.exact if s.name in plant.names("rho")]
+    theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
+    memory = Memory(vector, design)
+    shown = y - ca.DM(design.W2 @ design.w_centre)
+    v = ca.DM(design.noise)
+    low, high = shown - v, shown + v
+    exact = _exact_arguments(design, u, theta)
+    lower, upper = drives(design, ends(design, low, high, design.noisy), (low, high), u, exact)
+    G = ca.DM(design.G)
+    r = residuals(design, memory, low, high)
+    d_theta = theta_rates(design, memory, r)
+    smallest = ca.fmin(memory["theta_m"], memory["theta_M"])
+    largest = ca.fmax(memory["theta_m"], memory["theta_M"])
+    changed = {"theta_m": d_theta[0], "theta_M": d_theta[1]}
+    forget = 0.0 if design.window is None else 1.0 / design.window
+    for o, drive, bound, residual in (
+        ("m", lower, smallest, r[0]),
+        ("M", upper, largest, r[1]),
+    ):
+        N = -ca.DM(design.C) @ memory[f"Omega_{o}"]
+        changed[f"zeta_{o}"] = drive.M @ memory[f"zeta_{o}"] + drive.c
+        changed[f"Omega_{o}"] = drive.M @ memory[f"Omega_{o}"] - G
+        changed[f"xi_{o}"] = drive.M @ memory[f"xi_{o}"] + drive.c + G @ bound
+        changed[f"R_{o}"] = N.T @ N - forget * memory[f"R_{o}"]
+        changed[f"b_{o}"] = N.T @ residual - forget * memory[f"b_{o}"]
+    changed["weight"] = 1.0 - forget * memory["weight"]
+    changed["left"] = changed["initialised"] = ca.SX(0)
+    inputs = {"memory": vector, "u": u, "y": y}
+    if scheduling:
+        inputs["theta"] = theta
+    return ca.Function(
+        "ode",
+        list(inputs.values()),
+        [ca.densify(memory.packed(**changed))],
+        list(inputs),
+        ["dmemory"],
     )
 
 
@@ -259,3 +323,14 @@ def _monitor(
             added = ca.if_else(y_finite, design.Ts * value, ca.SX(*value.shape))
             changed[name] = keep * memory[name] + added
     return changed
+
+
+def _exact_arguments(design: SetDesign, u: ca.SX, theta: ca.SX) -> ca.SX:
+    """Return the arguments of the bounds that are known exactly, from inputs and scheduling."""
+    names = design.plant.names("u")
+    measured = [s.name for s in design.plant.rho if s.measured]
+    values = [
+        u[names.index(s.name)] if s.name in names else theta[measured.index(s.name)]
+        for s in design.bounds.exact
+    ]
+    return ca.vertcat(*values) if values else ca.SX(0, 1)

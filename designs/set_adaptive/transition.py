@@ -9,11 +9,9 @@ from decimal import Decimal, localcontext
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour import UNIT
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
-PRECISIONS = tuple(UNIT)
 SHOWN: Mapping[str, float] = {"double": 2.0**-48, "single": 2.0**-21}
 """Above the relative error of a measurement, its conversion into the precision included."""
 LARGEST_PRODUCT = 64.0
@@ -81,16 +79,3 @@ def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
         result = Q @ result + chance * state + tail * drive
     moved: ca.SX = ca.densify(result)
     return moved
-
-
-def allowance(precision: str, n: int, product: float = 0.0) -> float:
-    """Return what the rounding of one step may be, relative to the size of its terms.
-
-    What is added to a bound is this share of the sum of the magnitudes of all its terms, so that
-    cancellation does not matter. Making the terms takes at most 24 roundings one after the other;
-    every factor Q of the exponential 16 for its entries and n for the product, and the terms with
-    j factors have the weight of a Poisson variable with mean h mu, so that h mu factors count.
-    Twice that, and 2^-42 in double precision.
-    """
-    count = 2.0 * (24.0 + (16.0 + n) * (1.0 + product))
-    return max(count * UNIT[precision], 2.0**-42)

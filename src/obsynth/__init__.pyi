@@ -22,6 +22,7 @@ from .designs import Certificate as Certificate
 from .designs import CertificateError as CertificateError
 from .designs import Ellipsoid as Ellipsoid
 from .designs import FaultDetector as FaultDetector
+from .designs import FilterBank as FilterBank
 from .designs import HinfUIO as HinfUIO
 from .designs import InfeasibleDesign as InfeasibleDesign
 from .designs import IntervalObserver as IntervalObserver

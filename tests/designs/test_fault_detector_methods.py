@@ -19,8 +19,7 @@ def interval():
 
 @pytest.fixture(scope="module")
 def bank():
-    options = {"robust": True, "Ts": 0.01, "region": REGION}
-    return ob.SetAdaptiveObserver(**options).design(ob.plants.three_tanks())
+    return ob.FilterBank(Ts=0.01, region=REGION).design(ob.plants.three_tanks())
 
 
 @pytest.mark.parametrize("persistence", [1, 3])

@@ -1,6 +1,7 @@
 """The three tanks, their observers, and plant and observer integrated together, made once."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 import obsynth as ob
+from obsynth.designs.core.loading import contract_of
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
-from obsynth.designs.set_adaptive.model import read_structure
+from obsynth.designs.set_adaptive.model import read
 
 PAPER_GAIN = {"L": 3.0 * np.eye(3, 2)}
 A13 = A32 = 1.329e-4
@@ -32,7 +34,7 @@ def tanks():
 
 @pytest.fixture(scope="session")
 def structure(tanks):
-    return read_structure(tanks, noise=False)
+    return read(tanks, noise=False)
 
 
 @pytest.fixture(scope="session")
@@ -209,6 +211,17 @@ def paper_schedule(steps, Ts=0.01, theta=(8e-5, 6e-5)):
     f[t >= 200.0 - 1e-9, 0], f[t >= 300.0 - 1e-9, 1] = theta
     raised = (np.ceil(t / 100.0 - 1e-9) % 2 == 0) & (t > 0)
     return f, raised.astype(float)
+
+
+def certificate_of(record, level="lmi", **changed):
+    """The certificate of a record, valid or not, with parts of its contract changed."""
+    contract = replace(contract_of(record), **changed)
+    return contract.certify(contract.record.from_record(record), level)
+
+
+@pytest.fixture(scope="session")
+def certify():
+    return certificate_of
 
 
 @pytest.fixture(scope="session")

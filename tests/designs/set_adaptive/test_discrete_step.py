@@ -9,7 +9,6 @@ from scipy.linalg import expm
 
 import obsynth as ob
 from obsynth.designs.set_adaptive import step as step_module
-from obsynth.designs.set_adaptive.assembly import assemble
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT, apply, uniformisation
 
@@ -151,7 +150,9 @@ def test_inclusion_with_exact_outputs(exact_observer, closed_loop):
     "mutant",
     ["sign of theta", "swapped bounds", "late by one", "sign of G", "less noise"],
 )
-def test_inclusion_sees_a_mutant(cooperative, exact_observer, closed_loop, monkeypatch, mutant):
+def test_inclusion_sees_a_mutant(
+    cooperative, exact_observer, closed_loop, certify, monkeypatch, mutant
+):
     healthy = cooperative if mutant == "less noise" else exact_observer
     record, late = dict(healthy.record), 0
     if mutant == "sign of theta":
@@ -176,11 +177,9 @@ def test_inclusion_sees_a_mutant(cooperative, exact_observer, closed_loop, monke
         record["w_radius"] = (0.9 * np.array(record["w_radius"])).tolist()
     if mutant == "less noise":
         with pytest.raises(ob.CertificateError, match="disturbances"):
-            assemble(record)
-        from obsynth.designs.set_adaptive import assembly
-
-        monkeypatch.setattr(assembly, "prove_design", lambda *given: ())
-    broken = assemble(record)
+            certify(record).observer()
+    unproved = {"claims": lambda design: ()} if mutant == "less noise" else {}
+    broken = certify(record, **unproved).observer()
     loop = closed_loop(broken, late=late)
     if mutant == "less noise":
         assert sum(violations(hard_run(loop, seed)) for seed in range(12)) > 0
@@ -213,12 +212,12 @@ def count_one_level(observer):
     return total
 
 
-def test_what_moves_within_a_step_is_included():
+def test_what_moves_within_a_step_is_included(certify):
     observer = SetAdaptiveObserver(Ts=0.2, Gamma=10.0).design(one_level())
     assert count_one_level(observer) == 0
     record = dict(observer.record)
     record["rate"], record["input_rate"] = [[0.0, 0.0]], [[0.0]]
-    standing = assemble(record)
+    standing = certify(record).observer()
     assert count_one_level(standing) > 0
     with pytest.raises(ob.CertificateError, match="outputs move"):
         standing.certificate.check()

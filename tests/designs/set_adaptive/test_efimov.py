@@ -280,8 +280,8 @@ def test_the_continuous_form_with_noise_included(tanks):
 
 
 @pytest.mark.parametrize("mutant", ["sign of row 2", "swapped bounds", "theta", "later by one"])
-def test_the_table_sees_a_mutant(printed, integrate, numbers, monkeypatch, mutant):
-    from obsynth.designs.set_adaptive import ode as module
+def test_the_table_sees_a_mutant(printed, integrate, numbers, certify, monkeypatch, mutant):
+    from obsynth.designs.set_adaptive import step as module
 
     piece = ((100.0, 0.0, (0, 0)),)
     if mutant == "sign of row 2":
@@ -305,9 +305,7 @@ def test_the_table_sees_a_mutant(printed, integrate, numbers, monkeypatch, mutan
         monkeypatch.setattr(module, "theta_rates", wrong)
     else:
         monkeypatch.setattr(module, "drives", lambda *given: right(*given)[::-1])
-    from obsynth.designs.set_adaptive.assembly import assemble
-
-    broken = assemble(dict(printed.record))
+    broken = certify(printed.record).observer()
     found = integrate(broken, (0, 0), rtol=1e-7, pieces=((10.0, 0.0, (0, 0)),))
     healthy = integrate(printed, (0, 0), rtol=1e-7, pieces=((10.0, 0.0, (0, 0)),))
     name = "theta_m" if mutant == "theta" else "zeta_m"

@@ -6,9 +6,8 @@ import pytest
 import obsynth as ob
 from obsynth.derive.jacobian.slope_signs import Monotone, with_ranges
 from obsynth.designs.filter_bank import step as step_module
-from obsynth.designs.set_adaptive.assembly import assemble
-from obsynth.designs.set_adaptive.indicators import bank_intervals
-from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
+from obsynth.designs.filter_bank.indicators import bank_intervals
+from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.symbolic.noise import bounded_noise
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
@@ -19,7 +18,7 @@ RATES = (0.1, 0.2, 0.3, 0.5)
 
 @pytest.fixture(scope="module")
 def bank(tanks):
-    return SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION).design(tanks)
+    return FilterBank(Ts=0.01, region=REGION).design(tanks)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +128,7 @@ def test_the_unmeasured_level_is_enclosed_as_tightly_as_the_reference(paper_run,
 
 @pytest.mark.parametrize(("Ts", "key"), [(0.02, "h.02"), (0.05, "h.05"), (0.1, "h.1")])
 def test_longer_steps(tanks, closed_loop, schedule, numbers, Ts, key):
-    bank = SetAdaptiveObserver(robust=True, Ts=Ts, region=REGION).design(tanks)
+    bank = FilterBank(Ts=Ts, region=REGION).design(tanks)
     steps = round(320.0 / Ts)
     f, raised = schedule(steps, Ts)
     run = {**closed_loop(bank)(bounded_noise(1, steps, [BOUND] * 2), f, raised, x_range=START)}
@@ -199,7 +198,7 @@ def test_inclusion_in_a_thousand_hard_runs(bank, loop):
 @pytest.mark.parametrize(
     "mutant", ["no noise", "sign of the fault", "swapped ends", "late by one", "no envelope"]
 )
-def test_inclusion_sees_a_mutant(bank, closed_loop, monkeypatch, mutant):
+def test_inclusion_sees_a_mutant(bank, closed_loop, certify, monkeypatch, mutant):
     record = dict(bank.record)
     late = 0
     if mutant == "no noise":
@@ -225,7 +224,7 @@ def test_inclusion_sees_a_mutant(bank, closed_loop, monkeypatch, mutant):
         )
     else:
         late = 1
-    broken = assemble(record)
+    broken = certify(record).observer()
     loop = closed_loop(broken, late=late)
     counts = [sum(violations(broken, hard_run(loop, seed))) for seed in range(12)]
     assert sum(counts) > 0
@@ -279,7 +278,7 @@ def test_zeros_are_not_initialised(bank):
 def test_the_continuous_form_agrees_with_short_steps(bank, tanks):
     memory = bank.memory0([0.5, 0.1, 0.3], x_range=START)
     u, y = np.array([5.8e-5, 3.5e-6]), np.array([0.5, 0.1])
-    short = SetAdaptiveObserver(robust=True, Ts=1e-5, region=REGION).design(tanks)
+    short = FilterBank(Ts=1e-5, region=REGION).design(tanks)
     moved = np.array(short.step(memory, u, y)[0]).ravel()
     slope = (moved - memory) / 1e-5
     rates = np.array(bank.ode(memory, u, y)).ravel()
@@ -305,7 +304,7 @@ def test_through_simulate_and_the_fault_detector(bank, tanks):
 def test_steady_widths_are_predicted(tanks, closed_loop, bank):
     # flows through zero have slopes without a bound, so nothing is predicted over a wide region
     assert bank.half_widths is None
-    narrow = SetAdaptiveObserver(robust=True, Ts=0.01).design(tanks)
+    narrow = FilterBank(Ts=0.01).design(tanks)
     run = closed_loop(narrow)(bounded_noise(7, 40_000, [BOUND] * 2), x_range=START)
     last = slice(30_000, None)
     states = (run["x_upper"] - run["x_lower"])[last] / 2
@@ -318,6 +317,42 @@ def test_steady_widths_are_predicted(tanks, closed_loop, bank):
     smallest = ob.FaultDetector(narrow).smallest_detectable
     assert smallest == pytest.approx(2.0 * narrow.half_widths[3:], rel=1e-6)
     assert (smallest < [8e-5, 6e-5]).all()
+
+
+def test_the_old_spelling_designs_the_bank(bank, tanks, certify):
+    old = ob.SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION, Gamma=3.0, noise=False)
+    observer = old.design(tanks)
+    assert observer.method == bank.method == "filter_bank"
+    assert observer.record == bank.record
+    assert str(observer.guarantee) == str(bank.guarantee)
+    with pytest.raises(ob.ObsynthError, match="no gains") as refusal:
+        old.analyse(tanks, {"L": np.eye(3, 2)})
+    assert refusal.value.option == "robust"
+    with pytest.raises(ob.ObsynthError, match="no gains"):
+        FilterBank().analyse(tanks, {"L": np.eye(3, 2)})
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"filters": ()}, "filters is"),
+        ({"filters": (0.1, -0.2)}, "filters is"),
+        ({"Ts": 0.0}, "Ts is"),
+        ({"precision": "half"}, "precision is"),
+        ({"region": [0.1, 0.2]}, "region is"),
+        ({"region": "wide"}, "region is"),
+    ],
+)
+def test_options_out_of_range(options, words):
+    with pytest.raises(ob.ObsynthError, match=words):
+        FilterBank(**options)
+
+
+@pytest.mark.parametrize("region", [[(0, 1)], [(0, 1), (0, np.inf), (0, 1)]])
+def test_a_region_that_does_not_fit(tanks, region):
+    with pytest.raises(ob.ObsynthError, match="region") as refusal:
+        FilterBank(region=region).design(tanks)
+    assert refusal.value.option == "region"
 
 
 # -- monotone equations --------------------------------------------------------------
@@ -340,9 +375,9 @@ def test_an_equation_that_is_not_monotone_is_named():
     plant.dynamics([b * (1 - b) - a + f, a - b])
     plant.outputs([a])
     with pytest.raises(ob.StructureError, match=r"equation of a is not monotone in b") as refusal:
-        SetAdaptiveObserver(robust=True).design(plant)
+        FilterBank().design(plant)
     assert refusal.value.symbol == "b"
-    narrow = SetAdaptiveObserver(robust=True, region=[(0, 2), (0.6, 2)]).design(plant)
+    narrow = FilterBank(region=[(0, 2), (0.6, 2)]).design(plant)
     assert narrow.certificate.valid
 
 
@@ -369,9 +404,9 @@ def chain(fault_rows, **changes):
 def test_parameters_disturbances_and_two_unmeasured_states():
     plant = chain((0, 3))
     with pytest.raises(ob.StructureError, match="equation of x2 is not monotone in d"):
-        SetAdaptiveObserver(robust=True).design(plant)
+        FilterBank().design(plant)
     ordered = [(2.0, 3.0), (1.5, 2.0), (1.0, 1.5), (0.2, 1.0)]
-    bank = SetAdaptiveObserver(robust=True, Ts=0.02, region=ordered, filters=(0.5,)).design(plant)
+    bank = FilterBank(Ts=0.02, region=ordered, filters=(0.5,)).design(plant)
     rng = np.random.default_rng(3)
     F = bank.model.function()
     x, theta = np.array([2.3, 1.75, 1.2, 0.75]), np.array([0.1, -0.05])
@@ -400,7 +435,7 @@ def test_parameters_disturbances_and_two_unmeasured_states():
 )
 def test_other_plants_are_refused_by_name(rows, changes, words):
     with pytest.raises(ob.StructureError, match=words):
-        SetAdaptiveObserver(robust=True).design(chain(rows, **changes))
+        FilterBank().design(chain(rows, **changes))
 
 
 def test_an_unmeasured_state_that_grows_by_itself_is_refused():
@@ -410,4 +445,4 @@ def test_an_unmeasured_state_that_grows_by_itself_is_refused():
     plant.dynamics([-a + b + f, b - 2 * a])
     plant.outputs([a])
     with pytest.raises(ob.StructureError, match="derivative of b rises with b itself"):
-        SetAdaptiveObserver(robust=True).design(plant)
+        FilterBank().design(plant)

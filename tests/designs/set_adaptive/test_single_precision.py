@@ -1,10 +1,13 @@
 """Bounds still enclose when the step is evaluated in single precision."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 
 from obsynth.derive.rigour import outward
+from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 BOUND = 4.5e-3
@@ -132,26 +135,26 @@ def outside(observer, lanes, steps, kind=np.float32, seed=0):
 
 
 @pytest.fixture(scope="module", params=["adaptive", "bank"])
-def options(request):
+def method(request):
     if request.param == "bank":
-        return {"robust": True, "Ts": 0.01, "region": REGION}
-    return {"gain_cap": 0.5, "Ts": 0.05}
+        return FilterBank(Ts=0.01, region=REGION)
+    return SetAdaptiveObserver(gain_cap=0.5, Ts=0.05)
 
 
-def test_single_precision_encloses(tanks, options):
-    observer = SetAdaptiveObserver(**options, precision="single").design(tanks)
+def test_single_precision_encloses(tanks, method):
+    observer = replace(method, precision="single").design(tanks)
     assert "single" in str(observer.guarantee)
     assert outside(observer, 200, 100) == 0
 
 
-def test_a_step_for_double_does_not_enclose_in_single(tanks, options):
-    observer = SetAdaptiveObserver(**options).design(tanks)
+def test_a_step_for_double_does_not_enclose_in_single(tanks, method):
+    observer = method.design(tanks)
     assert outside(observer, 50, 20) > 0
     assert outside(observer, 50, 20, kind=np.float64) == 0
 
 
-def test_the_numpy_step_is_the_step(tanks, options):
-    observer = SetAdaptiveObserver(**options).design(tanks)
+def test_the_numpy_step_is_the_step(tanks, method):
+    observer = method.design(tanks)
     rng = np.random.default_rng(3)
     memory = observer.memory0([0.5, 0.1, 0.3])
     u, y = rng.uniform(0, 1e-4, 2), [0.5, 0.1]
@@ -164,8 +167,8 @@ def test_the_numpy_step_is_the_step(tanks, options):
 
 
 @pytest.mark.long
-def test_a_million_steps_in_single_precision(tanks, options):
-    observer = SetAdaptiveObserver(**options, precision="single").design(tanks)
+def test_a_million_steps_in_single_precision(tanks, method):
+    observer = replace(method, precision="single").design(tanks)
     assert outside(observer, 2000, 500) == 0
 
 

@@ -1,0 +1,122 @@
+"""`FilterBank`: options of the method, and the way from a plant to an observer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import POSITIVE
+from obsynth.designs.filter_bank.claims import claims, covers
+from obsynth.designs.filter_bank.guarantee import guarantee, numbers
+from obsynth.designs.filter_bank.model import CLASS, read, read_again
+from obsynth.designs.filter_bank.record import BankDesign, BankModel
+from obsynth.designs.filter_bank.step import build_ode, build_step, first_memory, memory_sizes
+from obsynth.symbolic.errors import ObsynthError
+
+if TYPE_CHECKING:
+    from obsynth.derive import Split
+    from obsynth.symbolic import Plant
+
+_DEFAULT_TS = 0.01
+
+
+@dataclass(frozen=True)
+class FilterBank(Method):
+    """Intervals of states and of weighted means of faults by a bank of filters.
+
+    For continuous plants whose equations are monotone in every signal that is not known at run
+    time, every output showing one state, y = s x + v with s > 0, and every fault entering the
+    equation of one measured state, alone in it, additively and with a positive constant factor.
+    The flow of an unmeasured state has to fall with that state itself.
+
+    Parameters
+    ----------
+    filters : sequence of float
+        Rates of the filters per second; the first one gives ``f_lower`` and ``f_upper``. Slow
+        filters have narrow intervals and long memories.
+    region : sequence of (float, float), optional
+        Box of the states in which monotonicity is proved and which the bank assumes; the declared
+        ranges by default.
+    Ts : float, optional
+        Sample time of `Observer.step`, .01 s by default.
+    precision : {"double", "single"}
+        In which the step runs: what its rounding may do is added to the bounds.
+
+    Raises
+    ------
+    ObsynthError
+        For an option that is not known or out of range.
+
+    Notes
+    -----
+    The bank answers what fails under noise in D. Efimov, T. Raissi, A. Zolghadri, "Set adaptive
+    observers for linear parameter-varying systems: application to fault detection", J. Dynamic
+    Systems, Measurement, and Control 136 (2014), for the same plants; it is not in the paper, and
+    there is no program to be solved and nothing singular to be evaluated.
+
+    Between two samples all states stay in an envelope X with X_0 + [0, Ts] f(X) inside X, whose
+    containment every step checks; where it fails the bank starts again. The unmeasured states come
+    from both ends of their own monotone equations, which no fault enters. Every measured state x
+    with a fault theta, x' = c + g theta, gets for every rate l filters
+
+        z' = c + l (x - z),     N' = g - l N,     z(0) = x(0),     N(0) = 0,
+
+    from below and from above, moved by their exact exponential. As x - z = N times the mean of
+    theta with the weights exp(-l age), the interval
+
+        [(x_lower - z_upper) / N, (x_upper - z_lower) / N]
+
+    encloses that mean, however the fault moves: not its present value, unless it is constant.
+    Without fault zero is never excluded, so an alarm of any filter proves a fault; the intervals of
+    the other rates follow from the memory (`bank_intervals`).
+
+    Examples
+    --------
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> bank = FilterBank(region=[(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]).design(three_tanks())
+    >>> bank.guarantee.claims[2]
+    'x3 too, whatever the faults do'
+    """
+
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="filter_bank",
+        record=BankDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+        ode=build_ode,
+        step_covered=True,
+    )
+
+    filters: Annotated[tuple[float, ...], POSITIVE] = (0.1, 0.2, 0.3, 0.5)
+    region: tuple[tuple[float, float], ...] | None = None
+    Ts: Annotated[float | None, POSITIVE] = None
+    precision: Literal["double", "single"] = "double"
+
+    def read(self, given: Plant | Split) -> BankModel:
+        """Prove over the region that the equations are monotone, and find where faults enter."""
+        return read(given, self.region)
+
+    def solve(self, model: BankModel) -> BankDesign:
+        """Put the filters to what was read; there is nothing to be solved."""
+        return BankDesign(
+            **vars(model),
+            Ts=_DEFAULT_TS if self.Ts is None else self.Ts,
+            filters=np.array(self.filters),
+            precision=self.precision,
+            options=self.options(),
+        )
+
+    def fix(self, model: BankModel, gains: Mapping[str, Any]) -> BankDesign:
+        """Refuse gains, which a bank does not have."""
+        raise ObsynthError("the bank has no gains: use design", option="gains")
