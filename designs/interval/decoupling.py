@@ -16,12 +16,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import Exact, exact, inverse, nearest
 from obsynth.designs.interval.model import IntervalModel
-from obsynth.symbolic import ObsynthError
+from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
 ORTHOGONAL = 1e-9
+MODE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,3 +185,34 @@ def _free_of(rows: Exact, columns: Exact) -> Exact:
     share: Exact = inverse(columns.T @ columns) @ columns.T
     free: Exact = rows - (rows @ columns) @ share
     return free
+
+
+def check_detectable(plant: Plant, data: Reduced) -> None:
+    """Refuse a pair (A2, C2) with a mode that does not decay and is not seen, Assumption 4."""
+    names = plant.names("x")
+    for number, A in enumerate(data.A):
+        for mode in np.linalg.eigvals(A):
+            if abs(mode) < 1.0 - MODE:
+                continue
+            pencil = np.vstack([mode * np.eye(len(A)) - A, data.C2.astype(complex)])
+            size = np.linalg.norm(pencil, axis=0)
+            size = np.where(size > 0.0, size, 1.0)
+            _, values, vectors = np.linalg.svd(pencil / size)
+            if values[-1] > MODE:
+                continue
+            motion = np.abs(data.W @ (vectors[-1].conj() / size))
+            moving = tuple(
+                name for name, v in zip(names, motion, strict=True) if v > 1e-6 * motion.max()
+            )
+            text = f"{mode.real:.6g}" if abs(mode.imag) < 1e-12 else f"{mode:.6g}"
+            raise StructureError(
+                f"the pair (A2, C2) is not detectable: once the faults are removed, a motion of "
+                f"{', '.join(moving)} with the mode {text}, which does not decay, leaves the "
+                f"outputs {', '.join(plant.output_names)} unchanged (vertex {number + 1}). "
+                f"Measure {moving[0]} as well",
+                condition="detectability",
+                symbols=moving,
+                states=moving,
+                mode=complex(mode),
+                vertex_index=number,
+            )

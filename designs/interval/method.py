@@ -16,8 +16,7 @@ from obsynth.designs.core.given import read_gains
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.options import MATRIX, read_rows
 from obsynth.designs.interval.claims import claims, covers
-from obsynth.designs.interval.decoupling import find_transformation
-from obsynth.designs.interval.gains import check_detectable, lp_problem
+from obsynth.designs.interval.decoupling import check_detectable, find_transformation
 from obsynth.designs.interval.guarantee import guarantee, numbers
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
 from obsynth.designs.interval.printed import refuse_printed
@@ -28,6 +27,7 @@ from obsynth.designs.interval.synthesis import (
     fitting_gains,
     given_gains,
     lp_design,
+    lp_problem,
     search_design,
     sylvester_design,
     with_gains,

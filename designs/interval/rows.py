@@ -8,7 +8,7 @@ are rounded and the sums are evaluated in floating point.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -248,9 +248,9 @@ def _image(left: Exact, low: Exact, high: Exact, right: Exact) -> tuple[Exact, E
 
 
 def _sizes(part: Part, names: tuple[str, ...]) -> dict[str, int]:
-    n2, m, n_u = part.S.shape[0], len(part.model.C), len(part.model.plant.u)
-    known: Mapping[str, Callable[[], int]] = {"y": lambda: m, "u": lambda: n_u, "one": lambda: 1}
-    return {name: known.get(name.rstrip("+-"), lambda: n2)() for name in names}
+    n2, m, n_u = len(part.S), len(part.model.C), len(part.model.plant.u)
+    known = {"y": m, "u": n_u, "one": 1}
+    return {name: known.get(name.rstrip("+-"), n2) for name in names}
 
 
 def _linear(

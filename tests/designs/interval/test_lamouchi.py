@@ -7,7 +7,6 @@ import pytest
 
 import obsynth as ob
 from obsynth.derive.rigour import exact, nearest
-from obsynth.designs.interval.gains import lp_problem, sylvester_gain
 from obsynth.designs.interval.printed import (
     FLAWS,
     largest_alpha,
@@ -15,7 +14,7 @@ from obsynth.designs.interval.printed import (
     printed_faults,
 )
 from obsynth.designs.interval.record import IntervalDesign
-from obsynth.designs.interval.synthesis import with_gains
+from obsynth.designs.interval.synthesis import lp_problem, sylvester_gain, with_gains
 
 BOX = np.tile([0.5, 1.5], (3, 1))
 P_PAPER = np.array([[10.0, -5.0], [-10.0, 6.0]])
