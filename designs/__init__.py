@@ -17,6 +17,8 @@ from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.hinf.method import HinfUIO
 from obsynth.designs.hinf.worst_case import WorstCase, worst_case
 from obsynth.designs.interval.method import IntervalObserver
+from obsynth.designs.qpv.method import QPVObserver
+from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "Claim",
     "Detection",
     "DetectorError",
+    "Ellipsoid",
     "FaultDetector",
     "FaultEvent",
     "FilterBank",
@@ -35,6 +38,7 @@ __all__ = [
     "InfeasibleDesign",
     "IntervalObserver",
     "Observer",
+    "QPVObserver",
     "SetAdaptiveObserver",
     "SolverTrouble",
     "WorstCase",

@@ -91,8 +91,9 @@ def _one_of(name: str, value: Any, allowed: list[Any]) -> Any:
 
 
 def _number(name: str, value: Any, limits: Number, whole: bool) -> float | int:
-    fits = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not fits or not limits.holds(value) or (whole and value != int(value)):
+    kinds = int | np.integer if whole else int | float | np.integer | np.floating
+    fits = isinstance(value, kinds) and not isinstance(value, bool)
+    if not fits or not limits.holds(value):
         raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
     return int(value) if whole else float(value)
 

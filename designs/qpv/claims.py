@@ -1,7 +1,11 @@
-"""Proofs of a stored design: every pair of vertices, every half-space, every corner."""
+"""Proofs of a stored design, and that it speaks of the stored plant.
+
+Every pair of vertices, every half-space, every corner.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
@@ -10,7 +14,6 @@ import numpy as np
 from obsynth.derive.rigour import Enclosure, ExactMatrix, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.lmi import FamilyProof, prove_family, symmetric_block
-from obsynth.designs.qpv.data import VertexData
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (
     close,
@@ -21,23 +24,73 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
+from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.polya import PolyaTerm
-from obsynth.designs.qpv.record import QPVDesign
+from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.text import write_text
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "the worst ones also by exact rational LDL'"
 
 
-def prove_design(design: QPVDesign) -> tuple[Claim, ...]:
-    """Prove everything that the guarantee rests on, from the stored numbers."""
+def claims(design: QPVDesign) -> Iterator[Claim]:
+    """Prove everything that the guarantee of a stored design rests on."""
+    yield from prove_inequalities(design)
+    product = design.fastest_mode * design.Ts
+    yield Claim(
+        "sampling",
+        f"Ts = {design.Ts:g} s resolves the fastest mode: |eigenvalue| Ts = {product:.3g} at the "
+        "vertices",
+        bool(product <= FASTEST * (1.0 + 1e-9)),
+        FASTEST - product,
+        "eigenvalues at the vertices of scheduling, state and error",
+    )
+
+
+def covers(design: QPVDesign, fresh: Derived) -> Iterator[Claim]:
+    """Compare the stored form with the one derived from the stored equations."""
+    form, stored = fresh.form, design.family
+    found = form.vertices().family
+    same = (
+        found.directions.shape == stored.directions.shape
+        and np.array_equal(found.constant, stored.constant)
+        and np.array_equal(found.directions, stored.directions)
+        and design.scheduling == tuple(write_text(v.expression) for v in form.scheduling)
+        and form.form_of_N == design.form_of_N
+        and form.names == (*design.plant.names("x"), *design.plant.names("f"))
+    )
+    room = -np.inf
+    if same:
+        outer = np.concatenate(
+            [
+                found.ranges[:, 0] - stored.ranges[:, 0],
+                stored.ranges[:, 1] - found.ranges[:, 1],
+                (stored.radius - found.radius).ravel(),
+            ]
+        )
+        room = float(outer.min(initial=np.inf))
+    linear = not any(any(matrix) for matrix in form.M)
+    yield Claim(
+        "model",
+        "the stored vertices hold the quadratic form of the stored equations, all faults as states",
+        bool(same and room >= 0 and linear and form.proof.holds),
+        room,
+        f"derived again; {form.proof}",
+    )
+
+
+def prove_inequalities(design: QPVDesign) -> Iterator[Claim]:
+    """Prove everything but the sample time."""
     sets, P = design.sets, design.P
-    claims = [_region(design), _error_set(P, sets), _start(P, sets)]
-    claims += prove_dynamics(design)
-    claims += [_bounds(design), _reset(design)]
+    yield _region(design)
+    yield _error_set(P, sets)
+    yield _start(P, sets)
+    yield from _dynamics(design)
+    yield _bounds(design)
+    yield _reset(design)
     if design.noise is not None:
-        claims.append(_noise_box(design))
-    return tuple(claims)
+        yield _noise_box(design, design.noise)
 
 
 def _claim(name: str, statement: str, proof: FamilyProof, how: str) -> Claim:
@@ -98,7 +151,7 @@ def _start(P: FloatArray, sets: ErrorSets) -> Claim:
     )
 
 
-def prove_dynamics(design: QPVDesign) -> list[Claim]:
+def _dynamics(design: QPVDesign) -> Iterator[Claim]:
     """Prove the inequalities of the error dynamics for all terms and all pairs of vertices."""
     data, terms = design.data, design.data.terms(design.polya)
     blocks: dict[str, tuple[str, Any]] = {
@@ -107,7 +160,7 @@ def prove_dynamics(design: QPVDesign) -> list[Claim]:
             lambda P, closed: decay_block(P, closed, design.alpha),
         )
     }
-    noise = design.noise
+    noise, gamma = design.noise, design.gamma
     if noise is not None:
         weights = np.diag(noise.weights)
         blocks["quadratic_boundedness"] = (
@@ -116,30 +169,22 @@ def prove_dynamics(design: QPVDesign) -> list[Claim]:
         )
     elif design.norm == "h2" and data.sizes[2]:
         blocks["h2"] = ("V' < w'w in E, (41)", lambda _, closed: h2_block(closed))
-    if design.norm == "hinf":
+    if gamma is not None:
         blocks["l2_gain"] = (
-            f"V' + z'z < {design.gamma:.6g} w'w in E, (23)",
-            lambda P, closed: hinf_block(closed, type(P).of(design.gamma)),
+            f"V' + z'z < {gamma:.6g} w'w in E, (23)",
+            lambda P, closed: hinf_block(closed, type(P).of(gamma)),
         )
-    families = [psi_family(block, design.sets, data.N_radius) for block in _distinct_blocks(data.N)]
+    distinct = data.N[:1] if (data.N[0] == data.N).all() else data.N
+    families = [psi_family(block, design.sets, data.N_radius) for block in distinct]
     if len(families) == 1:
         families *= len(data.N)
-    claims = []
     for name, (statement, formula) in blocks.items():
         proofs = [_prove_term(design, term, families, formula) for term in terms]
         worst = min(proofs, key=lambda p: (p.all_proved, p.margin))
         pairs = len(families[0].mid) if families[0].mid.ndim == 3 else 1
         kind = "vertices of the scheduling" if terms[0].total == 1 else "Polya terms"
-        claims.append(
-            _claim(
-                name, f"{statement}: {pairs} pairs of vertices, {len(terms)} {kind}", worst, RUMP
-            )
-        )
-    return claims
-
-
-def _distinct_blocks(N: FloatArray) -> FloatArray:
-    return N[:1] if (N[0] == N).all() else N
+        where = f"{pairs} pairs of vertices, {len(terms)} {kind}"
+        yield _claim(name, f"{statement}: {where}", worst, RUMP)
 
 
 def _prove_term(
@@ -254,23 +299,25 @@ def _reset(design: QPVDesign) -> Claim:
     )
 
 
-def _noise_box(design: QPVDesign) -> Claim:
-    noise, plant = design.noise, design.plant
-    box = plant.box("w")
-    total, room = Fraction(0), np.inf
-    if noise is not None:
-        for weight, radius in zip(noise.weights.tolist(), noise.radius.tolist(), strict=True):
-            total += Fraction(weight) * Fraction(radius) ** 2
-        n, n_w = len(plant.x), len(plant.w)
-        rates = [plant.f[k - n].rate or 0.0 for k in noise.faults]
-        centre, radius_w = design.w_centre, noise.radius[:n_w]
-        declared = np.concatenate([box[:, 1] - centre, centre - box[:, 0]])
-        given = np.concatenate([radius_w, radius_w])
-        room = float(np.min(given - declared, initial=np.inf))
-        room = min(room, float(np.min(noise.radius[n_w:] - np.array(rates), initial=np.inf)))
-        named = {k - n for k in noise.faults}
-        if any(s.rate for j, s in enumerate(plant.f) if j not in named):
-            room = -np.inf
+def _noise_box(design: QPVDesign, noise: NoiseBound) -> Claim:
+    plant, n, n_w = design.plant, len(design.plant.x), len(design.plant.w)
+    total = sum(
+        (Fraction(w) * Fraction(r) ** 2 for w, r in zip(noise.weights, noise.radius, strict=True)),
+        Fraction(0),
+    )
+    box, centre, radius = plant.box("w"), design.w_centre, noise.radius[:n_w]
+    rates = [plant.f[k - n].rate or 0.0 for k in noise.faults]
+    room = float(
+        np.concatenate(
+            [
+                radius - (box[:, 1] - centre),
+                radius - (centre - box[:, 0]),
+                noise.radius[n_w:] - rates,
+            ]
+        ).min(initial=np.inf)
+    )
+    if any(s.rate for k, s in enumerate(plant.f, n) if k not in noise.faults):
+        room = -np.inf
     return Claim(
         "noise",
         "the declared disturbances and rates satisfy v'W v <= 1",

@@ -4,25 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.options import POSITIVE, Number, read_matrix
+from obsynth.designs.qpv.claims import claims, covers
+from obsynth.designs.qpv.guarantee import guarantee, numbers
+from obsynth.designs.qpv.model import (
+    CLASS,
+    QPVModel,
+    check_faults,
+    check_polytope,
+    cover,
+    reach,
+    read_again,
+    read_apart,
+    read_form,
+    read_noise,
+    read_performance_output,
+    read_region,
+    unit_shape,
+)
+from obsynth.designs.qpv.printed import printed_refusal
+from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.designs.qpv.step import build_ode, build_step, first_memory, memory_sizes
+from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 if TYPE_CHECKING:
     from obsynth.derive import QPV
-    from obsynth.designs.core.observer import Observer
     from obsynth.designs.lmi import Problem
-    from obsynth.designs.qpv.work import Workspace
     from obsynth.symbolic import Plant
 
 
+ETA = Number(0.0, at_most=1.0, because="1 / eta enlarges the polytopes, so it lies in (0, 1]")
+DECAY = Number(at_least=0.0, because="a decay rate is not negative")
+ORDER = Number(at_least=2.0, because="the order s of the relaxation is an integer from 2 on")
+
+
 @dataclass(frozen=True, eq=False)
-class QPVObserver:
+class QPVObserver(Method):
     """Observer of states and process faults of parameter-varying plants, in continuous time.
 
     For ``x' = A(theta) x + B(theta) u + G(theta) w + sum_k A_fk(theta) f_k x``, ``y = C(theta) x +
@@ -107,45 +134,49 @@ class QPVObserver:
     'h2'
     """
 
-    norm: Literal["h2", "hinf"] = "h2"
+    CLASS = CLASS
+    CONTRACT = Contract(
+        name="qpv_observer",
+        record=QPVDesign,
+        read_again=read_again,
+        claims=claims,
+        covers=covers,
+        guarantee=guarantee,
+        numbers=numbers,
+        memory=memory_sizes,
+        first=first_memory,
+        step=build_step,
+        ode=build_ode,
+    )
+
+    norm: Norm = "h2"
     region: Ellipsoid | None = None
     polytope: Any = "box"
-    kappa: float | None = None
-    eta: float | None = None
-    alpha: float = 0.1
+    kappa: Annotated[float | None, POSITIVE] = None
+    eta: Annotated[float | None, ETA] = None
+    alpha: Annotated[float, DECAY] = 0.1
     performance_output: ArrayLike | None = None
-    polya: int | None = None
+    polya: Annotated[int | None, ORDER] = None
     initial_error: ArrayLike | None = None
     E_x: ArrayLike | None = None
-    alpha_q: float | None = None
-    gain_cap: float | None = None
-    form_of_N: Literal["upper", "symmetric"] = "upper"
-    Ts: float | None = None
+    alpha_q: Annotated[float | None, POSITIVE] = None
+    gain_cap: Annotated[float | None, POSITIVE] = None
+    form_of_N: FormOfN = "upper"
+    Ts: Annotated[float | None, POSITIVE] = None
     form: Literal["corrected", "printed"] = "corrected"
 
-    def __post_init__(self) -> None:
-        for name, values in (
-            ("norm", ("h2", "hinf")),
-            ("form_of_N", ("upper", "symmetric")),
-            ("form", ("corrected", "printed")),
-        ):
-            given = getattr(self, name)
-            if given not in values:
-                raise ObsynthError(
-                    f"{name} is {given!r}; it has to be one of {', '.join(map(repr, values))}",
-                    option=name,
-                )
+    def check(self) -> None:
+        """Read what is an array; refuse options that do not fit each other."""
         if not isinstance(self.region, Ellipsoid):
             raise ObsynthError(
                 f"region is {self.region!r}; the quadratic error dynamics contract only where "
                 "state and faults stay in a known set: give region=Ellipsoid(Q, c)",
                 option="region",
             )
-        self._check_numbers()
         for name in ("polytope", "performance_output", "initial_error", "E_x"):
             value = getattr(self, name)
             if value is not None and not (name == "polytope" and isinstance(value, str)):
-                object.__setattr__(self, name, _array(name, value))
+                object.__setattr__(self, name, read_matrix(name, value, (1, 2, 3)))
         if isinstance(self.polytope, str) and self.polytope not in ("box", "cross"):
             raise ObsynthError(
                 f"polytope is {self.polytope!r}; it has to be 'box', 'cross' or an array of "
@@ -166,69 +197,48 @@ class QPVObserver:
                 option="form",
             )
 
-    def _check_numbers(self) -> None:
-        for name in ("kappa", "eta", "alpha_q", "gain_cap", "Ts"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ObsynthError(f"{name} is {value!r}; it has to be positive", option=name)
-        if self.eta is not None and self.eta > 1:
+    def read(self, given: Plant | QPV) -> QPVModel:
+        """Derive the quadratic form; read the sets, the performance output and the noise."""
+        form = read_form(given, self.form_of_N)
+        region = read_region(self.region, form)
+        if self.norm == "hinf" and not form.model.w:
             raise ObsynthError(
-                f"eta is {self.eta!r}; 1 / eta enlarges the polytopes, so it lies in (0, 1]",
-                option="eta",
+                'norm="hinf" is a gain from disturbances, and the plant has none; declare '
+                'plant.disturbances(...), or use norm="h2"',
+                option="norm",
             )
-        if not (np.isfinite(self.alpha) and self.alpha >= 0):
-            raise ObsynthError(
-                f"alpha is {self.alpha!r}; a decay rate is not negative", option="alpha"
-            )
-        if self.polya is not None:
-            from obsynth.designs.qpv.polya import polya_terms
+        unit = unit_shape(self.polytope, region)
+        kappa, eta = self.kappa, self._fixed_eta
+        if kappa is None and self.E_x is None:
+            kappa = 1.0 / reach(unit, region)
+        elif kappa is None:
+            kappa = cover(unit, region) * (1.0 if eta is None else eta)
+        model = QPVModel(
+            form,
+            region,
+            unit,
+            kappa,
+            read_apart(self.E_x, self.initial_error, form),
+            read_performance_output(self.performance_output, form),
+            read_noise(self.alpha_q, form.model),
+        )
+        return check_polytope(model, eta)
 
-            polya_terms(1, self.polya)
+    def solve(self, model: QPVModel) -> QPVDesign:
+        """Find P and the gains; refuse ``form="printed"`` with what its optimum does not prove."""
+        return self._solve(model)
 
-    def design(self, model_or_form: Plant | QPV) -> Observer:
-        """Design, prove and return the observer.
+    def fix(self, model: QPVModel, gains: Mapping[str, ArrayLike]) -> QPVDesign:
+        """Find P for ``L1``, ``L2``, ... of shape (n, m), the last scheduling variable fastest.
 
-        Parameters
-        ----------
-        model_or_form : Plant or QPV
-            Continuous time.
-
-        Returns
-        -------
-        Observer
-            With a certificate in which every claim is proved.
-
-        Raises
-        ------
-        StructureError
-            If the plant is outside the class, or a fault is not seen everywhere in the sets;
-            before any LMI.
-        InfeasibleDesign
-            If the sets do not fit together, or no gain exists; says what binds.
-        CertificateError
-            For ``form="printed"``, with the printed optimum and what it does not prove.
+        A ``P`` among the gains is not looked at.
         """
-        return self._work(model_or_form).design()
+        n, m, _ = model.data.sizes
+        shapes = {f"L{k}": (n, m) for k in range(1, len(model.data.A) + 1)}
+        found = read_gains({k: value for k, value in gains.items() if k != "P"}, shapes)
+        return self._solve(model, np.stack([found[name] for name in shapes]))
 
-    def analyse(self, model_or_form: Plant | QPV, gains: Mapping[str, ArrayLike]) -> Observer:
-        """Return what the given gains guarantee, proved.
-
-        Parameters
-        ----------
-        model_or_form : Plant or QPV
-        gains : mapping
-            ``L1``, ``L2``, ... of shape (n, m), one per vertex of the scheduling variables, the
-            last variable fastest.
-
-        Raises
-        ------
-        InfeasibleDesign
-            If no P shows the required property for these gains.
-        """
-        work = self._work(model_or_form)
-        return work.design(work.read_gains(gains))
-
-    def problem(self, model_or_form: Plant | QPV) -> Problem:
+    def problem(self, given: Plant | QPV) -> Problem:
         """Return the design problem at the given eta, see `Problem.to_cvxpy`.
 
         Raises
@@ -236,37 +246,40 @@ class QPVObserver:
         ObsynthError
             If eta is not given: the inequalities are linear only for a fixed one.
         """
-        from obsynth.designs.qpv.synthesis import state_problem
-
-        work = self._work(model_or_form)
-        if work.eta is None:
+        if self._fixed_eta is None:
             raise ObsynthError("the inequalities are linear only for a fixed eta: give eta=")
-        return state_problem(work.setting(work.eta))
+        return state_problem(self.setting(self._checked(given)))
 
-    def _work(self, model_or_form: Plant | QPV) -> Workspace:
-        from obsynth.designs.qpv.work import Workspace
+    def setting(self, model: QPVModel) -> Setting:
+        """Return what the inequalities depend on, at the given eta or else at the largest one."""
+        return Setting(
+            model,
+            model.largest_eta if self._fixed_eta is None else self._fixed_eta,
+            self.norm,
+            self.alpha,
+            self.polya,
+            self.gain_cap,
+            self.form == "printed",
+        )
 
-        return Workspace.of(self, model_or_form)
-
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Mapping[str, Any]:
         """Return the options as JSON-able data, the region apart."""
-        values: dict[str, Any] = {}
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if name != "region":
-                values[name] = value.tolist() if isinstance(value, np.ndarray) else value
-        return values
+        return {name: value for name, value in super().options().items() if name != "region"}
 
     def with_eta(self, eta: float) -> QPVObserver:
         """Return the same options with another eta."""
         return replace(self, eta=eta)
 
+    @property
+    def _fixed_eta(self) -> float | None:
+        """The given eta; 1 for sets apart from each other, None to search it."""
+        return 1.0 if self.eta is None and self.E_x is not None else self.eta
 
-def _array(name: str, value: ArrayLike) -> FloatArray:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ObsynthError(f"{name} is no array of numbers: {value!r}", option=name) from error
-    if array.ndim not in (1, 2, 3) or not np.isfinite(array).all():
-        raise ObsynthError(f"{name} has to hold finite numbers; got {value!r}", option=name)
-    return array
+    def _solve(self, model: QPVModel, gains: FloatArray | None = None) -> QPVDesign:
+        setting = self.setting(model)
+        if self._fixed_eta is None:
+            setting = search_eta(setting, gains)
+        check_faults(setting.data, setting.sets, model.form.names)
+        if setting.printed:
+            raise printed_refusal(setting, gains)
+        return synthesise(setting, self.options(), gains, self.Ts)

@@ -1,59 +1,97 @@
-"""From a plant to the numbers of the method, what is outside its class refused first."""
+"""What is read of a plant, and of the options that describe sets of its states."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+import itertools
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from obsynth.derive import QPV, qpv
 from obsynth.derive.errors import StructureError
-from obsynth.designs.qpv.data import VertexData, read_vertices
-from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
-from obsynth.symbolic import Plant
+from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family
+from obsynth.designs.qpv.polytopes import Shape, box, cross, hull, one_of_each_pair
+from obsynth.designs.qpv.record import FormOfN, NoiseBound, QPVDesign, VertexData
+from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
+
+CLASS = PlantClass(
+    who="the QPV observer",
+    time="continuous",
+    forbids={
+        "d": ": the QPV observer does not decouple unknown inputs; declare a bounded one as a "
+        "disturbance, or use BoundedErrorUIO",
+        "p": " is only known to an interval; the observer schedules on measured values: give it a "
+        "value, or declare it as measured scheduling",
+    },
+    faults=(Role.ACTUATOR_FAULT, Role.SENSOR_FAULT, Role.PROCESS_FAULT),
+)
+# Outwards, so that inclusions that hold with equality can be proved in floating point.
+OUTWARDS = 1.0 + 2.0**-40
+TOLERANCE = 1e-9
+# Keeps sums of rounded weights at or below 1.
+BELOW_ONE = 1.0 - 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """A plant of the class with its quadratic form.
-
-    form: every fault is a state
-    vertices: number of vertices of the scheduling variables
-    """
+class Derived:
+    """What follows from the equations: a quadratic system in states and all faults, f' = 0."""
 
     form: QPV
-    vertices: int
+
+
+@dataclass(frozen=True, eq=False)
+class QPVModel(Derived):
+    """A plant of the class, and the sets that the options describe.
+
+    region: X
+    unit: the polytope P_x - c for kappa = 1
+    apart: polytope of the errors and corners (r, n) of that of e(0), where they are not P_x's
+    Cz (V, n_z, n)
+    noise: bounds of disturbances and fault rates, where they are taken into account
+    """
+
+    region: Ellipsoid
+    unit: Shape
+    kappa: float
+    apart: tuple[Shape, FloatArray] | None
+    Cz: FloatArray
+    noise: NoiseBound | None
+
+    @cached_property
+    def data(self) -> VertexData:
+        """The numbers of the form at the vertices of the scheduling."""
+        return VertexData.of(self.form.vertices(), self.Cz, self.noise)
 
     @property
-    def model(self) -> Plant:
-        """The continuous plant."""
-        return self.form.model
+    def largest_eta(self) -> float:
+        """The largest eta with X inside the enlarged polytope, (21)."""
+        return min(self.kappa / cover(self.unit, self.region), 1.0)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of states and faults."""
-        return self.form.names
+    def sets(self, eta: float) -> ErrorSets:
+        """Return the polytopes for a given eta."""
+        base = self.unit.scaled(self.kappa)
+        enlarged = base.scaled(OUTWARDS / eta)
+        error, start = (enlarged, one_of_each_pair(base.vertices)) if not self.apart else self.apart
+        places, entering_psi = tuple(range(error.dimension)), entering(self.data.N)
+        return ErrorSets(self.region.c, enlarged, error, places, start, *entering_psi)
 
-    def data(self, Cz: FloatArray) -> VertexData:
-        """Return the matrices with a performance output."""
-        return read_vertices(self.form.vertices().family, self.form.layout, Cz)
-
-
-def derive_form(model: Plant, form_of_N: str) -> QPV:
-    """Write the plant as a quadratic system in states and all faults, f' = 0."""
-    kind: Literal["upper", "symmetric"] = "symmetric" if form_of_N == "symmetric" else "upper"
-    return qpv(model, kind, augment="all")
+    def shrunk(self, share: float) -> QPVModel:
+        """Return the same problem for a smaller region, its polytopes with it."""
+        region = Ellipsoid(share**2 * self.region.Q, self.region.c)
+        return replace(self, region=region, unit=self.unit.scaled(share))
 
 
-def prepare(model_or_form: Any, form_of_N: str) -> Prepared:
-    """Check the class and derive the quadratic form."""
-    form = model_or_form if isinstance(model_or_form, QPV) else None
-    model: Plant = model_or_form if form is None else form.model
-    _check_signals(model)
-    if form is None:
-        form = derive_form(model, form_of_N)
+def read_form(given: Plant | QPV, form_of_N: FormOfN) -> QPV:
+    """Derive the quadratic form, or take the given one, and check what the class asks of it."""
+    form = given if isinstance(given, QPV) else qpv(given, form_of_N, augment="all")
+    model = form.model
     if len(form.names) != len(model.x) + len(model.f):
         raise StructureError(
             f"the states of the form are {', '.join(form.names)}; the observer needs the plant's "
@@ -69,47 +107,178 @@ def prepare(model_or_form: Any, form_of_N: str) -> Prepared:
                 symbols=(signal.name,),
                 condition="linear in the inputs",
             )
-    _check_scheduling(form)
-    return Prepared(form, form.vertices().count)
-
-
-def _check_signals(model: Plant) -> None:
-    if model.Ts is not None:
-        raise StructureError(
-            f"{model.name} is in discrete time and the QPV observer works in continuous time: give "
-            "the continuous plant, and Ts= of the observer for the sampling of its step",
-            condition="continuous time",
-        )
-    if model.d:
-        names = ", ".join(model.names("d"))
-        raise StructureError(
-            f"unknown input {names}: the QPV observer does not decouple unknown inputs; declare a "
-            "bounded one as a disturbance, or use BoundedErrorUIO",
-            symbols=model.names("d"),
-            condition="no unknown inputs",
-        )
-    if model.p:
-        names = ", ".join(model.names("p"))
-        raise StructureError(
-            f"parameter {names} is only known to an interval; the observer schedules on measured "
-            "values: give it a value, or declare it as measured scheduling",
-            symbols=model.names("p"),
-            condition="no uncertain parameters",
-        )
-
-
-def _check_scheduling(form: QPV) -> None:
-    known = {*form.model.names("u"), *(s.name for s in form.model.rho if s.measured)}
+    known = {*model.names("u"), *(s.name for s in model.rho if s.measured)}
     for variable in form.scheduling:
-        hidden = [name for name in variable.signals if name not in known]
+        hidden = tuple(name for name in variable.signals if name not in known)
         if hidden:
             raise StructureError(
                 f"the matrices vary with {variable.expression}, and {', '.join(hidden)} is not "
                 "measured, so the gain cannot follow it; declare it with measured=True, or bound "
                 "its effect as a disturbance",
-                symbols=tuple(hidden),
+                symbols=hidden,
                 condition="measured scheduling",
             )
+    return form
+
+
+def read_again(design: QPVDesign) -> Derived:
+    """Derive the form from the stored equations."""
+    return Derived(qpv(design.plant, design.form_of_N, augment="all"))
+
+
+def read_region(region: Any, form: QPV) -> Ellipsoid:
+    """Return X, one coordinate for every state and fault."""
+    if not isinstance(region, Ellipsoid) or region.dimension != len(form.names):
+        size = region.dimension if isinstance(region, Ellipsoid) else 0
+        raise ObsynthError(
+            f"region has {size} coordinates; {len(form.names)} are needed: {', '.join(form.names)}",
+            option="region",
+        )
+    return region
+
+
+def unit_shape(polytope: Any, region: Ellipsoid) -> Shape:
+    """Return the polytope for kappa = 1."""
+    if isinstance(polytope, str):
+        return (box if polytope == "box" else cross)(region.half_widths)
+    if polytope.ndim != 2 or polytope.shape[1] != region.dimension:
+        raise ObsynthError(
+            f"polytope has shape {polytope.shape}; vertices of {region.dimension} coordinates are "
+            "rows, offsets from the centre c",
+            option="polytope",
+        )
+    return hull(polytope)
+
+
+def reach(unit: Shape, region: Ellipsoid) -> float:
+    """Return the largest norm of a vertex in the region's metric: 1 on its boundary."""
+    vertices = unit.vertices
+    values = np.einsum("ki,ik->k", vertices, np.linalg.solve(region.Q, vertices.T))
+    return float(np.sqrt(values.max()))
+
+
+def cover(unit: Shape, region: Ellipsoid) -> float:
+    """Return how much the polytope has to be enlarged to hold the region."""
+    normals = unit.normals.mid[:, 0, :]
+    return float(np.sqrt(np.einsum("ki,ij,kj->k", normals, region.Q, normals).max()))
+
+
+def check_polytope(model: QPVModel, eta: float | None) -> QPVModel:
+    """Refuse a kappa with which X leaves the enlarged polytope, or P_x leaves X."""
+    needed, kappa = cover(model.unit, model.region), model.kappa
+    largest = 1.0 / reach(model.unit, model.region)
+    smallest = 0.0 if eta is None else eta * needed
+    if kappa < smallest * (1.0 - TOLERANCE):
+        raise InfeasibleDesign(
+            f"kappa = {kappa:.6g} is too small for eta = {eta:g}: the region X does not "
+            "lie in the enlarged polytope of the state, (21)",
+            [
+                f"kappa has to be at least {smallest:.6g} at this eta",
+                f"or eta at most {kappa / needed:.6g} at this kappa",
+            ],
+            kappa=kappa,
+            smallest=smallest,
+            largest=largest,
+        )
+    if not model.apart and kappa > largest * (1.0 + TOLERANCE):
+        raise InfeasibleDesign(
+            f"kappa = {kappa:.6g} is too large: the polytope P_x leaves the region X, "
+            "which Assumption 2 of the paper does not allow",
+            [f"kappa has to be at most {largest:.6g} for this polytope and region"],
+            kappa=kappa,
+            smallest=smallest,
+            largest=largest,
+        )
+    return model
+
+
+def read_apart(sides: Any, initial_error: Any, form: QPV) -> tuple[Shape, FloatArray] | None:
+    """Read E_x and initial_error: the box of the errors, and corners of the polytope of e(0)."""
+    if sides is None:
+        return None
+    names, n_x = form.names, len(form.model.x)
+    n = len(names)
+    if sides.shape not in ((n_x,), (n,)) or np.any(sides <= 0):
+        raise ObsynthError(
+            f"E_x holds {n_x} positive half widths (of the states), or {n} (of states and "
+            f"faults); given was {sides.tolist()}",
+            option="E_x",
+        )
+    start = start_corners(initial_error, names)
+    missing = [names[k] for k in entering(form.vertices().N)[1] if k >= sides.size]
+    if missing:
+        raise ObsynthError(
+            f"E_x says nothing of {', '.join(missing)}, whose error enters the dynamics "
+            f'(form_of_N="{form.form_of_N}"); give {n} half widths',
+            option="E_x",
+        )
+    return box(sides), start
+
+
+def start_corners(value: FloatArray, names: tuple[str, ...]) -> FloatArray:
+    """Read half widths of the box of e(0), or its vertices; one of every pair v, -v."""
+    n = len(names)
+    if value.ndim == 2 and value.shape[1] == n and len(value):
+        return one_of_each_pair(value)
+    if value.shape != (n,) or np.any(value < 0):
+        raise ObsynthError(
+            f"initial_error holds the half widths of {', '.join(names)}, or vertices in rows; "
+            f"given was {value.tolist()}",
+            option="initial_error",
+        )
+    ends = [(-side, side) if side > 0 else (0.0,) for side in value.tolist()]
+    return one_of_each_pair(np.array(list(itertools.product(*ends))))
+
+
+def read_performance_output(value: Any, form: QPV) -> FloatArray:
+    """Read Cz for every vertex of the scheduling, shape (V, n_z, n)."""
+    n, n_x, count = len(form.names), len(form.model.x), form.vertices().count
+    if value is None:
+        value = np.eye(n)[n_x:] if n > n_x else np.eye(n)
+    Cz = np.atleast_2d(np.asarray(value, dtype=float))
+    if Cz.ndim == 2:
+        Cz = np.broadcast_to(Cz, (count, *Cz.shape)).copy()
+    if Cz.shape[0] != count or Cz.shape[2] != n:
+        raise ObsynthError(
+            f"performance_output has shape {np.shape(value)}; z = Cz e needs {n} columns "
+            f"({', '.join(form.names)}), and {count} matrices if it varies",
+            option="performance_output",
+        )
+    return Cz
+
+
+def noise_centre(model: Plant) -> FloatArray:
+    """Return the middle of the declared disturbances, 0 where they have no bound, shape (n_w,)."""
+    w = np.where(np.isfinite(model.box("w")).all(axis=1, keepdims=True), model.box("w"), 0.0)
+    return np.asarray(w.mean(axis=1))
+
+
+def read_noise(rate: float | None, model: Plant) -> NoiseBound | None:
+    """Weigh disturbances and fault rates for quadratic boundedness at a rate, in equal parts."""
+    if rate is None:
+        return None
+    free = tuple(s.name for s in model.w if not s.bounded)
+    if free:
+        raise ObsynthError(
+            f"alpha_q bounds the error for bounded disturbances, and {', '.join(free)} has no "
+            "bound; declare it with bound= or range=",
+            option="alpha_q",
+            symbols=free,
+        )
+    centre, w = noise_centre(model), model.box("w")
+    radius = np.maximum(w[:, 1] - centre, centre - w[:, 0])
+    moving = [k for k, s in enumerate(model.f) if s.rate]
+    rates = [float(model.f[k].rate or 0.0) for k in moving]
+    both = np.nextafter(np.concatenate([radius, rates]), np.inf)
+    if not both.size:
+        raise ObsynthError(
+            "alpha_q bounds the error under disturbances and fault rates, and the plant has "
+            "neither; without them the error decays with alpha",
+            option="alpha_q",
+        )
+    n = len(model.x)
+    weights = BELOW_ONE / (both.size * both**2)
+    return NoiseBound(rate, weights, both, tuple(n + k for k in moving))
 
 
 def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> None:

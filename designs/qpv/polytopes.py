@@ -6,18 +6,18 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from obsynth.derive import polytope_from_halfspaces, polytope_from_vertices
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import Enclosure
+from obsynth.designs.core.record import Context
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 Kind = Literal["box", "cross", "hull"]
-KINDS: tuple[Kind, ...] = ("box", "cross", "hull")
 _MOST = 2**14
 
 
@@ -93,16 +93,12 @@ class Shape:
             return Shape(self.kind, self.data[chosen])
         return hull(self.vertices[:, chosen])
 
-    def to_record(self) -> dict[str, Any]:
-        """Return JSON-able data."""
-        return {"kind": self.kind, "data": self.data.tolist()}
-
     @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Shape:
-        """Read what `to_record` returned; a ValueError says what does not fit."""
-        data = np.asarray(record["data"], dtype=float)
-        kind = record["kind"]
-        if kind not in KINDS or data.ndim != (2 if kind == "hull" else 1):
+    def from_record(cls, stored: Mapping[str, Any], context: Context) -> Shape:
+        """Read a stored polytope; a ValueError says what does not fit."""
+        data = np.asarray(stored["data"], dtype=float)
+        kind = stored["kind"]
+        if kind not in get_args(Kind) or data.ndim != (2 if kind == "hull" else 1):
             raise ValueError(f"no polytope: kind {kind!r}, data of shape {data.shape}")
         if not np.isfinite(data).all() or (kind != "hull" and np.any(data <= 0)):
             raise ValueError(f"the data of a {kind} are not positive and finite")
@@ -132,6 +128,17 @@ def hull(vertices: FloatArray) -> Shape:
             offset=float(found.offsets.min()),
         )
     return Shape("hull", found.normals / found.offsets[:, None])
+
+
+def one_of_each_pair(vertices: FloatArray) -> FloatArray:
+    """Keep one of every pair v, -v, and those without a mirror image."""
+    seen: set[bytes] = set()
+    kept = []
+    for row in vertices + 0.0:
+        if (0.0 - row).tobytes() not in seen:
+            seen.add(row.tobytes())
+            kept.append(row)
+    return np.array(kept)
 
 
 def _signs(n: int) -> FloatArray:

@@ -1,12 +1,14 @@
-"""The gains that the paper prints for its example, to the printed digits."""
+"""What the paper prints: the gains of its example, and conditions that do not prove it."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.qpv.synthesis import Setting, solve_with_proof
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 _FIRST = [
@@ -31,7 +33,7 @@ _H2 = [
 _LISTS = {"first": [*_FIRST, _FIRST[2]], "H2": _H2}
 
 
-def printed_gains(name: Literal["first", "H2"]) -> dict[str, NDArray[np.float64]]:
+def printed_gains(name: Literal["first", "H2"]) -> dict[str, FloatArray]:
     """Return L1, ..., L4 of Rotondo, Buciakowski and Witczak, Section 5."""
     if name not in _LISTS:
         raise ObsynthError(f"there are gains 'first' and 'H2', not {name!r}", name=name)
@@ -39,3 +41,33 @@ def printed_gains(name: Literal["first", "H2"]) -> dict[str, NDArray[np.float64]
         f"L{k}": np.array(text.split(), dtype=float).reshape(6, 3)
         for k, text in enumerate(_LISTS[name], 1)
     }
+
+
+def printed_refusal(setting: Setting, gains: FloatArray | None = None) -> CertificateError:
+    """Solve the printed inequalities and show what their solution does not satisfy."""
+    unknowns, found = solve_with_proof(setting, lambda _: True, gains)
+    P, sets = unknowns.P, setting.sets
+    start = float(np.einsum("ki,ij,kj->k", sets.start, P, sets.start).max())
+    normals = sets.normals.mid[:, 0, :]
+    inside = float(np.einsum("ki,ik->k", normals, np.linalg.solve(P, normals.T)).max())
+    letter = "mu" if setting.norm == "h2" else "gamma"
+    return CertificateError(
+        f"the conditions (19) and (20) as printed have the solution {letter} = "
+        f"{found.objective:.6g}, and it does not prove what they are for",
+        [
+            "they describe e'P^-1 e <= 1, while V = e'P e decays",
+            f"E = {{V <= 1}} has to lie in the polytope of the error: the largest "
+            f"eta^2 a_k'P^-1 a_k is {inside:.6g}, above 1"
+            if inside > 1
+            else f"E lies in the polytope of the error ({inside:.6g})",
+            f"P_e has to lie in E: the largest V at its corners is {start:.6g}"
+            + (", above 1" if start > 1 else ""),
+            'form="corrected" states both for V',
+        ],
+        mu=found.objective,
+        P=P,
+        gains={f"L{k}": gain for k, gain in enumerate(unknowns.gains, 1)},
+        error_set=inside,
+        start=start,
+        solution=dict(found.values),
+    )

@@ -3,46 +3,131 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from obsynth.derive.forms.qpv.form import QPVVertices
 from obsynth.derive.forms.qpv.layout import QPVLayout
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import plain_fields, read_family, reading
-from obsynth.designs.qpv.data import VertexData, read_vertices
-from obsynth.designs.qpv.error_matrix import ErrorSets, entering
+from obsynth.designs.core.record import Record
+from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_kept
+from obsynth.designs.qpv.polya import PolyaTerm, collapsed_terms, polya_terms
 from obsynth.designs.qpv.polytopes import Shape
 from obsynth.designs.qpv.region import Ellipsoid
-from obsynth.designs.qpv.synthesis import Norm
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-METHOD = "qpv_observer"
+Norm = Literal["h2", "hinf"]
+FormOfN = Literal["upper", "symmetric"]
+FASTEST = 1.0
+"""Largest product of sample time and modulus of a mode.
+
+A Runge-Kutta step of order four then errs by less than one per cent of the change of that mode,
+and is far from its limit of stability.
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseBound:
+class VertexData:
+    """Matrices of the augmented plant at the V vertices of the scheduling variables.
+
+    A, G, C, H: shapes (V, n, n), (V, n, n_v), (V, m, n), (V, m, n_v), n with the faults;
+        disturbances first, then the rates of faults that have one
+    N (V, n, n, n): N[l, i] is N_i
+    Cz (V, n_z, n): performance output
+    A_radius, G_radius, C_radius, H_radius, N_radius: what rounding may add, the same at every
+        vertex
+    """
+
+    A: FloatArray
+    G: FloatArray
+    C: FloatArray
+    H: FloatArray
+    N: FloatArray
+    Cz: FloatArray
+    A_radius: FloatArray
+    G_radius: FloatArray
+    C_radius: FloatArray
+    H_radius: FloatArray
+    N_radius: FloatArray
+
+    @classmethod
+    def of(cls, corners: QPVVertices, Cz: FloatArray, noise: NoiseBound | None) -> VertexData:
+        """Take the blocks of a form, and the rates of faults as disturbances where bounded."""
+        blocks = {name: getattr(corners, name) for name in ("A", "G", "C", "H", "N")}
+        radii = {f"{name}_radius": corners.radius(name) for name in blocks}
+        data = cls(Cz=Cz, **blocks, **radii)
+        return data if noise is None else data.with_rates(list(noise.faults))
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of states with faults, outputs, disturbances."""
+        return self.A.shape[1], self.C.shape[1], self.G.shape[2]
+
+    @property
+    def collapses(self) -> bool:
+        """Whether C and H are the same at all vertices, so that double sums are single ones."""
+        return bool((self.C[0] == self.C).all() and (self.H[0] == self.H).all())
+
+    def terms(self, polya: int | None) -> tuple[PolyaTerm, ...]:
+        """Terms of the relaxation; collapsed where that is exact, of order 2 by default."""
+        count = len(self.A)
+        if self.collapses or count == 1:
+            return collapsed_terms(count)
+        return polya_terms(count, 2 if polya is None else polya)
+
+    def scaled(self, half: FloatArray) -> VertexData:
+        """Rewrite for errors in units of `half`; radii are dropped, since this only guides."""
+        return replace(
+            self,
+            A=self.A * half / half[:, None],
+            G=self.G / half[:, None],
+            C=self.C * half,
+            Cz=self.Cz * half,
+        )
+
+    def psi(self, sets: ErrorSets) -> FloatArray:
+        """Extreme values of Psi, shape (V, kept, n, n)."""
+        return psi_kept(self.N, sets)
+
+    def with_rates(self, faults: list[int]) -> VertexData:
+        """Add one disturbance for the rate of change of each of some states."""
+        vertices, n = self.A.shape[:2]
+        m = self.C.shape[1]
+        more = np.eye(n)[:, faults]
+        still = np.zeros((vertices, m, len(faults)))
+        return replace(
+            self,
+            G=np.concatenate([self.G, np.broadcast_to(more, (vertices, *more.shape))], axis=2),
+            H=np.concatenate([self.H, still], axis=2),
+            G_radius=np.hstack([self.G_radius, np.zeros_like(more)]),
+            H_radius=np.hstack([self.H_radius, np.zeros((m, len(faults)))]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseBound(Record):
     """Bounded disturbances of a design by quadratic boundedness.
 
     rate: alpha_q: V' <= alpha_q (1 - V)
-    weights (n_v,): diagonal of W; every admissible v has v'W v <= 1
-    radius (n_v,): largest |v_i|: disturbances about their centre, then rates of faults
+    weights: diagonal of W; every admissible v has v'W v <= 1
+    radius: largest |v_i|: disturbances about their centre, then rates of faults
     faults: positions among the augmented states of the faults whose rates are in v
     """
 
     rate: float
-    weights: FloatArray
-    radius: FloatArray
+    weights: Annotated[FloatArray, "n_v"]
+    radius: Annotated[FloatArray, "n_v"]
     faults: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class QPVDesign:
-    """Everything that is deployed and proved, in doubles.
+class QPVDesign(Record):
+    """Everything that is deployed and proved, in doubles; states of the form are states, faults.
 
     plant: the continuous plant
     form_of_N: see `obsynth.qpv`
@@ -50,40 +135,38 @@ class QPVDesign:
     scheduling: the scheduling variables as expressions of inputs and scheduling signals
     region: X, in which the augmented state is assumed to stay
     state, error: polytopes of x - c and of e, see `ErrorSets`
-    start (r, n): corners of the polytope of e(0)
+    start: corners of the polytope of e(0)
     alpha: decay of V without disturbances
-    Cz (V, n_z, n)
-    w_centre (n_w,): middle of the declared disturbances
-    P (n, n)
-    L (V, n, m)
-    gamma: proved bound of the squared L2 gain; infinite where it is not claimed
-    rows (V, n_z): proved upper bounds of the diagonal of Cz P^-1 Cz'
-    inverse_diagonal (n,): proved upper bounds of (P^-1)_ii
+    w_centre: middle of the declared disturbances
+    L: gains at the vertices of the scheduling
+    gamma: proved bound of the squared L2 gain, where it is claimed
+    rows: proved upper bounds of the diagonal of Cz P^-1 Cz'
+    inverse_diagonal: proved upper bounds of (P^-1)_ii
     reset: X - c lies in {e'P e <= reset^2}, proved
     Ts: sample time of the step
     options: the options of the method, as given
     """
 
     plant: Plant
-    form_of_N: str
-    family: AffineFamily
+    form_of_N: FormOfN
+    family: Annotated[AffineFamily, "n+n_f+m columns"]
     scheduling: tuple[str, ...]
     region: Ellipsoid
     state: Shape
     error: Shape
     error_coordinates: tuple[int, ...]
-    start: FloatArray
+    start: Annotated[FloatArray, "r n+n_f"]
     norm: Norm
     alpha: float
     noise: NoiseBound | None
     polya: int | None
-    Cz: FloatArray
-    w_centre: FloatArray
-    P: FloatArray
-    L: FloatArray
-    gamma: float
-    rows: FloatArray
-    inverse_diagonal: FloatArray
+    Cz: Annotated[FloatArray, "V n_z n+n_f"]
+    w_centre: Annotated[FloatArray, "n_w"]
+    P: Annotated[FloatArray, "n+n_f n+n_f"]
+    L: Annotated[FloatArray, "V n+n_f m"]
+    gamma: float | None
+    rows: Annotated[FloatArray, "V n_z"]
+    inverse_diagonal: Annotated[FloatArray, "n+n_f"]
     reset: float
     Ts: float
     options: Mapping[str, Any]
@@ -92,33 +175,24 @@ class QPVDesign:
     def layout(self) -> QPVLayout:
         """Where the blocks of the family are."""
         plant = self.plant
-        return QPVLayout(
-            len(plant.x) + len(plant.f),
-            len(plant.output),
-            len(plant.u),
-            0,
-            0,
-            len(plant.w),
-        )
+        n = len(plant.x) + len(plant.f)
+        return QPVLayout(n, len(plant.output), len(plant.u), 0, 0, len(plant.w))
 
     @cached_property
     def data(self) -> VertexData:
         """Matrices at the vertices, rates of faults included where they are bounded."""
-        data = read_vertices(self.family, self.layout, self.Cz)
-        return data if self.noise is None else data.with_rates(list(self.noise.faults))
+        return VertexData.of(QPVVertices(self.family, self.layout), self.Cz, self.noise)
 
     @cached_property
     def sets(self) -> ErrorSets:
         """The polytopes over which the inequalities hold."""
-        state, error = entering(self.data.N)
         return ErrorSets(
             self.region.c,
             self.state,
             self.error,
             self.error_coordinates,
             self.start,
-            state,
-            error,
+            *entering(self.data.N),
         )
 
     @property
@@ -126,97 +200,51 @@ class QPVDesign:
         """Whether the error is bounded at all times: by `noise`, or without disturbances."""
         return self.noise is not None or not self.plant.w
 
-    def to_record(self) -> dict[str, Any]:
-        """Return the design as JSON-able data."""
-        gamma = self.gamma if np.isfinite(self.gamma) else None
-        return {**plain_fields(self), "gamma": gamma}
+    @property
+    def trace(self) -> float:
+        """Proved bound of trace(Cz P^-1 Cz')."""
+        return float(self.rows.sum(axis=1).max(initial=0.0))
 
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> QPVDesign:
-        """Read and check the data of `to_record`."""
-        with reading():
-            design = cls._read(record)
-        design._check()
-        return design
+    @cached_property
+    def fastest_mode(self) -> float:
+        """The largest modulus of an eigenvalue of A + Psi - L C, over vertices, in 1/s."""
+        data = self.data
+        largest = 0.0
+        for A, members, gain in zip(data.A, data.psi(self.sets), self.L, strict=True):
+            for C in np.unique(data.C, axis=0):
+                modes = np.linalg.eigvals(A + members - gain @ C)
+                largest = max(largest, float(np.abs(modes).max()))
+        return largest
 
-    @classmethod
-    def _read(cls, record: Mapping[str, Any]) -> QPVDesign:
-        noise = record["noise"]
-        shape = np.asarray(record["family"]["constant"], dtype=float).shape
-        family = read_family(record["family"], (shape[0], shape[1]))
-        norm: Norm = "hinf" if record["norm"] == "hinf" else "h2"
-        if record["norm"] != norm or record["form_of_N"] not in ("upper", "symmetric"):
-            raise ValueError(f"norm {record['norm']!r}, form_of_N {record['form_of_N']!r}")
-        region = record["region"]
-        return cls(
-            plant=Plant.from_dict(record["plant"]),
-            form_of_N=str(record["form_of_N"]),
-            family=family,
-            scheduling=tuple(map(str, record["scheduling"])),
-            region=Ellipsoid(region["Q"], region["c"]),
-            state=Shape.from_record(record["state"]),
-            error=Shape.from_record(record["error"]),
-            error_coordinates=tuple(map(int, record["error_coordinates"])),
-            start=np.asarray(record["start"], dtype=float),
-            norm=norm,
-            alpha=float(record["alpha"]),
-            noise=None
-            if noise is None
-            else NoiseBound(
-                float(noise["rate"]),
-                np.asarray(noise["weights"], dtype=float),
-                np.asarray(noise["radius"], dtype=float),
-                tuple(map(int, noise["faults"])),
-            ),
-            polya=None if record["polya"] is None else int(record["polya"]),
-            Cz=np.asarray(record["Cz"], dtype=float),
-            w_centre=np.asarray(record["w_centre"], dtype=float),
-            P=np.asarray(record["P"], dtype=float),
-            L=np.asarray(record["L"], dtype=float),
-            gamma=np.inf if record["gamma"] is None else float(record["gamma"]),
-            rows=np.asarray(record["rows"], dtype=float),
-            inverse_diagonal=np.asarray(record["inverse_diagonal"], dtype=float),
-            reset=float(record["reset"]),
-            Ts=float(record["Ts"]),
-            options=dict(record["options"]),
-        )
-
-    def _check(self) -> None:
-        layout, count = self.layout, self.family.vertex_count
-        n, m, n_w = layout.states, layout.outputs, layout.disturbances
-        n_z = self.Cz.shape[1] if self.Cz.ndim == 3 else -1
-        shapes = {
-            "family": (self.family.constant, layout.shape),
-            "radius": (self.family.radius, layout.shape),
-            "c": (self.region.c, (n,)),
-            "start": (self.start, (len(self.start), n)),
-            "Cz": (self.Cz, (count, n_z, n)),
-            "w_centre": (self.w_centre, (n_w,)),
-            "P": (self.P, (n, n)),
-            "L": (self.L, (count, n, m)),
-            "rows": (self.rows, (count, n_z)),
-            "inverse_diagonal": (self.inverse_diagonal, (n,)),
-            "ranges": (self.family.ranges, (len(self.scheduling), 2)),
+    def check(self) -> None:
+        """Refuse sizes, coordinates and numbers that annotations do not tell."""
+        layout, noise, places = self.layout, self.noise, self.error_coordinates
+        n, n_x = layout.states, len(self.plant.x)
+        sizes = {
+            "columns of family": (self.family.constant.shape[1], layout.shape[1]),
+            "gains L": (len(self.L), self.family.vertex_count),
+            "ranges of family": (len(self.family.ranges), len(self.scheduling)),
+            "coordinates of region": (self.region.dimension, n),
+            "coordinates of state": (self.state.dimension, n),
+            "coordinates of error": (self.error.dimension, len(places)),
         }
-        if self.noise is not None:
-            shapes["noise weights"] = (self.noise.weights, (n_w + len(self.noise.faults),))
-            shapes["noise radius"] = (self.noise.radius, self.noise.weights.shape)
-        for name, (value, shape) in shapes.items():
-            if value.shape != shape:
+        if noise is not None:
+            wanted = layout.disturbances + len(noise.faults)
+            sizes["noise weights"] = (noise.weights.size, wanted)
+        for name, (found, needed) in sizes.items():
+            if found != needed:
                 raise CertificateError(
-                    f"{name} has shape {value.shape} in the stored design; the plant needs {shape}"
+                    f"the stored design has {found} {name}; the plant needs {needed}"
                 )
-            if not np.all(np.isfinite(value)):
-                raise CertificateError(f"{name} of the stored design is not finite")
-        places = self.error_coordinates
-        if self.state.dimension != n or self.error.dimension != len(places):
-            raise CertificateError("the stored polytopes do not have the plant's coordinates")
+        if noise is not None and not all(n_x <= k < n for k in noise.faults):
+            raise CertificateError(f"noise.faults of the stored design are {noise.faults}")
         missing = set(self.sets.error_entering) - set(places)
         if missing or not all(0 <= k < n for k in places) or len(set(places)) != len(places):
             raise CertificateError(
                 f"the polytope of the error is in the coordinates {places}; those that enter are "
                 f"{self.sets.error_entering}"
             )
-        numbers = (self.alpha, self.reset, self.Ts)
-        if not (np.isfinite(numbers).all() and self.Ts > 0 and self.alpha >= 0):
-            raise CertificateError("alpha, reset and Ts of the stored design are no usable numbers")
+        if self.Ts <= 0 or self.alpha < 0:
+            raise CertificateError("alpha or Ts of the stored design is negative")
+        if (self.gamma is None) == (self.norm == "hinf"):
+            raise CertificateError("gamma of the stored design belongs to norm 'hinf'")

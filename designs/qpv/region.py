@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,8 +40,8 @@ class Ellipsoid:
     (0.5, [2.0, 1.0])
     """
 
-    Q: FloatArray
-    c: FloatArray
+    Q: Annotated[FloatArray, "N N"]
+    c: Annotated[FloatArray, "N"]
 
     def __init__(self, Q: ArrayLike, c: ArrayLike) -> None:
         centre = _numbers("c", c)

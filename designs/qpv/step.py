@@ -7,33 +7,85 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+import sympy as sp
 from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.step import largest_level
-from obsynth.designs.core.stepping import all_finite, finite_or, make_step, select, status_word
+from obsynth.designs.core.given import Start, read_vector
+from obsynth.designs.core.stepping import (
+    all_finite,
+    finite_or,
+    make_step,
+    select,
+    slices,
+    status_word,
+)
 from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.schedule import measured_schedule, vertex_weights
-from obsynth.designs.starting import read_box, read_vector
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.signals import Signal
+from obsynth.symbolic.text import read_text
 
 # Above the rounding of the few dozen operations behind every returned number.
 _UP = 1.0 + 2.0**-40
 
 
-def memory_layout(n: int, n_f: int) -> dict[str, slice]:
+def memory_sizes(design: QPVDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
     ``xhat``, ``fhat``, ``level`` (a bound of V = e'P e, infinite where none is known) and
     ``initialised`` (0 or 1).
     """
-    sizes = {"xhat": n, "fhat": n_f, "level": 1, "initialised": 1}
-    layout: dict[str, slice] = {}
-    at = 0
-    for name, size in sizes.items():
-        layout[name] = slice(at, at + size)
-        at += size
-    return layout
+    plant = design.plant
+    return {"xhat": len(plant.x), "fhat": len(plant.f), "level": 1, "initialised": 1}
+
+
+def first_memory(
+    design: QPVDesign, start: Start, fhat0: ArrayLike | None = None
+) -> dict[str, ArrayLike]:
+    """Start at the guess; fhat0 is the middle of f_range, or given; y0 is not needed."""
+    plant = design.plant
+    fhat = start.f.mean(axis=1) if fhat0 is None else read_vector(fhat0, "fhat0", plant.names("f"))
+    state = np.concatenate([start.guess, fhat])
+    x_box = plant.box("x") if start.x_range is None else start.x_range
+    box = np.concatenate([x_box, start.f]) - state[:, None]
+    offset = state - design.region.c
+    level = float((np.sqrt(offset @ design.P @ offset) + design.reset) ** 2 * _UP)
+    if np.isfinite(box).all():
+        level = min(level, largest_level(design.P, box[:, 0], box[:, 1]))
+    return {"xhat": start.guess, "fhat": fhat, "level": level if level <= 1.0 else np.inf}
+
+
+def measured_schedule(plant: Plant) -> tuple[Signal, ...]:
+    """Scheduling signals whose values the step is given, in the order of declaration."""
+    return tuple(s for s in plant.rho if s.measured)
+
+
+def vertex_weights(design: QPVDesign, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the weights of the vertices, and whether the scheduling lies in its range.
+
+    Shapes: weights (V, 1).
+    """
+    values = _values(design, u, theta)
+    weights, inside = [ca.SX(1)], ca.SX(1)
+    for value, (low, high) in zip(values, design.family.ranges.tolist(), strict=True):
+        inside = ca.logic_and(inside, ca.logic_and(value >= low, value <= high))
+        if low == high:
+            continue
+        share = ca.fmin(ca.fmax((value - low) / (high - low), 0.0), 1.0)
+        weights = [weight * part for weight in weights for part in (1.0 - share, share)]
+    return ca.vertcat(*weights), inside
+
+
+def _values(design: QPVDesign, u: ca.SX, theta: ca.SX) -> list[ca.SX]:
+    plant = design.plant
+    signals = [*plant.u, *measured_schedule(plant)]
+    entries = ca.vertsplit(ca.vertcat(u, theta)) if signals else []
+    table = {s.symbol: entry for s, entry in zip(signals, entries, strict=True)}
+    symbols: dict[str, sp.Symbol] = {s.name: s.symbol for s in signals}
+    expressions = [read_text(text, symbols) for text in design.scheduling]
+    return to_sx(expressions, table, list(design.scheduling)) if expressions else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +146,7 @@ def _symbols(plant: Plant) -> dict[str, ca.SX]:
 def build_ode(design: QPVDesign) -> ca.Function:
     """Return `Observer.ode`: (memory, u, y[, theta]) -> dmemory."""
     plant = design.plant
-    layout = memory_layout(len(plant.x), len(plant.f))
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     found = _symbols(plant)
     u, y, theta = found["u"], found["y"], found["theta"]
@@ -161,7 +213,7 @@ def build_step(design: QPVDesign) -> ca.Function:
     """Return `Observer.step`: the Runge-Kutta step of order four with u, y and theta held."""
     plant = design.plant
     n, n_f, m = len(plant.x), len(plant.f), len(plant.output)
-    layout = memory_layout(n, n_f)
+    layout = slices(memory_sizes(design))
     memory = ca.SX.sym("memory", layout["initialised"].stop)
     found = _symbols(plant)
     u, y, theta = found["u"], found["y"], found["theta"]
@@ -244,39 +296,3 @@ def _runge_kutta(rate: Callable[[ca.SX], ca.SX], state: ca.SX, step: float) -> c
     k3 = rate(state + 0.5 * step * k2)
     k4 = rate(state + step * k3)
     return state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
-def make_start(design: QPVDesign) -> Callable[..., FloatArray]:
-    """Return the function behind `Observer.memory0`."""
-    plant = design.plant
-    names, faults = plant.names("x"), plant.names("f")
-    n, n_f = len(names), len(faults)
-    layout = memory_layout(n, n_f)
-
-    def start(
-        guess: ArrayLike,
-        x_range: ArrayLike | None = None,
-        f_range: ArrayLike | None = None,
-        y0: ArrayLike | None = None,
-        fhat0: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Start at the guess; fhat0 is the middle of f_range, or given; y0 is not needed."""
-        point = read_vector(guess, "guess", names)
-        x_box = plant.box("x") if x_range is None else read_box(x_range, "x_range", names)
-        f_box = np.zeros((n_f, 2)) if f_range is None else read_box(f_range, "f_range", faults)
-        fhat = f_box.mean(axis=1) if fhat0 is None else read_vector(fhat0, "fhat0", faults)
-        state = np.concatenate([point, fhat])
-        box = np.concatenate([x_box, f_box]) - state[:, None]
-        level = np.inf
-        if np.isfinite(box).all():
-            level = largest_level(design.P, box[:, 0], box[:, 1])
-        offset = state - design.region.c
-        from_region = (np.sqrt(offset @ design.P @ offset) + design.reset) ** 2 * _UP
-        level = min(level, float(from_region))
-        memory = np.zeros(layout["initialised"].stop)
-        memory[: n + n_f] = state
-        memory[layout["level"]] = level if level <= 1.0 else np.inf
-        memory[layout["initialised"]] = 1.0
-        return memory
-
-    return start

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi import (
     Affine,
+    Knob,
     MarginSolution,
     Problem,
     cap_gain,
     full,
+    largest_margin,
     scalar,
+    search_line,
+    smallest_changes,
     solve_reliably,
     solve_with_margin,
     split_common,
@@ -22,7 +29,7 @@ from obsynth.designs.lmi import (
     symmetric_block,
     trace,
 )
-from obsynth.designs.qpv.data import VertexData
+from obsynth.designs.qpv.claims import inverse_bounds, prove_inequalities, region_factor
 from obsynth.designs.qpv.error_matrix import ErrorSets
 from obsynth.designs.qpv.lmis import (
     Closed,
@@ -34,41 +41,57 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
+from obsynth.designs.qpv.model import QPVModel, noise_centre
 from obsynth.designs.qpv.polya import PolyaTerm
+from obsynth.designs.qpv.record import FASTEST, Norm, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
-
-Norm = Literal["h2", "hinf"]
+from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.text import write_text
 
 # Part of the largest margin that phase 2 keeps; the objective loses about as much, relatively.
-_FRACTION = 1e-5
-
+FRACTION = 1e-5
 # What a search tolerates: the smallest eigenvalue, where the sets have size one, and the gap.
-_ROUGH = -1e-5
-_ROUGH_GAP = 1e-3
+ROUGH = -1e-5
+ROUGH_GAP = 1e-3
+# Shares of the largest eta that are tried before the golden sections.
+SHARES = (0.2, 0.4, 0.6, 0.8)
+REFINE = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
     """Everything that the inequalities depend on besides the unknowns.
 
+    eta: 1 / eta enlarges the polytopes
     alpha: decay rate of V = e'P e
-    alpha_q: rate of quadratic boundedness
-    noise (n_v,) or None: weights of the disturbances, w'W w <= 1
+    polya: order of the relaxation
     gain_cap: largest singular value of every L_l
     printed: whether (19) and (20) are taken as printed
-    half (n,): units of the error
     """
 
-    data: VertexData
-    sets: ErrorSets
+    model: QPVModel
+    eta: float
     norm: Norm
     alpha: float
-    alpha_q: float | None
-    noise: FloatArray | None
     polya: int | None
     gain_cap: float | None
     printed: bool
-    half: FloatArray
+
+    @property
+    def data(self) -> VertexData:
+        """Matrices at the vertices."""
+        return self.model.data
+
+    @cached_property
+    def sets(self) -> ErrorSets:
+        """The polytopes."""
+        return self.model.sets(self.eta)
+
+    @cached_property
+    def half(self) -> FloatArray:
+        """Units of the error, shape (n,)."""
+        half = np.abs(self.sets.start).max(axis=0)
+        return np.where(half > 0, half, self.model.region.half_widths)
 
     @property
     def terms(self) -> tuple[PolyaTerm, ...]:
@@ -127,7 +150,7 @@ def state_problem(setting: Setting, gains: FloatArray | None = None) -> Problem:
             cap_gain(problem, inverse @ P @ inverse, inverse @ gamma, setting.gain_cap, f"L{k}")
     if level is None:
         Z = symmetric("Z", data.Cz.shape[1])
-        for number, Cz in enumerate(_distinct(data.Cz)):
+        for number, Cz in enumerate(np.unique(data.Cz, axis=0)):
             problem.add_lmi(f"trace {number}", symmetric_block([[P], [Cz, Z]]), ">>")
         problem.minimise(trace(Z))
     else:
@@ -143,14 +166,13 @@ def _state_term(
     level: Affine | None,
     number: int,
 ) -> None:
-    bounded = setting.alpha_q is not None and setting.noise is not None
-    if not (bounded and setting.alpha <= (setting.alpha_q or 0.0)):
+    noise = setting.model.noise
+    if noise is None or setting.alpha > noise.rate:
         problem.add_lmi(f"decay {number}", decay_block(P, closed, setting.alpha), ">>")
     blocks: dict[str, Any] = {}
     if closed.side is not None:
-        if bounded:
-            weights = np.diag(np.asarray(setting.noise))
-            blocks["noise"] = noise_block(P, closed, setting.alpha_q, weights)
+        if noise is not None:
+            blocks["noise"] = noise_block(P, closed, noise.rate, np.diag(noise.weights))
         elif setting.norm == "h2":
             blocks["h2"] = h2_block(closed)
         if setting.norm == "hinf":
@@ -173,29 +195,145 @@ def _state_sets(problem: Problem, setting: Setting, P: Affine) -> None:
     problem.add_lmi("error set", inside_block(P, normals * half), ">>")
 
 
-def _distinct(matrices: FloatArray) -> FloatArray:
-    return np.unique(matrices, axis=0)
-
-
 def rough_objective(setting: Setting, gains: FloatArray | None = None) -> float:
     """Return the optimum without margin and proof, for searches."""
     problem = state_problem(setting, gains)
-    return solve_reliably(problem, floor=_ROUGH, gap=_ROUGH_GAP).objective
+    return solve_reliably(problem, floor=ROUGH, gap=ROUGH_GAP).objective
 
 
-def solve(
-    setting: Setting,
-    prove: Callable[[Unknowns], Any],
-    gains: FloatArray | None = None,
+def search_eta(setting: Setting, gains: FloatArray | None = None) -> Setting:
+    """Choose the eta with the smallest optimum."""
+    largest = setting.model.largest_eta
+    found = search_line(
+        lambda eta: rough_objective(replace(setting, eta=eta), gains),
+        float,
+        [share * largest for share in SHARES],
+        refine=REFINE,
+        name="eta",
+    )
+    return replace(setting, eta=found.value)
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """What the LMI layer asks of a proof: whether it went through."""
+
+    all_proved: bool
+
+
+def solve_with_proof(
+    setting: Setting, prove: Callable[[Unknowns], bool], gains: FloatArray | None = None
 ) -> tuple[Unknowns, MarginSolution]:
     """Solve with a margin and back off until `prove` accepts the numbers as stored.
 
     Shapes: gains (V, n, m).
     """
-    problem = state_problem(setting, gains)
     found = solve_with_margin(
-        problem,
-        prove=lambda values: prove(Unknowns.read(values, setting, gains)),
-        fraction=_FRACTION,
+        state_problem(setting, gains),
+        prove=lambda values: Accepted(prove(Unknowns.read(values, setting, gains))),
+        fraction=FRACTION,
     )
     return Unknowns.read(found.values, setting, gains), found
+
+
+def synthesise(
+    setting: Setting, options: Mapping[str, Any], gains: FloatArray | None, Ts: float | None
+) -> QPVDesign:
+    """Find P and, where they are not given, gains; explain it where there are none.
+
+    Shapes: gains (V, n, m).
+    """
+
+    def prove(unknowns: Unknowns) -> bool:
+        if np.linalg.eigvalsh(unknowns.P)[0] <= 0 or not np.isfinite(unknowns.gains).all():
+            return False
+        design = complete(setting, unknowns, options)
+        return all(claim.holds for claim in prove_inequalities(design))
+
+    try:
+        unknowns, _ = solve_with_proof(setting, prove, gains)
+    except InfeasibleDesign as error:
+        raise explain(error, setting, gains) from error
+    design = complete(setting, unknowns, options)
+    return replace(design, Ts=choose_sample_time(design.fastest_mode, Ts))
+
+
+def complete(setting: Setting, unknowns: Unknowns, options: Mapping[str, Any]) -> QPVDesign:
+    """Put everything that is stored together, the sample time apart."""
+    model, sets, P, n = setting.model, setting.sets, unknowns.P, len(unknowns.P)
+    form, Cz = model.form, model.Cz
+    return QPVDesign(
+        plant=form.model,
+        form_of_N=form.form_of_N,
+        family=form.vertices().family,
+        scheduling=tuple(write_text(v.expression) for v in form.scheduling),
+        region=model.region,
+        state=sets.state,
+        error=sets.error,
+        error_coordinates=sets.error_coordinates,
+        start=sets.start,
+        norm=setting.norm,
+        alpha=setting.alpha,
+        noise=model.noise,
+        polya=setting.polya,
+        Cz=Cz,
+        w_centre=noise_centre(form.model),
+        P=P,
+        L=unknowns.gains,
+        gamma=unknowns.level if setting.norm == "hinf" else None,
+        rows=inverse_bounds(P, Cz.reshape(-1, n)).reshape(Cz.shape[:2]),
+        inverse_diagonal=inverse_bounds(P, np.eye(n)),
+        reset=region_factor(P, model.region.Q),
+        Ts=1.0,
+        options={**options, "eta_used": setting.eta, "kappa_used": model.kappa},
+    )
+
+
+def choose_sample_time(fastest: float, given: float | None) -> float:
+    """Check a sample time against the fastest mode, or choose one (1, 2 or 5 times 10^k)."""
+    longest = FASTEST / max(fastest, 1e-6)
+    if given is None:
+        power = 10.0 ** math.floor(math.log10(longest))
+        factor = max(f for f in (1.0, 2.0, 5.0) if f * power <= longest * (1.0 + 1e-12))
+        return float(f"{factor * power:.0e}")
+    if given > longest:
+        raise ObsynthError(
+            f"Ts = {given:g} s is too long for the observer's fastest mode of {fastest:.4g}/s: a "
+            f"Runge-Kutta step follows it up to Ts = {longest:.3g} s. Take a shorter step, or "
+            "keep the gains smaller with gain_cap=",
+            Ts=given,
+            largest=longest,
+            fastest_mode=fastest,
+        )
+    return given
+
+
+def explain(
+    error: InfeasibleDesign, setting: Setting, gains: FloatArray | None
+) -> InfeasibleDesign:
+    """Say which change of one number would help."""
+    model, eta, alpha = setting.model, setting.eta, setting.alpha
+
+    def feasible(**changes: Any) -> bool:
+        problem = state_problem(replace(setting, **changes), gains)
+        return largest_margin(problem, explain=False).feasible
+
+    knobs = []
+    if alpha > 0:
+        knobs.append(Knob("alpha", alpha, 0.0, lambda a: feasible(alpha=a)))
+    if not model.apart:
+        ends = [0.4 * eta, *([model.largest_eta] if eta < 0.999 * model.largest_eta else [])]
+        knobs += [Knob("eta", eta, end, lambda v: feasible(eta=v)) for end in ends]
+    knobs.append(
+        Knob("size of the region", 1.0, 0.5, lambda share: feasible(model=model.shrunk(share)))
+    )
+    what = "these gains" if gains is not None else "any gains"
+    facts = {name: getattr(error, name, None) for name in ("margin", "binding", "bound")}
+    return InfeasibleDesign(
+        f"no P shows the required decay and performance over the polytopes for {what} "
+        f"(eta = {eta:g}, kappa = {model.kappa:g}, alpha = {alpha:g})",
+        [*getattr(error, "details", ()), *smallest_changes(knobs, rtol=0.1)],
+        eta=eta,
+        kappa=model.kappa,
+        **facts,
+    )

@@ -1,6 +1,7 @@
 """The quadratic parameter-varying form of a plant."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import sympy as sp
@@ -90,7 +91,7 @@ class QPV(VaryingForm):
 
     layout: QPVLayout
     plant: Augmented
-    form_of_N: str
+    form_of_N: Literal["upper", "symmetric"]
 
     @property
     def model(self) -> Plant:

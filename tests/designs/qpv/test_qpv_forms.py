@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 import obsynth as ob
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family, psi_kept
-from obsynth.designs.qpv.model import prepare
+from obsynth.designs.qpv.model import read_form
 from obsynth.designs.qpv.polytopes import box, cross, hull
-from obsynth.designs.qpv.work import Workspace
 
 REGION = ob.Ellipsoid([1.0, 0.1], [5.0, 0.0])
 
@@ -48,7 +47,7 @@ def small(**changes):
 )
 def test_psi_is_the_difference_of_the_quadratic_terms(form, numbers, theta):
     """(10), (30): N(x) x - N(xhat) xhat = Psi(x, e) e, at any point of the polytopes."""
-    form_of = prepare(ob.plants.qpv_example(), form).form
+    form_of = read_form(ob.plants.qpv_example(), form)
     N = form_of.vertices().N
     x, e = np.array(numbers[:6]), np.array(numbers[6:])
 
@@ -80,7 +79,7 @@ def test_psi_is_the_difference_of_the_quadratic_terms(form, numbers, theta):
 def test_dropped_pairs_are_convex_combinations_of_kept_ones(kind):
     from scipy.optimize import linprog
 
-    N = prepare(ob.plants.qpv_example(), "upper").form.vertices().N
+    N = read_form(ob.plants.qpv_example(), "upper").vertices().N
     shape = kind(np.sqrt([0.2, 0.2, 0.2, 0.1, 0.1, 0.1]))
     state, error = entering(N)
     sets = ErrorSets(
@@ -106,7 +105,7 @@ def test_dropped_pairs_are_convex_combinations_of_kept_ones(kind):
 def test_outputs_that_vary_are_relaxed_and_hold_between_the_vertices():
     plant = varying()
     observer = small().design(plant)
-    assert not Workspace.of(small(), plant).setting(0.4).data.collapses
+    assert not small().read(plant).data.collapses
     assert "3 Polya terms" in observer.certificate["decay"].statement
     P, L = observer.gains["P"], np.stack([observer.gains["L1"], observer.gains["L2"]])
     alpha = observer.performance["decay"]

@@ -1,10 +1,11 @@
 """The scheduled step as C: theta as inputs, vectors that reach the certified set."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.qpv.assembly import assemble
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,8 @@ def apart(plant, observer, seconds=1.0):
 
 def test_the_step_follows_the_differential_equation(designed, plant):
     """What is held over a sample leaves an error of first order."""
-    record = dict(designed("box_tight").record)
-    halves = [assemble({**record, "Ts": record["Ts"] / n}) for n in (4, 8, 16)]
+    design, contract = designed("box_tight").certificate.design, ob.QPVObserver.CONTRACT
+    shorter = [replace(design, Ts=design.Ts / n) for n in (4, 8, 16)]
+    halves = [contract.certify(one, "lmi").observer() for one in shorter]
     found = np.array([apart(plant, observer) for observer in halves])
     np.testing.assert_allclose(found[:-1] / found[1:], 2.0, atol=0.3)

@@ -1,0 +1,109 @@
+"""What an observer of the method promises, and what it shows of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.designs.core.certificate import Guarantee
+from obsynth.designs.core.method import Numbers
+from obsynth.designs.qpv.record import QPVDesign
+from obsynth.designs.qpv.step import measured_schedule
+
+
+def numbers(design: QPVDesign) -> Numbers:
+    """Return the gains L1, L2, ... at the vertices of the scheduling, (52), and what they reach."""
+    widths = None
+    if design.noise is not None:
+        widths = np.sqrt(design.inverse_diagonal) * (1.0 + 2.0**-40)
+    elif not design.plant.w:
+        widths = np.zeros(len(design.P))
+    gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
+    return Numbers(gains, _performance(design), widths)
+
+
+def _performance(design: QPVDesign) -> dict[str, float]:
+    values = {"decay": design.alpha, "error_decay": 0.5 * design.alpha}
+    if design.gamma is not None:
+        values |= {"l2_gain": float(np.sqrt(design.gamma)), "gamma": design.gamma}
+    elif design.noise is None:
+        values |= {"h2_trace": design.trace, "mu": design.trace}
+    if design.noise is not None:
+        values |= {"alpha_q": design.noise.rate, "bound_trace": design.trace}
+    values |= {
+        "trace_P_inv": float(design.inverse_diagonal.sum()),
+        "largest_gain": float(np.abs(design.L).max()),
+        "fastest_mode": design.fastest_mode,
+    }
+    eta = design.options.get("eta_used")
+    if eta is not None:
+        values["eta"] = float(eta)
+    return values
+
+
+def guarantee(design: QPVDesign) -> Guarantee:
+    """Return what is promised of the error, and what has to hold for it."""
+    return Guarantee(tuple(_claims(design)), tuple(_assumptions(design)))
+
+
+def _claims(design: QPVDesign) -> Iterator[str]:
+    names = (*design.plant.names("x"), *design.plant.names("f"))
+    yield (
+        f"without disturbances V = e'P e decays with exp(-{design.alpha:g} t) from every e(0) in "
+        "{e'P e <= 1}, and the error stays in this ellipsoid"
+    )
+    if design.noise is not None:
+        widths = np.sqrt(design.inverse_diagonal)
+        pairs = zip(names, widths, strict=True)
+        listed = ", ".join(f"{name} +-{width:.4g}" for name, width in pairs)
+        yield (
+            f"with bounded disturbances the error never leaves it, so that {', '.join(names)} lie "
+            f"inside the returned intervals ({listed} in the limit)"
+        )
+    elif design.norm == "h2" and design.plant.w:
+        yield (
+            f"V' < w'w and trace(Cz P^-1 Cz') <= {design.trace:.6g}, as long as the error stays "
+            "in it"
+        )
+    if design.gamma is not None:
+        yield (
+            f"the L2 gain from w to z = Cz e is at most {np.sqrt(design.gamma):.6g}, as long as "
+            "the error stays in it"
+        )
+
+
+def _assumptions(design: QPVDesign) -> Iterator[str]:
+    plant, noise = design.plant, design.noise
+    yield (
+        f"the plant is {plant.name} in continuous time, and the observer is its ode; the step "
+        f"follows it with Runge-Kutta steps of {design.Ts:g} s, short against the fastest mode, "
+        "but what they and holding u, y and theta over a sample add is not bounded"
+    )
+    yield "state and faults stay in the ellipsoid of the region [monitored: status bit 4]"
+    yield (
+        "e(0) lies in {e'P e <= 1}, as memory0 finds from the ranges it is given "
+        "[monitored: status bit 4]"
+    )
+    scheduling = measured_schedule(plant)
+    if scheduling:
+        listed = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in scheduling)
+        yield (f"{listed}, measured without error [monitored: status bit 4]")
+    if noise is not None and plant.w:
+        listed = ", ".join(
+            f"{name} in [{low:g}, {high:g}]"
+            for name, (low, high) in zip(plant.names("w"), plant.box("w"), strict=True)
+        )
+        yield (f"{listed} [monitored in part: status bit 8]")
+    elif plant.w:
+        yield (
+            "disturbances are small enough that the error stays in {e'P e <= 1}; that is proved "
+            "only with alpha_q= [monitored in part: status bit 8]"
+        )
+    n = len(plant.x)
+    moving = () if noise is None else tuple(plant.f[k - n] for k in noise.faults)
+    if moving:
+        yield (", ".join(f"|d{s.name}/dt| <= {s.rate:g}/s" for s in moving))
+    still = [s.name for s in plant.f if s not in moving]
+    if still:
+        yield (f"{', '.join(still)} do not change; every jump is a new e(0)")
