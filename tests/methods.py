@@ -68,6 +68,37 @@ def sound_tanks() -> ob.Scenario:
     return ob.scenarios.three_tanks("fault free", end=20.0, noise=None)
 
 
+def vessel() -> ob.Plant:
+    """One state whose outflow is scheduled and has a process fault, in continuous time."""
+    plant = ob.Plant("vessel")
+    (x,) = plant.states("x", range=(3, 7), nominal=5)
+    (u,) = plant.inputs("u", range=(0, 20), nominal=7)
+    (theta,) = plant.scheduling("theta", range=(0, 1))
+    (f,) = plant.process_faults("f", range=(-0.3, 0.3))
+    (w,) = plant.disturbances("w", bound=0.01)
+    plant.dynamics([-(1 + theta) * x + f * x + u + w])
+    plant.outputs([x + w])
+    return plant
+
+
+def vessel_moving() -> ob.Scenario:
+    def theta(k: float) -> float:
+        return 0.5 + 0.5 * float(np.sin(0.01 * k))
+
+    return ob.Scenario(
+        name="moving",
+        steps=600,
+        x0=[5.03],
+        guess=[5.0],
+        inputs=lambda k: [5 * (1 + theta(k)) + 1.2 * np.sin(0.03 * k)],
+        scheduling=lambda k: [theta(k)],
+        faults=np.full((601, 1), 0.03),
+        disturbances=np.random.default_rng(1).uniform(-0.01, 0.01, (601, 1)),
+        x_range=[(4.95, 5.05)],
+        f_range=[(-0.05, 0.05)],
+    )
+
+
 METHODS = {
     "bounded_error_uio": Entry(
         ob.BoundedErrorUIO(gamma=0.005),
@@ -113,6 +144,22 @@ METHODS = {
         spoilt=(("alpha",), 1.01, "decay"),
         option={"gain_cap": 0.0},
         gains=("L",),
+    ),
+    "qpv_observer": Entry(
+        ob.QPVObserver(
+            region=ob.Ellipsoid([1.5, 0.09], [5, 0]),
+            initial_error=[0.05, 0.05],
+            E_x=[0.3],
+            alpha_q=1.0,
+            gain_cap=50.0,
+            Ts=0.01,
+        ),
+        vessel,
+        vessel_moving,
+        outside=tank,
+        spoilt=(("inverse_diagonal", 1), 0.999, "bounds"),
+        option={"eta": 1.5},
+        gains=("L1", "L2"),
     ),
     "luenberger": Entry(
         Luenberger(),

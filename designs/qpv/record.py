@@ -238,6 +238,8 @@ class QPVDesign(Record):
                 )
         if noise is not None and not all(n_x <= k < n for k in noise.faults):
             raise CertificateError(f"noise.faults of the stored design are {noise.faults}")
+        if len(np.unique(self.start, axis=0)) != len(self.start):
+            raise CertificateError("a corner of start is twice in the stored design")
         missing = set(self.sets.error_entering) - set(places)
         if missing or not all(0 <= k < n for k in places) or len(set(places)) != len(places):
             raise CertificateError(
