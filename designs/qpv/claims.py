@@ -24,7 +24,7 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
-from obsynth.designs.qpv.model import Derived
+from obsynth.designs.qpv.model import Derived, noise_centre
 from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
@@ -58,6 +58,7 @@ def covers(design: QPVDesign, fresh: Derived) -> Iterator[Claim]:
         and np.array_equal(found.directions, stored.directions)
         and design.scheduling == tuple(write_text(v.expression) for v in form.scheduling)
         and form.form_of_N == design.form_of_N
+        and np.array_equal(design.w_centre, noise_centre(design.plant))
         and form.names == (*design.plant.names("x"), *design.plant.names("f"))
     )
     room = -np.inf

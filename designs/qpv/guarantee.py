@@ -35,10 +35,8 @@ def _performance(design: QPVDesign) -> dict[str, float]:
         "trace_P_inv": float(design.inverse_diagonal.sum()),
         "largest_gain": float(np.abs(design.L).max()),
         "fastest_mode": design.fastest_mode,
+        "eta": design.eta,
     }
-    eta = design.options.get("eta_used")
-    if eta is not None:
-        values["eta"] = float(eta)
     return values
 
 
@@ -88,13 +86,13 @@ def _assumptions(design: QPVDesign) -> Iterator[str]:
     scheduling = measured_schedule(plant)
     if scheduling:
         listed = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in scheduling)
-        yield (f"{listed}, measured without error [monitored: status bit 4]")
+        yield f"{listed}, measured without error [monitored: status bit 4]"
     if noise is not None and plant.w:
         listed = ", ".join(
             f"{name} in [{low:g}, {high:g}]"
             for name, (low, high) in zip(plant.names("w"), plant.box("w"), strict=True)
         )
-        yield (f"{listed} [monitored in part: status bit 8]")
+        yield f"{listed} [monitored in part: status bit 8]"
     elif plant.w:
         yield (
             "disturbances are small enough that the error stays in {e'P e <= 1}; that is proved "
@@ -103,7 +101,7 @@ def _assumptions(design: QPVDesign) -> Iterator[str]:
     n = len(plant.x)
     moving = () if noise is None else tuple(plant.f[k - n] for k in noise.faults)
     if moving:
-        yield (", ".join(f"|d{s.name}/dt| <= {s.rate:g}/s" for s in moving))
+        yield ", ".join(f"|d{s.name}/dt| <= {s.rate:g}/s" for s in moving)
     still = [s.name for s in plant.f if s not in moving]
     if still:
-        yield (f"{', '.join(still)} do not change; every jump is a new e(0)")
+        yield f"{', '.join(still)} do not change; every jump is a new e(0)"

@@ -54,7 +54,8 @@ class QPVObserver(Method):
 
     For ``x' = A(theta) x + B(theta) u + G(theta) w + sum_k A_fk(theta) f_k x``, ``y = C(theta) x +
     H(theta) w`` with measured theta: faults become states, which makes the plant quadratic, and
-    the gain is scheduled, ``L(theta) = sum_l mu_l(theta) L_l``.
+    the gain is scheduled, ``L(theta) = sum_l mu_l(theta) L_l``. Gains that are given are ``L1``,
+    ``L2``, ... of shape (n, m), one per vertex of the scheduling, the last variable fastest.
 
     Parameters
     ----------
@@ -229,10 +230,7 @@ class QPVObserver(Method):
         return self._solve(model)
 
     def fix(self, model: QPVModel, gains: Mapping[str, ArrayLike]) -> QPVDesign:
-        """Find P for ``L1``, ``L2``, ... of shape (n, m), the last scheduling variable fastest.
-
-        A ``P`` among the gains is not looked at.
-        """
+        """Find P for gains L1, L2, ...; a P among them is not looked at."""
         n, m, _ = model.data.sizes
         shapes = {f"L{k}": (n, m) for k in range(1, len(model.data.A) + 1)}
         found = read_gains({k: value for k, value in gains.items() if k != "P"}, shapes)

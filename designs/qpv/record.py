@@ -136,6 +136,7 @@ class QPVDesign(Record):
     region: X, in which the augmented state is assumed to stay
     state, error: polytopes of x - c and of e, see `ErrorSets`
     start: corners of the polytope of e(0)
+    eta, kappa: with which the polytopes were made
     alpha: decay of V without disturbances
     w_centre: middle of the declared disturbances
     L: gains at the vertices of the scheduling
@@ -156,6 +157,8 @@ class QPVDesign(Record):
     error: Shape
     error_coordinates: tuple[int, ...]
     start: Annotated[FloatArray, "r n+n_f"]
+    eta: float
+    kappa: float
     norm: Norm
     alpha: float
     noise: NoiseBound | None

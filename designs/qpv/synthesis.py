@@ -272,6 +272,8 @@ def complete(setting: Setting, unknowns: Unknowns, options: Mapping[str, Any]) -
         error=sets.error,
         error_coordinates=sets.error_coordinates,
         start=sets.start,
+        eta=setting.eta,
+        kappa=model.kappa,
         norm=setting.norm,
         alpha=setting.alpha,
         noise=model.noise,
@@ -285,7 +287,7 @@ def complete(setting: Setting, unknowns: Unknowns, options: Mapping[str, Any]) -
         inverse_diagonal=inverse_bounds(P, np.eye(n)),
         reset=region_factor(P, model.region.Q),
         Ts=1.0,
-        options={**options, "eta_used": setting.eta, "kappa_used": model.kappa},
+        options=options,
     )
 
 

@@ -271,6 +271,7 @@ MUTANTS = {
     "another constant": (["family", "constant", 0, 1], lambda v: 0.9 * v, "model"),
     "another form of N": (["form_of_N"], lambda _: "symmetric", "model"),
     "another scheduling": (["scheduling", 0], lambda _: "2*theta1", "model"),
+    "another middle of the noise": (["w_centre", 0], lambda v: v + 0.1, "model"),
     "longer step": (["Ts"], lambda v: 10.0 * v, "sampling"),
     "smaller reset": (["reset"], lambda v: 0.99 * v, "reset"),
 }
