@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from obsynth.derive.errors import StructureError
+from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
@@ -114,6 +114,10 @@ def read(given: Plant | QuasiLPV, prefer: Prefer = None) -> IntervalModel:
                 option="prefer",
             )
         form = given
+    if not form.proof.holds:
+        raise DerivationError(
+            f"the quasi-LPV form of {form.model.name} is not proved to be the plant: {form.proof}"
+        )
     model = _matrices(form)
     _check_ranks(model)
     return model

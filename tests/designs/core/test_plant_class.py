@@ -60,7 +60,7 @@ def test_what_is_outside_is_refused_by_its_names(change, said, symbols):
 
 
 def test_continuous_methods_refuse_discrete_plants():
-    with pytest.raises(ob.StructureError, match="cart is in discrete time"):
+    with pytest.raises(ob.StructureError, match="'cart' is a discrete plant"):
         PlantClass(who="the observer", time="continuous").check(plant())
 
 

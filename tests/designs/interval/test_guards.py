@@ -4,6 +4,7 @@ import copy
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import sympy as sp
 
 import obsynth as ob
 from obsynth.codegen import find_compiler
+from obsynth.derive import DerivationError
 from obsynth.designs import STATUS
 
 BOX = np.tile([0.5, 1.5], (3, 1))
@@ -483,3 +485,22 @@ def test_the_c_code_is_the_step(options, example, tmp_path):
     assert project.comparison is not None
     assert project.comparison.vectors >= 1000
     assert "equal to the last bit" in str(project)
+
+
+def test_a_form_that_is_only_true_to_many_digits_is_not_taken(monkeypatch):
+    """Mutant: without the proof of the form the claims would still say that it is the plant."""
+    import obsynth.designs.interval.model as module
+
+    observer = ob.IntervalObserver().design(ob.plants.interval_example())
+    derive = module.quasi_lpv
+
+    def doubtful(plant, **options):
+        form = derive(plant, **options)
+        return replace(form, proof=replace(form.proof, methods=("", *form.proof.methods[1:])))
+
+    monkeypatch.setattr(module, "quasi_lpv", doubtful)
+    with pytest.raises(DerivationError, match="not proved to be the plant"):
+        ob.IntervalObserver().design(ob.plants.interval_example())
+    with pytest.raises(ob.CertificateError) as refusal:
+        observer.certificate.check()
+    assert {claim.name for claim in refusal.value.failed} == {"derivation"}
