@@ -1,6 +1,6 @@
 """What follows from a plant, with proof."""
 
-from obsynth.derive.algebra.identity import IdentityProof
+from obsynth.derive.algebra.linear_parts import IdentityProof
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.lipschitz import InnerBound, LipschitzConstants, lipschitz
 from obsynth.derive.constants.majorant import Majorant, majorant
@@ -15,8 +15,7 @@ from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm
 from obsynth.derive.forms.quasi_lpv.polytopic import CentredForm, PolytopicForm
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.jacobian.dependence import AffineDependence
-from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.jacobian.family import AffineDependence, AffineFamily
 from obsynth.derive.polytopes.fewer import principal_family
 from obsynth.derive.polytopes.polytope import (
     Polytope,

@@ -10,8 +10,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
-from obsynth.derive.algebra.identity import IdentityProof, prove_identity
-from obsynth.derive.algebra.linear_parts import constant_columns
+from obsynth.derive.algebra.linear_parts import IdentityProof, constant_columns, prove_identity
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError

@@ -4,11 +4,10 @@ from obsynth.symbolic import plants, scenarios
 from obsynth.symbolic.convert import nearest_double, to_sx
 from obsynth.symbolic.errors import ObsynthError, ObsynthWarning, PlantError
 from obsynth.symbolic.functions import phi1, tanhc
-from obsynth.symbolic.parity import ParityError, check_parity
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.scenario import Scenario
 from obsynth.symbolic.signals import Role, Signal
-from obsynth.symbolic.sxmodel import SxModel
+from obsynth.symbolic.sxmodel import ParityError, SxModel, check_parity
 from obsynth.symbolic.tape import from_tape
 from obsynth.symbolic.text import TextError, read_text, write_text
 

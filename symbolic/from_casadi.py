@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic.declarations import Names
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.parity import check_parity, sample_box
 from obsynth.symbolic.signals import expand_names
+from obsynth.symbolic.sxmodel import check_parity, sample_box
 from obsynth.symbolic.tape import expand_function, from_tape
 
 if TYPE_CHECKING:

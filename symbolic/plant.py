@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic import declarations
 from obsynth.symbolic.declarations import Names, Symbols
-from obsynth.symbolic.discretise import check_method, next_values, sampling_time
 from obsynth.symbolic.display import plant_html, plant_latex
 from obsynth.symbolic.equations import insert_faults, read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
@@ -19,7 +18,7 @@ from obsynth.symbolic.from_casadi import plant_from_casadi
 from obsynth.symbolic.serialize import check_format, fill_from_dict, plant_to_dict, read_field
 from obsynth.symbolic.signal_table import SignalTable, check_targets
 from obsynth.symbolic.signals import KINDS, Role, Signal
-from obsynth.symbolic.sxmodel import SxModel, build_sx
+from obsynth.symbolic.sxmodel import SxModel, build_sx, check_method, next_values, sampling_time
 from obsynth.symbolic.text import read_text
 
 Rows = tuple[sp.Expr, ...]

@@ -1,9 +1,54 @@
-"""Quasi-linear forms f(x, u) = A(x, u) x + B(x, u) u + r by a rule for every term."""
+"""Exact rewriting of expressions: common factors, factors over a field, sums of angles.
 
-from collections.abc import Iterator, Sequence
+Common factors of numerators and denominators, cancelled where a denominator may be zero.
+
+(x**2 - y**2)/(x - y) is x + y, but an interval method sees a division by an interval that contains
+zero, and no quotient in one variable either. Where the denominator has no zero in the box, rows
+stay as they were typed.
+
+Products of sines and cosines as sums, before anything is bounded.
+
+cos(a) cos(a + b) + sin(a) sin(a + b) is cos(b), but an interval method sees three functions of a
+that vary independently. With products written as sums (Fu's rule TR8) what cancels has cancelled,
+and variables that do not matter are gone: the equations of a robot arm, as they come out of
+Lagrange's method, shrink to a fraction. Every rewritten part is proved equal to what it replaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import sympy as sp
+
+_LARGEST_SUM = 200
+
+
+def cancel_common_factors(
+    expression: sp.Expr, may_vanish: Callable[[sp.Expr], bool]
+) -> sp.Expr | None:
+    """Cancel what numerators have in common with denominators that may be zero."""
+    found = _cancelled(expression, may_vanish)
+    return None if found == expression else found
+
+
+def _cancelled(expression: sp.Expr, may_vanish: Callable[[sp.Expr], bool]) -> sp.Expr:
+    if not expression.args or not any(p.exp.is_negative for p in expression.atoms(sp.Pow)):
+        return expression
+    parts = [_cancelled(part, may_vanish) for part in expression.args]
+    result = expression.func(*parts)
+    if not isinstance(result, sp.Mul):
+        return result
+    numerator, denominator = sp.fraction(result)
+    sums = [f for f in sp.Mul.make_args(denominator) if f.atoms(sp.Add)]
+    if not sums or result.count_ops() > _LARGEST_SUM or not any(map(may_vanish, sums)):
+        return result
+    shorter = sp.cancel(result)
+    left, below = sp.fraction(shorter)
+    if below.count_ops() >= denominator.count_ops():
+        return result
+    # numbers aside, the new denominator divides the old one and the products agree
+    return shorter if sp.expand(left * denominator - numerator * below) == 0 else result
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,3 +194,91 @@ def factorise(
                 if divisor.form == signals[j] and not coefficient.has(*signals):
                     linear[i, j] += coefficient
     return Factorisation(columns[:, :n], columns[:, n:], offset, linear[:, :n], linear[:, n:])
+
+
+_LARGEST = 3000
+
+
+def products_to_sums(expression: sp.Expr) -> sp.Expr | None:
+    """Write products of sines and cosines as sums, in every part where that is possible."""
+    if not _has_products(expression) or expression.count_ops() > _LARGEST:
+        return None
+    result = _rewritten(expression)
+    return None if result == expression else result
+
+
+def _waves(expression: sp.Expr) -> set[sp.Expr]:
+    return set(expression.atoms(sp.sin, sp.cos))
+
+
+def _has_products(expression: sp.Expr) -> bool:
+    """Whether some product or power holds two sines or cosines, in one factor or in two."""
+    for node in sp.preorder_traversal(expression):
+        if isinstance(node, sp.Mul) and sum(bool(_waves(factor)) for factor in node.args) > 1:
+            return True
+        if isinstance(node, sp.Pow) and isinstance(node.base, sp.sin | sp.cos):
+            return True
+    return False
+
+
+def _is_polynomial(expression: sp.Expr) -> bool:
+    """Whether sines and cosines stand in sums, products and natural powers only."""
+    if not _waves(expression):
+        return True
+    if isinstance(expression, sp.sin | sp.cos):
+        return not _waves(expression.args[0])
+    if isinstance(expression, sp.Add | sp.Mul):
+        return all(_is_polynomial(part) for part in expression.args)
+    if isinstance(expression, sp.Pow):
+        whole = expression.exp.is_Integer and expression.exp.is_positive
+        return bool(whole) and _is_polynomial(expression.base)
+    return False
+
+
+def _rewritten(expression: sp.Expr) -> sp.Expr:
+    if not _waves(expression) or not expression.args:
+        return expression
+    if _is_polynomial(expression):
+        return _as_sum(expression)
+    if isinstance(expression, sp.Mul | sp.Add):
+        # what can be expanded is expanded together, so that it can cancel
+        plain = [part for part in expression.args if _is_polynomial(part)]
+        others = [_rewritten(part) for part in expression.args if not _is_polynomial(part)]
+        return expression.func(_rewritten(expression.func(*plain)), *others)
+    return expression.func(*(_rewritten(part) for part in expression.args))
+
+
+def _as_sum(expression: sp.Expr) -> sp.Expr:
+    from sympy.simplify.fu import TR8
+
+    if not _has_products(expression):
+        return expression
+    flat = sp.expand(TR8(sp.expand(expression)))
+    waves = sorted(_waves(flat), key=sp.default_sort_key)
+    parts = sp.collect(flat, waves, evaluate=False, exact=True)
+    total = sp.Add(*(sp.factor_terms(_short(factor)) * wave for wave, factor in parts.items()))
+    return total if same_waves(expression, total) else expression
+
+
+def _short(factor: sp.Expr) -> sp.Expr:
+    """Factor a coefficient where that makes it shorter, such as the square of a sum of rates."""
+    if factor.is_polynomial() and factor.count_ops() < 100:
+        candidate = sp.factor(factor)
+        return min((candidate, factor), key=lambda e: e.count_ops())
+    return factor
+
+
+def same_waves(one: sp.Expr, other: sp.Expr) -> bool:
+    """Prove that two polynomials in sines and cosines are the same function."""
+    waves = {wave: _exponentials(wave) for wave in _waves(one) | _waves(other)}
+    return bool(sp.expand(one.xreplace(waves) - other.xreplace(waves)) == 0)
+
+
+def _exponentials(wave: sp.Expr) -> sp.Expr:
+    forwards, backwards = sp.Integer(1), sp.Integer(1)
+    for term in sp.Add.make_args(sp.expand(wave.args[0])):
+        forwards *= sp.exp(sp.I * term)
+        backwards *= sp.exp(-sp.I * term)
+    if isinstance(wave, sp.sin):
+        return (forwards - backwards) / (2 * sp.I)
+    return (forwards + backwards) / 2

@@ -19,7 +19,7 @@ from obsynth.derive.constants.majorant_parts import (
 )
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
-from obsynth.derive.jacobian.continuity import refuse_jumps
+from obsynth.derive.jacobian.bounds import refuse_jumps
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.rigour import up
 from obsynth.derive.split import Split

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.derive.intervals.evaluate import enclose
+from obsynth.derive.intervals.program import enclose
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.rigour import UNIT_ROUNDOFF, middle_and_radius
 from obsynth.symbolic.arrays import BoolArray, FloatArray

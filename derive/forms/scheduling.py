@@ -10,10 +10,14 @@ from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.zero_test import prove_zero
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.forms.measured import known_signals
-from obsynth.derive.intervals.evaluate import evaluate
+from obsynth.derive.intervals.program import evaluate
 from obsynth.derive.intervals.ranges import Status
-from obsynth.derive.jacobian.dependence import AffineDependence, find_dependences
-from obsynth.derive.jacobian.family import AffineFamily, build_family
+from obsynth.derive.jacobian.family import (
+    AffineDependence,
+    AffineFamily,
+    build_family,
+    find_dependences,
+)
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal

@@ -6,10 +6,8 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.common_factors import cancel_common_factors
-from obsynth.derive.algebra.products_to_sums import products_to_sums
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.algebra.factorise import cancel_common_factors, products_to_sums
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.rewriting.removable import remove_singularities
@@ -17,8 +15,8 @@ from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import nearest_double, to_sx
-from obsynth.symbolic.parity import ParityError, check_parity, sample_box
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
 
 Entry = tuple[int, int]
 _SAMPLES = 96

@@ -15,9 +15,8 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.intervals.ranges import Ranges, bound_ranges
+from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
 from obsynth.derive.intervals.search.batch import Problem
-from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.rigour import enclose_number, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray

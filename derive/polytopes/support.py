@@ -16,9 +16,8 @@ import numpy as np
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.jacobian.dependence import entry_name
 from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries
-from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.jacobian.family import AffineFamily, entry_name
 from obsynth.derive.polytopes.polytope import (
     Label,
     Polytope,

@@ -7,15 +7,15 @@ import numpy as np
 
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Status
-from obsynth.derive.jacobian.continuity import refuse_jumps
+from obsynth.derive.jacobian.bounds import refuse_jumps
 from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.remainder.system import system
 from obsynth.derive.remainder.work import Work
 from obsynth.derive.rigour import Interval
 from obsynth.derive.rigour.interval import add, multiply
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.discretise import check_method, sampling_time
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.sxmodel import check_method, sampling_time
 
 _ORDER = {"euler": 2, "rk4": 5}
 _RANDOM = 32

@@ -6,11 +6,10 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.ranges import EFFORTS
+from obsynth.derive.intervals.program import evaluate
+from obsynth.derive.intervals.ranges import EFFORTS, make_problem
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.intervals.search.branch import maximise
-from obsynth.derive.intervals.search.problem import make_problem
 from obsynth.derive.remainder.system import System
 from obsynth.derive.rigour import down, up
 from obsynth.symbolic.arrays import BoolArray, FloatArray

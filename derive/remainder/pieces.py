@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.symbolic.arrays import FloatArray
 
 PIECES = {"fast": 256, "normal": 4096, "tight": 65536}

@@ -7,14 +7,13 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.intervals.evaluate import enclose
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, enclose
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rules import JUMPS
 from obsynth.derive.rigour import enclose_number
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.sxmodel import runge_kutta
 
 _HELD = ("u", "d", "f", "w", "p", "rho")
 

@@ -7,7 +7,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.intervals.evaluate import enclose, evaluate
+from obsynth.derive.intervals.program import enclose, evaluate
 from obsynth.derive.remainder.flow import flow_box, flow_tubes
 from obsynth.derive.remainder.pieces import PIECES, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.system import System, step_derivatives, time_derivatives

@@ -27,11 +27,29 @@ each kind of number to its law, against exact rationals or balls of 300 bits.
     Bounds of largest eigenvalues of symmetric matrices, from both sides or from above.
 """
 
-from obsynth.derive.rigour.definite import ProofResult, prove_positive_definite
 from obsynth.derive.rigour.eigenvalues import finite, largest_eigenvalue, perron_bound, rotate
-from obsynth.derive.rigour.enclosure import Enclosure
-from obsynth.derive.rigour.interval import Interval
-from obsynth.derive.rigour.numbers import enclose_number, rational, round_number, substitute
+from obsynth.derive.rigour.enclosure import Enclosure, ProofResult, prove_positive_definite
+from obsynth.derive.rigour.interval import (
+    TINY,
+    UNIT,
+    UNIT_ROUNDOFF,
+    Interval,
+    add_up,
+    allowance,
+    down,
+    enclose_number,
+    gamma_bound,
+    lowered,
+    middle_and_radius,
+    outward,
+    product_up,
+    raised,
+    rational,
+    round_number,
+    smallest_above,
+    substitute,
+    up,
+)
 from obsynth.derive.rigour.rationals import (
     Exact,
     ExactMatrix,
@@ -46,22 +64,6 @@ from obsynth.derive.rigour.rationals import (
     negative,
     positive,
     to_text,
-)
-from obsynth.derive.rigour.rounding import (
-    TINY,
-    UNIT,
-    UNIT_ROUNDOFF,
-    add_up,
-    allowance,
-    down,
-    gamma_bound,
-    lowered,
-    middle_and_radius,
-    outward,
-    product_up,
-    raised,
-    smallest_above,
-    up,
 )
 
 __all__ = [

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.derive.rigour.rounding import UNIT_ROUNDOFF, down, gamma_bound, up
+from obsynth.derive.rigour.interval import UNIT_ROUNDOFF, down, gamma_bound, up
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 # What sums of products may lose to underflow; far below every tolerance.

@@ -1,4 +1,4 @@
-"""Interval arithmetic on batches, rounded outwards.
+"""Intervals, one step of rounding to the named side, and doubles around SymPy's real numbers.
 
 An interval is a pair ``(lo, hi)`` of arrays of equal or broadcastable shape, one element per box of
 a batch. The four operations and the square root are correctly rounded by IEEE 754, so that one
@@ -8,14 +8,159 @@ of ``-5e-324`` in place of 0 would leave the domain of a square root.
 ``nan`` in either end stands for "nothing is known": it propagates through every operation here and
 is turned into the whole line by whoever reads the result. It arises from ``0 * inf``, from
 operands outside a domain and from a division by an interval with zero inside.
+
+Doubles rounded to a chosen side.
+
+The rounding mode is never changed. One operation is stepped outwards by one double (`down`, `up`);
+a formula with nonnegative terms only is multiplied by one factor above its accumulated rounding
+error (`raised`, `lowered`), which rests on the error n u / (1 - n u) of a sum of n products in any
+order, with or without fused multiply-adds (N. J. Higham, Accuracy and Stability of Numerical
+Algorithms, section 3.1).
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from fractions import Fraction
 
 import numpy as np
+import sympy as sp
 
-from obsynth.derive.rigour.rounding import down, up
+from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.arrays import BoolArray, FloatArray
+
+UNIT_ROUNDOFF = 2.0**-53
+UNIT: Mapping[str, float] = {"double": UNIT_ROUNDOFF, "single": 2.0**-24}
+"""Unit roundoff of a precision."""
+
+# Above the underflow of fewer than 2^40 operations, whether or not it is flushed to zero.
+TINY = 2.0**-980
+
+
+def down(value: FloatArray | float) -> FloatArray:
+    """Step to the next double towards minus infinity."""
+    return np.nextafter(value, -np.inf)
+
+
+def up(value: FloatArray | float) -> FloatArray:
+    """Step to the next double towards plus infinity; the counterpart of `down`."""
+    return np.nextafter(value, np.inf)
+
+
+def smallest_above(value: Fraction) -> float:
+    """Return the smallest double that is not below a rational number."""
+    nearest = float(value)
+    return nearest if Fraction(nearest) >= value else math.nextafter(nearest, math.inf)
+
+
+def middle_and_radius(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Split intervals so that middle +- radius holds them; no radius where both ends are equal.
+
+    Intervals that are not finite get the middle 0 and an infinite radius.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        middle = 0.5 * low + 0.5 * high
+        radius = np.maximum(high - middle, middle - low)
+    known = np.isfinite(middle) & np.isfinite(radius)
+    outward = np.where(radius > 0.0, up(radius), 0.0)
+    return np.where(known, middle, 0.0), np.where(known, outward, np.inf)
+
+
+def gamma_bound(n: int) -> float:
+    """Upper bound of n u / (1 - n u), the relative error of n roundings."""
+    return n * UNIT_ROUNDOFF * (1.0 + 2.0**-10)
+
+
+def raised(value: FloatArray, roundings: int) -> FloatArray:
+    """Return an upper bound of a nonnegative expression evaluated in doubles."""
+    # three more: the factor, the product with it and the sum are rounded themselves
+    return np.asarray(value * (1.0 + 2.0 * gamma_bound(roundings + 3)) + TINY)
+
+
+def lowered(value: FloatArray, roundings: int) -> FloatArray:
+    """Return a lower bound, not below zero, of such an expression."""
+    return np.maximum(value * (1.0 - 2.0 * gamma_bound(roundings + 3)) - TINY, 0.0)
+
+
+def add_up(*terms: FloatArray) -> FloatArray:
+    """Return an upper bound of a sum of nonnegative arrays of one shape."""
+    return raised(np.sum(np.stack(terms), axis=0), len(terms))
+
+
+def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return an upper bound of the product of nonnegative matrices."""
+    return raised(left @ right, left.shape[-1] + 1)
+
+
+def allowance(precision: str, n: int, product: float = 0.0) -> float:
+    """Return what the rounding of one step may be, relative to the size of its terms.
+
+    What is added to a bound is this share of the sum of the magnitudes of all its terms, so that
+    cancellation does not matter. Making the terms takes at most 24 roundings one after the other;
+    every factor Q = I + M / mu of a transition over h 16 for its entries and n for the product, and
+    the terms with j factors have the weight of a Poisson variable with mean h mu, the `product`,
+    so that h mu factors count. Twice that, and 2^-42 in double precision.
+    """
+    count = 2.0 * (24.0 + (16.0 + n) * (1.0 + product))
+    return max(count * UNIT[precision], 2.0**-42)
+
+
+def outward(box: FloatArray, precision: str) -> FloatArray:
+    """Return a box, shape (n, 2), whose ends are numbers of the precision and that holds it."""
+    if precision == "double":
+        return np.array(box, dtype=float)
+    single = np.asarray(box, dtype=np.float32)
+    low = np.where(single[:, 0] > box[:, 0], np.nextafter(single[:, 0], -np.inf), single[:, 0])
+    high = np.where(single[:, 1] < box[:, 1], np.nextafter(single[:, 1], np.inf), single[:, 1])
+    return np.column_stack([low, high]).astype(float)
+
+
+_DIGITS = 60
+_LARGEST = sp.Integer(int(sys.float_info.max))
+
+
+def rational(value: float) -> sp.Rational:
+    """Return the rational number that a double is."""
+    fraction = Fraction(float(value))
+    return sp.Rational(fraction.numerator, fraction.denominator)
+
+
+def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """Put exact numbers in place of symbols; floats of the user become the rational they are."""
+    result = sp.sympify(expression)
+    if present := {s: values[s] for s in result.free_symbols if s in values}:
+        result = result.subs(present)
+    floats = {number: rational(float(number)) for number in result.atoms(sp.Float)}
+    return result.xreplace(floats) if floats else result
+
+
+def round_number(number: sp.Expr) -> tuple[float, float]:
+    """Round an exact real number to a double, with a bound of the rounding error."""
+    number = sp.sympify(number)
+    approximation = number if number.is_Rational else number.evalf(_DIGITS)
+    if not (number.is_Rational or approximation.is_Float) or not approximation.is_finite:
+        raise DerivationError(f"{number} is not a finite real number", expression=number)
+    if abs(approximation) > _LARGEST:
+        raise DerivationError(f"{number} is too large for a double", expression=number)
+    if number.is_Rational:
+        exact = Fraction(int(number.p), int(number.q))
+        value = float(exact)
+        return value, smallest_above(abs(exact - Fraction(value)))
+    value = float(approximation)
+    distance = abs(approximation - sp.Float(rational(value), 2 * _DIGITS))
+    margin = sp.Float(10, _DIGITS) ** (10 - _DIGITS) * abs(approximation)
+    return value, math.nextafter(float(distance + margin), math.inf)
+
+
+def enclose_number(number: sp.Expr) -> tuple[float, float]:
+    """Enclose an exact real number between doubles."""
+    value, error = round_number(number)
+    if error == 0.0:
+        return value, value
+    return math.nextafter(value, -math.inf), math.nextafter(value, math.inf)
+
 
 Interval = tuple[FloatArray, FloatArray]
 

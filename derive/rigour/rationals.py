@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.derive.rigour.rounding import smallest_above
+from obsynth.derive.rigour.interval import smallest_above
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

@@ -10,8 +10,11 @@ import numpy as np
 from obsynth.derive.equilibrium import Equilibrium
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.split import Split, split
-from obsynth.derive.structure.decoupling import unknown_input_condition
-from obsynth.derive.structure.detectability import detectability, weakest_member
+from obsynth.derive.structure.conditions import (
+    detectability,
+    unknown_input_condition,
+    weakest_member,
+)
 from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.isolability import fault_isolability
 from obsynth.derive.structure.zeros import (

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.derive import Split
 from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
-from obsynth.derive.structure.decoupling import decouple
+from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error.lmis import (
     Arithmetic,
     ModelData,

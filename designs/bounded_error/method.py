@@ -38,9 +38,8 @@ from obsynth.designs.bounded_error.synthesis import (
     synthesise,
 )
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.given import Number, read_gains
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import Number
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

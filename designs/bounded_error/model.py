@@ -10,10 +10,9 @@ import numpy as np
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
-from obsynth.derive.structure.decoupling import unknown_input_condition
-from obsynth.derive.structure.detectability import detectability
+from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import casadi as ca
@@ -21,6 +20,7 @@ from obsynth.designs.core.stepping import (
     clip,
     finite_or,
     inside,
+    largest_level,
     make_step,
     select,
     slices,
@@ -34,7 +34,6 @@ ROUND_UP = 1.0 + 2.0**-50
 ULPS = 2.0**-50
 # Above the relative rounding error of the few dozen operations of each formula below.
 UP = 1.0 + 2.0**-44
-CORNERS = 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +70,6 @@ def noise_offset(design: UioDesign) -> FloatArray:
     """Return the bound of ``E W2 w_k``, which separates e from zeta, shape (n,)."""
     bound: FloatArray = np.abs(design.E) @ (np.abs(design.W2) @ design.w_radius) * UP
     return bound
-
-
-def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
-    """Return an upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
-
-    Exact up to rounding at the corners for up to 14 components, by the sum of
-    ``|P_ij| r_i r_j`` beyond.
-    """
-    reach = np.maximum(np.abs(lower), np.abs(upper))
-    rounding = 2.0**-40 * float(reach @ np.abs(P) @ reach)
-    if len(P) > CORNERS:
-        return float(reach @ np.abs(P) @ reach) * UP + rounding
-    pairs = [(a, b) if a != b else (a,) for a, b in zip(lower, upper, strict=True)]
-    corners = np.array(list(itertools.product(*pairs)))
-    levels = np.einsum("ki,ij,kj->k", corners, P, corners)
-    return float(levels.max()) + rounding
 
 
 class StartBox:

@@ -1,17 +1,236 @@
-"""What the user hands over beside the plant: gains, and where the first state may be."""
+"""What a method is given, checked: options, the class of the plant, gains, the first set."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, fields
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.symbolic import Plant
+from obsynth.derive.errors import StructureError
+from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+
+
+@dataclass(frozen=True)
+class Number:
+    """What a number among the options has to satisfy, every entry of a sequence alike.
+
+    because: how a refusal goes on after "gamma is 1.5; "
+    """
+
+    above: float = -np.inf
+    below: float = np.inf
+    at_least: float = -np.inf
+    at_most: float = np.inf
+    because: str = "it has to be finite"
+
+    def holds(self, values: Any) -> bool:
+        """Whether finite numbers all lie within the limits."""
+        numbers = np.asarray(values, dtype=float)
+        inside = (numbers > self.above) & (numbers < self.below)
+        inside &= (numbers >= self.at_least) & (numbers <= self.at_most)
+        return bool(np.all(inside & np.isfinite(numbers)))
+
+
+POSITIVE = Number(above=0.0, because="it has to be positive and finite")
+MATRIX = "matrix"
+"""In ``Annotated``: finite numbers, kept as a tuple of rows; a vector serves as one column."""
+
+
+def check_options(method: Any) -> None:
+    """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
+
+    Literals, bool, int, float, tuples of floats or of pairs and their unions with None are
+    checked, numbers also by a `Number` in ``Annotated``, one number or a tuple of them too, and
+    what is a `MATRIX`; whatever else a method takes it checks by itself.
+    """
+    hints = get_type_hints(type(method), include_extras=True)
+    for option in fields(method):
+        value = read_option(option.name, hints[option.name], getattr(method, option.name))
+        object.__setattr__(method, option.name, value)
+
+
+def read_option(name: str, kind: Any, value: Any) -> Any:
+    """Return the value of an option as its annotation describes it, or refuse it."""
+    limits, extras = Number(), []
+    if get_origin(kind) is Annotated:
+        kind, *extras = get_args(kind)
+        limits = next((extra for extra in extras if isinstance(extra, Number)), limits)
+    allowed = list(get_args(kind)) if get_origin(kind) in (Union, UnionType) else [kind]
+    if value is None and NoneType in allowed:
+        return None
+    if MATRIX in extras:
+        return read_rows(name, value)
+    allowed = [one for one in allowed if one is not NoneType]
+    literals = [v for one in allowed if get_origin(one) is Literal for v in get_args(one)]
+    if literals and len(allowed) == 1:
+        return _one_of(name, value, [*literals, *([None] if _optional(kind) else [])])
+    if allowed == [bool]:
+        return _one_of(name, value, [True, False])
+    if allowed in ([float], [int]):
+        return _number(name, value, limits, whole=allowed == [int])
+    if allowed == [float, tuple[float, ...]] and isinstance(value, int | float):
+        return _number(name, value, limits, whole=False)
+    if tuple[float, ...] in allowed:
+        return _finite_numbers(name, value, limits)
+    if allowed == [tuple[tuple[float, float], ...]]:
+        return _pairs(name, value)
+    return value
+
+
+def _optional(kind: Any) -> bool:
+    return get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind)
+
+
+def _one_of(name: str, value: Any, allowed: list[Any]) -> Any:
+    for one in allowed:
+        if type(value) is type(one) and value == one:
+            return one
+    words = ", ".join(map(repr, allowed))
+    raise ObsynthError(f"{name} is {value!r}; it has to be one of {words}", option=name)
+
+
+def _number(name: str, value: Any, limits: Number, whole: bool) -> float | int:
+    kinds = int | np.integer if whole else int | float | np.integer | np.floating
+    fits = isinstance(value, kinds) and not isinstance(value, bool)
+    if not fits or not limits.holds(value):
+        raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
+    return int(value) if whole else float(value)
+
+
+def _finite_numbers(name: str, value: Any, limits: Number) -> tuple[float, ...]:
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.ndim != 1 or not numbers.size or not limits.holds(numbers):
+        raise ObsynthError(f"{name} is {value!r}; {limits.because}", option=name)
+    return tuple(numbers.tolist())
+
+
+def _pairs(name: str, value: Any) -> tuple[tuple[float, float], ...]:
+    try:
+        return tuple((float(low), float(high)) for low, high in value)
+    except (TypeError, ValueError) as error:
+        raise ObsynthError(
+            f"{name} is {value!r}; it has to be pairs (lower, upper)", option=name
+        ) from error
+
+
+def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np.ndarray[Any, Any]:
+    """Return an option that is an array of finite numbers; a vector serves as one column."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ObsynthError(f"{name} is no array of numbers: {value!r}", option=name) from error
+    if array.ndim == 1 and 1 not in dimensions:
+        array = array[:, None]
+    if array.ndim not in dimensions or not np.isfinite(array).all():
+        raise ObsynthError(
+            f"{name} has to hold finite numbers in {' or '.join(map(str, dimensions))} dimensions; "
+            f"got {value!r}",
+            option=name,
+        )
+    return array
+
+
+def read_rows(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix of finite numbers as a tuple of rows, which can be compared."""
+    return tuple(map(tuple, read_matrix(name, value).tolist()))
+
+
+WORDS = {
+    "d": "unknown input",
+    "p": "parameter",
+    "rho": "scheduling variable",
+    "x": "state",
+    "u": "input",
+    "w": "disturbance",
+    "f": "fault",
+}
+"""Kinds of signals as refusals call them."""
+
+
+@dataclass(frozen=True)
+class PlantClass:
+    """What a plant has to be for a method; each refusal is a clause after the symbols' names.
+
+    who: the method as a refusal calls it, "the bounded-error observer"
+    time: in which the method works
+    discretised: whether a discretisation stands for the continuous plant that it was made from
+    forbids: kind of signal -> why the method has none of it and what to do instead
+    finite: kind of signal -> why each of it needs a finite range and how to declare it
+    needs: kind of signal -> why at least one is needed
+    faults: roles of the faults that the method estimates
+    """
+
+    who: str
+    time: Literal["discrete", "continuous"]
+    discretised: bool = False
+    forbids: Mapping[str, str] = field(default_factory=dict)
+    finite: Mapping[str, str] = field(default_factory=dict)
+    needs: Mapping[str, str] = field(default_factory=dict)
+    faults: tuple[Role, ...] = (Role.ACTUATOR_FAULT, Role.PROCESS_FAULT)
+
+    def check(self, plant: Plant) -> Plant:
+        """Return the plant in the method's time, or refuse it by the user's own names."""
+        plant = self._in_time(plant)
+        for kind, clause in self.forbids.items():
+            self._refuse(kind, plant.names(kind), clause)
+        sensors = [s.name for s in plant.f if s.role not in self.faults]
+        if sensors:
+            raise StructureError(
+                f"sensor fault {', '.join(sensors)}: this method estimates faults that enter the "
+                "dynamics (actuator and process faults)",
+                symbols=tuple(sensors),
+                condition="faults in the dynamics",
+            )
+        for kind, clause in self.finite.items():
+            loose = tuple(s.name for s in getattr(plant, kind) if not s.bounded)
+            self._refuse(kind, loose, clause)
+        for kind, clause in self.needs.items():
+            if not getattr(plant, kind):
+                raise StructureError(
+                    f"{plant.name!r} declares no {WORDS[kind]}; {clause}",
+                    symbol=plant.name,
+                    condition=f"at least one {WORDS[kind]}",
+                )
+        return plant
+
+    def _in_time(self, plant: Plant) -> Plant:
+        if self.time == "continuous":
+            behind = plant.continuous if self.discretised and plant.Ts is not None else plant
+            if behind is None or behind.Ts is not None:
+                raise StructureError(
+                    f"{plant.name!r} is a discrete plant and {self.who} does not work in discrete "
+                    "time: give the continuous plant, and Ts= of the observer for the sampling of "
+                    "its step",
+                    symbol=plant.name,
+                    condition="continuous time",
+                )
+            return behind
+        if plant.Ts is None:
+            raise StructureError(
+                f"{plant.name} is in continuous time and {self.who} works in discrete time: "
+                'call discretise("euler", Ts=...) first',
+                condition="discrete time",
+            )
+        return plant
+
+    @staticmethod
+    def _refuse(kind: str, names: tuple[str, ...], clause: str) -> None:
+        if names:
+            raise StructureError(
+                f"{WORDS[kind]} {', '.join(names)}{clause}",
+                symbols=names,
+                symbol=names[0],
+                condition=f"{WORDS[kind]}s",
+            )
 
 
 @dataclass(frozen=True, eq=False)

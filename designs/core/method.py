@@ -17,10 +17,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.core.given import Start
+from obsynth.designs.core.given import PlantClass, Start, check_options
 from obsynth.designs.core.observer import Observer
-from obsynth.designs.core.options import check_options
-from obsynth.designs.core.plant_class import PlantClass
 from obsynth.designs.core.record import plain
 from obsynth.designs.core.stepping import fill, slices
 from obsynth.symbolic import Plant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import casadi as ca
@@ -15,6 +16,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 FINITE = 1e300
 """What is larger counts as no number: CasADi folds ``y == y`` to 1, so size is what tells."""
+MOST_CORNERS = 14
 
 
 def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
@@ -59,6 +61,22 @@ def known_signals(plant: Plant, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX, c
 def _enters_linearly(plant: Plant, symbol: sp.Symbol) -> bool:
     constants = set(plant.constant_values)
     return all(not sp.expand(sp.diff(row, symbol)).free_symbols - constants for row in plant.rhs)
+
+
+def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
+    """Return an upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
+
+    Exact up to rounding at the corners for up to 14 components, by the sum of
+    ``|P_ij| r_i r_j`` beyond.
+    """
+    reach = np.maximum(np.abs(lower), np.abs(upper))
+    rounding = 2.0**-40 * float(reach @ np.abs(P) @ reach)
+    if len(P) > MOST_CORNERS:
+        return float(reach @ np.abs(P) @ reach) * (1.0 + 2.0**-44) + rounding
+    pairs = [(a, b) if a != b else (a,) for a, b in zip(lower, upper, strict=True)]
+    corners = np.array(list(itertools.product(*pairs)))
+    levels = np.einsum("ki,ij,kj->k", corners, P, corners)
+    return float(levels.max()) + rounding
 
 
 def clip(value: ca.SX, box: FloatArray) -> ca.SX:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
+from obsynth.designs.core.given import POSITIVE
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import POSITIVE
-from obsynth.designs.filter_bank.claims import claims, covers
-from obsynth.designs.filter_bank.guarantee import guarantee, numbers
+from obsynth.designs.filter_bank.claims import claims, covers, guarantee, numbers
 from obsynth.designs.filter_bank.model import CLASS, read, read_again
 from obsynth.designs.filter_bank.record import BankDesign, BankModel
 from obsynth.designs.filter_bank.step import build_ode, build_step, first_memory, memory_sizes

@@ -12,7 +12,7 @@ from obsynth.derive import Split, StructureError
 from obsynth.derive.forms.measured import Reading, readings
 from obsynth.derive.jacobian.slope_signs import Monotone, exact_slope, with_ranges
 from obsynth.derive.rigour import round_number, substitute
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.filter_bank.record import UNKNOWN, BankModel, Signs
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray

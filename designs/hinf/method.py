@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.given import Number, read_gains, read_matrix
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import Number, read_matrix
 from obsynth.designs.hinf.claims import (
     RESIDUAL,
     claims,
     covers,
     decoupling_residual,
+    guarantee,
+    numbers,
     prove_level,
 )
-from obsynth.designs.hinf.guarantee import guarantee, numbers
 from obsynth.designs.hinf.model import CLASS, HinfModel, read, read_again
 from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.sector import Multipliers, SectorForm

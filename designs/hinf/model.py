@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, majorant, split
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.sector import ROOM, SectorForm, build_sector
 from obsynth.designs.hinf.system import Filter

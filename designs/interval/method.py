@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
-from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.given import MATRIX, read_gains, read_rows
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import MATRIX, read_rows
-from obsynth.designs.interval.claims import claims, covers
+from obsynth.designs.interval.claims import claims, covers, guarantee, numbers
 from obsynth.designs.interval.decoupling import check_detectable, find_transformation
-from obsynth.designs.interval.guarantee import guarantee, numbers
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign

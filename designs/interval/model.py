@@ -16,7 +16,7 @@ from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import Exact, exact, nearest
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -29,7 +29,7 @@ as it is stored:
 True
 """
 
-from obsynth.designs.lmi.blocks import block, he, symmetric_block
+from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
@@ -41,7 +41,7 @@ from obsynth.designs.lmi.expression import (
     trace,
 )
 from obsynth.designs.lmi.margin import Margin, MarginSolution, largest_margin, solve_with_margin
-from obsynth.designs.lmi.problem import Problem, cap_gain
+from obsynth.designs.lmi.problem import Problem, block, cap_gain, he, symmetric_block
 from obsynth.designs.lmi.proof import FamilyProof, prove_family
 from obsynth.designs.lmi.reductions import (
     distinct_members,
@@ -63,7 +63,6 @@ from obsynth.designs.lmi.search import (
     smallest_changes,
 )
 from obsynth.designs.lmi.solve import solve_lazily, solve_reliably, solve_with_retries
-from obsynth.designs.lmi.statement import Solution
 
 __all__ = [
     "Affine",

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.errors import SolverTrouble
+from obsynth.designs.lmi.conic import Solution, Statement
 from obsynth.designs.lmi.expression import Affine, Structure, Variable
-from obsynth.designs.lmi.statement import Solution, Statement
 
 # SDPA often stops a little short of its default of 1e-7 and then calls itself inaccurate.
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.rigour import ExactMatrix, is_positive_definite
+from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import Affine
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.lmi.statement import Solution
 
 # Blocks with less than this share of the dual weight get the multiplier zero.
 _NEGLIGIBLE = 1e-10

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.designs.lmi.blocks import block
 from obsynth.designs.lmi.expression import Affine, IntArray, symmetric
+from obsynth.designs.lmi.problem import block
 from obsynth.symbolic.errors import ObsynthError
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.lmi.blocks import block, he
 from obsynth.designs.lmi.expression import (
     Affine,
     ExpressionError,
@@ -22,7 +21,7 @@ from obsynth.designs.lmi.expression import (
     scalar,
     symmetric,
 )
-from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.problem import Problem, block, he
 from obsynth.designs.lmi.reductions import present_entries
 
 

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from obsynth.derive.rigour import prove_positive_definite
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi.conic import conic_form, rescaled, solve_form
+from obsynth.designs.lmi.conic import Solution, conic_form, rescaled, solve_form
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy
 from obsynth.designs.lmi.expression import IntArray
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.lmi.statement import Solution
 
 SECOND_SOLVERS = ("SDPA", "SCS")
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.given import read_gains
+from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import POSITIVE, Number, read_matrix
 from obsynth.designs.qpv.claims import claims, covers
 from obsynth.designs.qpv.guarantee import guarantee, numbers
 from obsynth.designs.qpv.model import (

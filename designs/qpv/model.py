@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.derive import QPV, qpv
 from obsynth.derive.errors import StructureError
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family
 from obsynth.designs.qpv.polytopes import Shape, box, cross, hull, one_of_each_pair
 from obsynth.designs.qpv.record import FormOfN, NoiseBound, QPVDesign, VertexData

@@ -10,11 +10,11 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.step import largest_level
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.stepping import (
     all_finite,
     finite_or,
+    largest_level,
     make_step,
     select,
     slices,

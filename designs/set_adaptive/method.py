@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.given import POSITIVE
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.core.options import POSITIVE
 from obsynth.designs.filter_bank.method import FilterBank
-from obsynth.designs.set_adaptive.claims import claims, covers
+from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
 from obsynth.designs.set_adaptive.equations import memory_sizes
 from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, design_gain, gain_problem
-from obsynth.designs.set_adaptive.guarantee import guarantee, numbers
 from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
 from obsynth.designs.set_adaptive.printed import printed_gain
 from obsynth.designs.set_adaptive.record import SetDesign, System

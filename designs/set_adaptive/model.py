@@ -11,7 +11,7 @@ import sympy as sp
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import middle_and_radius, round_number, substitute
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds
 from obsynth.designs.set_adaptive.record import SetDesign, System
 from obsynth.symbolic import Plant

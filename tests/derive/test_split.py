@@ -8,8 +8,7 @@ import sympy as sp
 
 from obsynth.derive import DerivationError, Split, StructureError, equilibrium, split
 from obsynth.derive.algebra.factorise import expand_terms, factorise
-from obsynth.derive.algebra.identity import prove_identity
-from obsynth.derive.algebra.linear_parts import rounded
+from obsynth.derive.algebra.linear_parts import prove_identity, rounded
 from obsynth.derive.rigour import rational
 from obsynth.symbolic import Plant
 

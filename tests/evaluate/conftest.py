@@ -79,7 +79,7 @@ class ToyObserver:
     @property
     def certificate(self):
         claim = Claim("interval", "a <= y + 0.1 & a >= y - 0.1", True, 0.25, "by construction")
-        return Certificate((claim,), {"format": "toy"})
+        return Certificate((claim,), {"format": "toy"}, None)
 
     @property
     def guarantee(self):

@@ -136,7 +136,7 @@ def test_a_claim_that_does_not_hold_is_shown_as_such(toy, tmp_path):
         @property
         def certificate(self):
             claims = (Claim("a", "two is two", True, 1, "-"), Claim("b", "no", False, -1, "-"))
-            return Certificate(claims, {})
+            return Certificate(claims, {}, None)
 
     text = report(tmp_path / "r.html", Doubtful(toy.plant)).read_text(encoding="utf-8")
     assert "1 of 2 claims proved" in text

@@ -8,7 +8,7 @@ from typing import Annotated
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import middle_and_radius
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -8,7 +8,7 @@ import pytest
 import sympy as sp
 
 from obsynth.symbolic import Plant, PlantError, plants
-from obsynth.symbolic.parity import ParityError
+from obsynth.symbolic.sxmodel import ParityError
 from zoo import ZOO
 
 KINDS = ("x", "u", "d", "f", "w", "p", "rho")

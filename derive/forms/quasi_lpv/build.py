@@ -7,20 +7,17 @@ import sympy as sp
 
 from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.forms.quasi_lpv.centre import (
-    Centre,
-    decide_signs,
-    deviations,
-    read_centre,
-)
-from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, Ranging
-from obsynth.derive.forms.quasi_lpv.layout import LinearLayout
+from obsynth.derive.forms.quasi_lpv.form import LinearLayout, QuasiLPV, Ranging
 from obsynth.derive.forms.quasi_lpv.options import Option
 from obsynth.derive.forms.quasi_lpv.ranking import choose
 from obsynth.derive.forms.quasi_lpv.terms import (
+    Centre,
     Term,
+    decide_signs,
+    deviations,
     list_terms,
     prefer_options,
+    read_centre,
     row_names,
     stacked_rows,
 )

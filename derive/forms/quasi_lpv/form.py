@@ -1,15 +1,16 @@
-"""The quasi-LPV form of a plant."""
+"""The quasi-LPV form of a plant, and where its blocks stand in one stacked matrix."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import sympy as sp
 from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.measured import read_measured
-from obsynth.derive.forms.quasi_lpv.centre import Centre
 from obsynth.derive.forms.quasi_lpv.display import form_html, form_latex, form_text
 from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, make_interval_form
 from obsynth.derive.forms.quasi_lpv.polytopic import (
@@ -18,10 +19,54 @@ from obsynth.derive.forms.quasi_lpv.polytopic import (
     centre_form,
 )
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
+from obsynth.derive.forms.quasi_lpv.terms import Centre
 from obsynth.derive.forms.scheduling import Lift, SchedulingVariable
-from obsynth.derive.forms.varying import VaryingForm, casadi_elements
+from obsynth.derive.forms.varying import Layout, VaryingForm, casadi_elements
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
+
+
+@dataclass(frozen=True)
+class LinearLayout(Layout):
+    """Sizes of [A B D B_f W1 offset; C feedthrough D_y D_f W2 output_offset].
+
+    rows: number of states and of outputs
+    columns: number of states, inputs, unknown inputs, faults, disturbances, and 1 for the offset
+    """
+
+    BLOCKS: ClassVar[dict[str, tuple[str, str]]] = {
+        "A": ("dynamics", "x"),
+        "B": ("dynamics", "u"),
+        "D": ("dynamics", "d"),
+        "B_f": ("dynamics", "f"),
+        "W1": ("dynamics", "w"),
+        "offset": ("dynamics", "1"),
+        "C": ("outputs", "x"),
+        "feedthrough": ("outputs", "u"),
+        "D_y": ("outputs", "d"),
+        "D_f": ("outputs", "f"),
+        "W2": ("outputs", "w"),
+        "output_offset": ("outputs", "1"),
+    }
+
+    rows: tuple[int, int]
+    columns: tuple[int, int, int, int, int, int]
+
+    @classmethod
+    def of(cls, model: Plant) -> LinearLayout:
+        """Return the layout of a plant."""
+        n, n_u, n_d, n_f, n_w = (len(model.names(kind)) for kind in "xudfw")
+        return cls((n, len(model.output_names)), (n, n_u, n_d, n_f, n_w, 1))
+
+    @property
+    def heights(self) -> tuple[int, int]:
+        """Number of states and of outputs."""
+        return self.rows
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Columns by the signals they multiply."""
+        return dict(zip("xudfw1", self.columns, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.measured import Known
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.scheduling import Lift
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import enclose_number, rational

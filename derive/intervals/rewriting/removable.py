@@ -14,8 +14,7 @@ from functools import cache
 import casadi as ca
 import sympy as sp
 
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.rewriting.quotients import Quotient, Quotients
 from obsynth.derive.intervals.search.reduction import SxGraph
 from obsynth.derive.rigour import substitute

@@ -6,8 +6,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.intervals.evaluate import enclose
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, enclose
 from obsynth.derive.rigour import up
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 

@@ -12,8 +12,13 @@ is concave is settled at once by the tangent at its top, however many boxes arou
 value the first order would need.
 """
 
+from __future__ import annotations
+
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -32,9 +37,52 @@ from obsynth.derive.intervals.search.curvature import (
     sharpened_slopes,
     taylor_spread,
 )
-from obsynth.derive.intervals.search.progress import Patience
 from obsynth.derive.rigour import Interval, up
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+
+_PATIENCE = 2.0
+
+
+class Patience:
+    """Shows what a long search is doing; silent before two seconds and off a terminal."""
+
+    def __init__(self) -> None:
+        self._since = time.monotonic()
+        self._status: Status | None = None
+        self._silent = False
+
+    def tell(self, text: str) -> None:
+        """Show a line in place of the one before."""
+        if self._silent or time.monotonic() - self._since < _PATIENCE:
+            return
+        if self._status is not None:
+            self._status.update(text)
+            return
+        from rich.console import Console
+
+        console = Console(stderr=True)
+        if not console.is_terminal:
+            self._silent = True
+            return
+        self._status = console.status(text)
+        self._status.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._status is not None:
+            self._status.stop()
+
 
 _CHUNK = 8192
 # Second derivatives are worth their price only where the first few sweeps leave something open;

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import UnboundedError, jacobian_bounds
-from obsynth.derive.algebra.common_factors import cancel_common_factors
+from obsynth.derive.algebra.factorise import cancel_common_factors
 from obsynth.symbolic import Plant
 
 x, y = sp.symbols("x y", real=True)

@@ -8,8 +8,8 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import Status, jacobian_bounds
-from obsynth.derive.algebra import products_to_sums
-from obsynth.derive.algebra.products_to_sums import same_waves
+from obsynth.derive.algebra import factorise
+from obsynth.derive.algebra.factorise import same_waves
 from obsynth.derive.jacobian import entries as jacobian_entries
 from obsynth.symbolic import Plant
 from obsynth.symbolic.plants.planar_arm import planar_arm_bias
@@ -54,7 +54,7 @@ def arm_from_lagrange(n):
     ],
 )
 def test_products_become_sums(typed, expected):
-    found = products_to_sums.products_to_sums(typed)
+    found = factorise.products_to_sums(typed)
     assert sp.simplify(found - expected) == 0
     assert not any(
         isinstance(node, sp.Mul) and len(node.atoms(sp.sin, sp.cos)) > 1
@@ -64,7 +64,7 @@ def test_products_become_sums(typed, expected):
 
 @pytest.mark.parametrize("expression", [v * sp.sin(a), a * b, sp.sin(sp.sin(a)), sp.tan(a)])
 def test_nothing_to_do(expression):
-    assert products_to_sums.products_to_sums(expression) is None
+    assert factorise.products_to_sums(expression) is None
 
 
 def test_the_proof_refuses_what_differs():
@@ -83,12 +83,12 @@ def wrong_rule(monkeypatch):
 def test_a_wrong_rule_is_not_used(monkeypatch):
     wrong_rule(monkeypatch)
     typed = sp.cos(a) * sp.cos(a + b) + sp.sin(a) * sp.sin(a + b)
-    assert products_to_sums.products_to_sums(typed) is None
+    assert factorise.products_to_sums(typed) is None
 
 
 def test_points_catch_what_a_missing_proof_lets_through(monkeypatch):
     plant = arm_from_lagrange(2)
-    monkeypatch.setattr(products_to_sums, "same_waves", lambda one, other: True)
+    monkeypatch.setattr(factorise, "same_waves", lambda one, other: True)
     right = fu.TR8
     monkeypatch.setattr(
         fu,

@@ -18,8 +18,7 @@ from obsynth.derive.constants.interval_matrix import (
     norm_over_interval,
 )
 from obsynth.derive.constants.symmetric_field import SymmetricField
-from obsynth.derive.intervals.ranges import Status, bound_ranges
-from obsynth.derive.intervals.search.problem import make_problem
+from obsynth.derive.intervals.ranges import Status, bound_ranges, make_problem
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
 

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals import functions, rules
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program, constant_interval
-from obsynth.derive.intervals.rewriting import cancelling
+from obsynth.derive.intervals.program import Program, constant_interval, evaluate
+from obsynth.derive.intervals.rewriting import rewrites
 from obsynth.derive.rigour import interval as arithmetic
 
 QUICK = settings(max_examples=120, deadline=None, derandomize=True)
@@ -210,9 +209,9 @@ def test_wrong_cancelling_is_caught(exactly, monkeypatch):
     assert not leaks(exactly, function, box)
     lo, hi = evaluate(Program.from_casadi(function), box[:, :1], box[:, 1:])
     assert (lo[0, 0], hi[0, 0]) == pytest.approx((0.0, 2**2.5 * np.sin(1)), rel=1e-14)
-    real = cancelling._powers
+    real = rewrites._powers
     monkeypatch.setattr(
-        cancelling,
+        rewrites,
         "_powers",
         lambda graph, factor, half, roots: real(graph, factor, half - 1, roots),
     )

@@ -6,13 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from obsynth.derive.intervals.graph import Schedule
 from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.ranges import make_problem, staged
 from obsynth.derive.intervals.rules import RULES, uncertain
-from obsynth.derive.intervals.schedule import Schedule
 from obsynth.derive.intervals.search.batch import Entries
 from obsynth.derive.intervals.search.branch import Budget, Search
-from obsynth.derive.intervals.search.problem import make_problem
-from obsynth.derive.intervals.search.stages import staged
 
 QUICK = settings(max_examples=60, deadline=None, derandomize=True)
 X = ca.SX.sym("x", 3)
@@ -105,7 +104,7 @@ def test_operands_in_the_wrong_row_are_caught(monkeypatch):
     live = program.live(range(3))
     right = Schedule(program, live, live)
     assert not differ(right, program, 0)
-    rows = "obsynth.derive.intervals.schedule._rows"
+    rows = "obsynth.derive.intervals.graph._rows"
     monkeypatch.setattr(rows, lambda found: np.array(found[::-1], dtype=np.int64))
     assert differ(Schedule(program, live, live), program, 0)
 

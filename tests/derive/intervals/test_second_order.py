@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.intervals.ranges import Status, bound_ranges
-from obsynth.derive.intervals.search import branch, curvature, reduction, stages
+from obsynth.derive.intervals import ranges
+from obsynth.derive.intervals.search import branch, curvature, reduction
 from obsynth.derive.intervals.search.curvature import Hessians, is_concave
 from obsynth.derive.intervals.search.reduction import SxGraph, reduce_variables
 
@@ -141,7 +142,7 @@ def test_no_bound_is_named_in_the_variables_of_the_user():
 
 @pytest.mark.parametrize("kink", [ca.fabs(X[0]), ca.fmax(X[0], X[1] ** 2), ca.sign(X[0]) * X[0]])
 def test_second_derivatives_across_a_kink_are_not_used(kink):
-    problem = stages.make_problem(kink * X[2], X, ROOM)
+    problem = ranges.make_problem(kink * X[2], X, ROOM)
     made = curvature.Curvatures(problem.source, problem.program)
     low, high = problem.lower[:, None], problem.upper[:, None]
     assert not made.enclose(np.array([1]), low, high).usable.any()
@@ -279,7 +280,7 @@ def test_a_quantity_whose_variables_stand_elsewhere_too_costs_tightness_and_says
         live = self._live(self.roots[output])
         return [n for n in live if self.supports[n] == {0, 1} and n != self.roots[output]][-1:]
 
-    monkeypatch.setattr(stages, "_QUICK", branch.Budget(boxes=1, sweeps=1))
+    monkeypatch.setattr(ranges, "_QUICK", branch.Budget(boxes=1, sweeps=1))
     monkeypatch.setattr(reduction.SxGraph, "quantities", first_sum)
     assert not wrong_bounds(exactly, entangled, ROOM)
     found = bound_ranges(entangled, X, ROOM, rtol=1e-6)
@@ -288,7 +289,7 @@ def test_a_quantity_whose_variables_stand_elsewhere_too_costs_tightness_and_says
 
 
 def test_a_range_of_a_quantity_that_is_too_narrow_is_caught(exactly, monkeypatch):
-    real = stages.make_problem
+    real = ranges.make_problem
 
     def narrow(expressions, variables, box, *constants):
         box = np.array(box, dtype=float)
@@ -298,7 +299,7 @@ def test_a_range_of_a_quantity_that_is_too_narrow_is_caught(exactly, monkeypatch
             box[4:, 1] -= 0.2 * width
         return real(expressions, variables, box, *constants)
 
-    monkeypatch.setattr(stages, "_FEW", 0)
-    monkeypatch.setattr(stages, "make_problem", narrow)
+    monkeypatch.setattr(ranges, "_FEW", 0)
+    monkeypatch.setattr(ranges, "make_problem", narrow)
     rising = ca.atan(X[0] + X[1] + ca.sin(4 * X[0] * X[1])) * ca.exp(X[2] * X[3] - X[2])
     assert wrong_bounds(exactly, rising, ROOM)

@@ -14,8 +14,7 @@ from obsynth.derive import (
     jacobian_bounds,
     split,
 )
-from obsynth.derive.structure.decoupling import unknown_input_condition
-from obsynth.derive.structure.detectability import detectability
+from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 
 CORRECT = {
     (0, 0): (0.002596, 0.006490),

@@ -7,8 +7,12 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, jacobian_bounds, split
-from obsynth.derive.jacobian.dependence import AffineDependence, find_dependences
-from obsynth.derive.jacobian.family import AffineFamily, build_family
+from obsynth.derive.jacobian.family import (
+    AffineDependence,
+    AffineFamily,
+    build_family,
+    find_dependences,
+)
 from obsynth.symbolic import Plant
 from obsynth.symbolic.plants.lorenz import lorenz
 

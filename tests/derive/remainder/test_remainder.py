@@ -7,8 +7,7 @@ import sympy as sp
 
 from obsynth.derive import StructureError, UnboundedError
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.evaluate import evaluate
-from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.remainder import flow, work
 from obsynth.derive.remainder.certify import discretisation_remainder
 from obsynth.derive.remainder.flow import FlowError, flow_box

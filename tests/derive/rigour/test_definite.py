@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.derive.rigour import definite, is_positive_definite, prove_positive_definite
+from obsynth.derive.rigour import enclosure, is_positive_definite, prove_positive_definite
 from obsynth.symbolic.errors import ObsynthError
 
 
@@ -53,8 +53,8 @@ def test_without_its_error_bound_the_proof_would_accept_indefinite_matrices(monk
     matrices = nearly_singular(np.random.default_rng(2), 10, 400, spread=0.5)
     exact = np.array([is_positive_definite(matrix) for matrix in matrices])
     assert not np.any(prove_positive_definite(matrices).proved & ~exact)
-    monkeypatch.setattr(definite, "gamma_bound", lambda n: 0.0)
-    monkeypatch.setattr(definite, "UNIT_ROUNDOFF", 0.0)
+    monkeypatch.setattr(enclosure, "gamma_bound", lambda n: 0.0)
+    monkeypatch.setattr(enclosure, "UNIT_ROUNDOFF", 0.0)
     assert np.any(prove_positive_definite(matrices).proved & ~exact)
 
 

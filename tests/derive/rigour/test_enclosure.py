@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour import Enclosure, ExactMatrix, enclosure, rounding
+from obsynth.derive.rigour import Enclosure, ExactMatrix, enclosure, interval
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=40, deadline=None)
@@ -62,7 +62,7 @@ def test_without_rounding_bounds_the_exact_result_escapes(monkeypatch):
     exact = ExactMatrix.of(a) @ ExactMatrix.of(b)
     assert inside(exact, Enclosure.of(a) @ Enclosure.of(b))
     monkeypatch.setattr(enclosure, "gamma_bound", lambda n: 0.0)
-    monkeypatch.setattr(rounding, "gamma_bound", lambda n: 0.0)
+    monkeypatch.setattr(interval, "gamma_bound", lambda n: 0.0)
     assert not inside(exact, Enclosure.of(a) @ Enclosure.of(b))
 
 

@@ -25,7 +25,6 @@ from obsynth.derive.rigour import (
     raised,
     rational,
     round_number,
-    rounding,
     smallest_above,
     substitute,
     up,
@@ -198,8 +197,8 @@ def test_sums_and_products_lie_on_their_side(seed):
 
 
 def test_without_the_factor_or_the_underflow_they_do_not(monkeypatch):
-    monkeypatch.setattr(rounding, "gamma_bound", lambda n: 0.0)
-    monkeypatch.setattr(rounding, "TINY", 0.0)
+    monkeypatch.setattr(interval, "gamma_bound", lambda n: 0.0)
+    monkeypatch.setattr(interval, "TINY", 0.0)
     verdicts = [one_sided(seed) for seed in range(10)]
     assert all(not all(v[name] for v in verdicts) for name in verdicts[0])
 
@@ -237,7 +236,7 @@ def test_middle_and_radius_hold_the_interval(seed):
 
 
 def test_a_radius_that_is_not_rounded_up_is_caught(monkeypatch):
-    monkeypatch.setattr(rounding, "up", lambda value: value)
+    monkeypatch.setattr(interval, "up", lambda value: value)
     assert sum(uncovered(seed) for seed in range(5))
 
 
@@ -304,7 +303,7 @@ def test_the_bound_of_the_rounding_is_half_a_unit(number):
 
 
 def test_a_rounding_whose_error_is_not_told_is_caught(monkeypatch):
-    from obsynth.derive.rigour import numbers as module
+    from obsynth.derive.rigour import interval as module
 
     monkeypatch.setattr(module, "smallest_above", lambda value: 0.0)
     assert not number_is_bounded(sp.Rational(1, 3))

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from obsynth.derive import StructureError, analyse, jacobian_bounds, split
 from obsynth.derive.structure import isolability
 from obsynth.derive.structure import zeros as zeros_module
-from obsynth.derive.structure.decoupling import unknown_input_condition
-from obsynth.derive.structure.detectability import pair_margin, weakest_member
+from obsynth.derive.structure.conditions import pair_margin, unknown_input_condition, weakest_member
 from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.frozen import balls, precision, rank
 from obsynth.derive.structure.isolability import fault_isolability

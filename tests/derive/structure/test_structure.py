@@ -5,8 +5,11 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import StructureError, analyse, jacobian_bounds, split
-from obsynth.derive.structure.decoupling import unknown_input_condition
-from obsynth.derive.structure.detectability import augmented_pair, detectability
+from obsynth.derive.structure.conditions import (
+    augmented_pair,
+    detectability,
+    unknown_input_condition,
+)
 from obsynth.derive.structure.zeros import invariant_zeros, separable_faults
 from obsynth.symbolic import Plant
 from obsynth.symbolic.plants.quadruple_tank import quadruple_tank

@@ -14,8 +14,8 @@ from obsynth.designs.bounded_error.infeasibility import find_fixed_point, verify
 from obsynth.designs.bounded_error.lmis import plain_error
 from obsynth.designs.bounded_error.multipliers import box_vertices, largest_multiplier_gamma
 from obsynth.designs.bounded_error.record import UioDesign
-from obsynth.designs.bounded_error.step import largest_level
 from obsynth.designs.bounded_error.synthesis import largest_gamma
+from obsynth.designs.core.stepping import largest_level
 
 SCENARIOS = ("FS1", "FS2")
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from obsynth.designs.core.options import MATRIX, POSITIVE, Number, check_options
+from obsynth.designs.core.given import MATRIX, POSITIVE, Number, check_options
 from obsynth.symbolic import ObsynthError
 
 SHARE = Number(0.0, 1.0, because="a share lies between 0 and 1")

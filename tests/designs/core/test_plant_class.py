@@ -5,8 +5,7 @@ import pytest
 
 import obsynth as ob
 from methods import two_tanks
-from obsynth.designs.core.given import Start, read_gains
-from obsynth.designs.core.plant_class import PlantClass
+from obsynth.designs.core.given import PlantClass, Start, read_gains
 
 CLASS = PlantClass(
     who="the observer",
