@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.intervals import ranges
+from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.intervals.search import branch, curvature, reduction
 from obsynth.derive.intervals.search.curvature import Hessians, is_concave
 from obsynth.derive.intervals.search.reduction import SxGraph, reduce_variables
