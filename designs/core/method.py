@@ -143,7 +143,7 @@ class Method:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        CONTRACTS.setdefault(cls.CONTRACT.name, cls.CONTRACT)
+        CONTRACTS[cls.CONTRACT.name] = cls.CONTRACT
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.core.given import POSITIVE
+from obsynth.designs.core.given import POSITIVE, read_gains
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
@@ -175,13 +175,7 @@ class SetAdaptiveObserver(Method):
 
     def fix(self, model: SetModel, gains: Mapping[str, ArrayLike]) -> SetDesign:
         """Find the decay of a given ``L`` of shape (n, m)."""
-        L = np.asarray(gains.get("L"), dtype=float)
-        if set(gains) != {"L"} or L.shape != model.C.T.shape or not np.all(np.isfinite(L)):
-            raise ObsynthError(
-                f"gains has to hold L alone, of shape {model.C.T.shape}, finite; given were "
-                f"{', '.join(gains) or 'none'}",
-                option="gains",
-            )
+        L = read_gains(gains, {"L": model.C.T.shape})["L"]
         gain = analyse_gain(model.A_lower_box, model.A_span[1], model.C, L)
         if gain.alpha <= 0.0:
             raise InfeasibleDesign(
