@@ -1,7 +1,5 @@
 """Compile a generated project and compare it with its vectors, to the last bit."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """What a project is made from: an observer, checked and with C names."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Leave a folder whole or not at all, and never over someone else's files."""
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

@@ -1,7 +1,5 @@
 """The arithmetic of one step: as C without CasADi's interface, and on CasADi's virtual machine."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`generate_c`: a C project of one observer step, built and compared on the spot."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import operator

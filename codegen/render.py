@@ -1,7 +1,5 @@
 """The text files of a project, from templates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from importlib.metadata import version

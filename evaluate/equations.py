@@ -1,17 +1,13 @@
 """A plant's equations for a page: each row as a formula, signals and constants as tables."""
 
 import html
-from typing import TYPE_CHECKING
 
 import numpy as np
 import sympy as sp
 
 from obsynth.evaluate.svg import math_svg
 from obsynth.evaluate.table import Table
-
-if TYPE_CHECKING:
-    from obsynth.symbolic import Plant
-
+from obsynth.symbolic import Plant
 
 _GROUPS = ("x", "u", "d", "f", "w", "rho", "p")
 

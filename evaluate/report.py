@@ -7,8 +7,9 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from obsynth.designs.core.observer import Observer
 from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.equations import constants_html, equations_html, signals_table
 from obsynth.evaluate.errors import ReportError
@@ -19,11 +20,7 @@ from obsynth.evaluate.plotting.width_plot import plot_widths
 from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.svg import figure_svg
 from obsynth.evaluate.table import Table, text
-
-if TYPE_CHECKING:
-    from obsynth.designs.core.observer import Observer
-    from obsynth.symbolic import Plant
-
+from obsynth.symbolic import Plant
 
 Tables = Table | Sequence[Table]
 

@@ -4,22 +4,19 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.table import Table
 from obsynth.evaluate.trace import Trace, Violation
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from obsynth.designs.core.observer import Observer
-    from obsynth.designs.detection.detector import FaultDetector
-    from obsynth.symbolic import Plant
-
 
 # Instants listed for each violated signal; the count is always complete.
 LISTED = 5

@@ -3,17 +3,14 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
-
-if TYPE_CHECKING:
-    from obsynth.symbolic.plant import Plant
-
+from obsynth.symbolic.plant import Plant
 
 _FIELDS = {
     "u": "inputs",

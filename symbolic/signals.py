@@ -161,11 +161,6 @@ class Signal:
         """True when both bounds are finite."""
         return math.isfinite(self.lower) and math.isfinite(self.upper)
 
-    @property
-    def is_fault(self) -> bool:
-        """True for actuator, sensor and process faults."""
-        return self.role in FAULT_ROLES
-
 
 def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str, ...]:
     """Expand names as ``sympy.symbols`` does."""

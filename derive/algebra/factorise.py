@@ -14,8 +14,6 @@ and variables that do not matter are gone: the equations of a robot arm, as they
 Lagrange's method, shrink to a fraction. Every rewritten part is proved equal to what it replaces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 

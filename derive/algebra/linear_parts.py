@@ -1,7 +1,5 @@
 """Linear parts of expressions, and the proof that the parts of a split add up to the plant."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ fewer than that. So all products whose factors are known are taken in one call, 
 row per product and one column per box, then all sums that have become possible, and so on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Guaranteed ranges of expressions over a box: the way into the interval engine."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum

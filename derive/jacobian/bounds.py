@@ -6,8 +6,6 @@ CasADi differentiates past the jump of a sign, a step or a piecewise definition 
 there. A kink is harmless (both slopes enter the bounds), a jump is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ product sign(g) |g|^a with a > 0 counts as one increasing function of g, so that
 of pieces with a sign each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

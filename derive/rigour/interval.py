@@ -18,8 +18,6 @@ order, with or without fused multiply-adds (N. J. Higham, Accuracy and Stability
 Algorithms, section 3.1).
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Mapping

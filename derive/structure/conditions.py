@@ -1,7 +1,5 @@
 """Structural conditions: can unknown inputs be decoupled, can what is left be detected?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

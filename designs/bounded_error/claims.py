@@ -1,7 +1,5 @@
 """Proofs for the gains and matrices as they are stored, and that they speak of the stored plant."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any

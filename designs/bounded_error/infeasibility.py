@@ -13,8 +13,6 @@ does not change; yet s satisfies both inequalities that (51) allows it
 every P, K: (51) is infeasible whatever the solver says.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any

@@ -20,7 +20,6 @@ from obsynth.symbolic.arrays import FloatArray
 
 ErrorKind = Literal["plain", "shifted"]
 Arithmetic = Literal["float", "enclosure", "exact"]
-ERRORS: tuple[ErrorKind, ...] = ("plain", "shifted")
 
 
 @dataclass(frozen=True, eq=False)

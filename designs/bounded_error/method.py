@@ -1,14 +1,13 @@
 """`BoundedErrorUIO`: options of the method, and the way from a model to an observer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.bounded_error.claims import (
     claims,
     covers,
@@ -40,14 +39,10 @@ from obsynth.designs.bounded_error.synthesis import (
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.lmi import Problem
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.derive import JacobianBounds, Split
-    from obsynth.designs.lmi import Problem
-    from obsynth.symbolic import Plant
-
 
 # Keeps sums of rounded weights at or below 1.
 BELOW_ONE = 1.0 - 2.0**-48

@@ -1,9 +1,7 @@
 """From a model to the numeric data of the method, structural conditions first."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +13,6 @@ from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.designs.core.given import PlantClass
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from obsynth.symbolic import Plant
 
 
 @dataclass(frozen=True, eq=False)

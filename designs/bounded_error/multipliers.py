@@ -1,7 +1,5 @@
 """Design through inequality (51): as printed, and repaired with diagonal multipliers."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """What runs: equations (10)-(12), half-width recursions (33)-(36) and their first values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

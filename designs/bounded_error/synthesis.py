@@ -1,7 +1,5 @@
 """Gains and ellipsoids by linear matrix inequalities: solved here, proved elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -28,7 +26,6 @@ from obsynth.designs.lmi import (
 from obsynth.symbolic.arrays import FloatArray
 
 Objective = Literal["trace_inverse", "log_det", "lambda_min", "trace"]
-OBJECTIVES: tuple[Objective, ...] = ("trace_inverse", "log_det", "lambda_min", "trace")
 
 # Room between the solver's answer and the boundary, relative to blocks scaled to about one:
 # large against the solver's tolerance, small against the digits anybody reads.

@@ -1,7 +1,5 @@
 """Read a design from a file: nothing in it is believed before it is proved again."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

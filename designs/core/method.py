@@ -5,8 +5,6 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 `Contract` say what they owe, and the observer, its certificate, its file and its memory follow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar

@@ -5,8 +5,6 @@ for the numbers of the plant's signals (`sizes_of`); sums like ``n+n_f-1`` are a
 other letter stands for the length that it meets first. The plant comes before them.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

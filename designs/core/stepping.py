@@ -1,7 +1,5 @@
 """What the steps of all methods share: finiteness, ranges, the status word, the names."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 

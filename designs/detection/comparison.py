@@ -1,7 +1,5 @@
 """What a fault detector did in a run: events, delays, false alarms."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape

@@ -1,12 +1,10 @@
 """`FaultDetector`: alarms from guaranteed fault bounds."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,11 +14,8 @@ from obsynth.designs.core.certificate import Certificate, Guarantee
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.comparison import Detection, RunLike, compare
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from obsynth.symbolic import Plant
-
 
 SKIPPED = ("not_initialised", "non_finite_input", "fault_not_valid")
 """Bits of the status at which a sample never counts, neither for an alarm nor against it."""

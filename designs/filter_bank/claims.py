@@ -1,7 +1,5 @@
 """Proofs for the bank as it is stored, and that it speaks of the stored plant."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fault intervals of every filter, from a bank's memory."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,24 +1,20 @@
 """`FilterBank`: options of the method, and the way from a plant to an observer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from obsynth.derive import Split
 from obsynth.designs.core.given import POSITIVE
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.filter_bank.claims import claims, covers, guarantee, numbers
 from obsynth.designs.filter_bank.model import CLASS, read, read_again
 from obsynth.designs.filter_bank.record import BankDesign, BankModel
 from obsynth.designs.filter_bank.step import build_ode, build_step, first_memory, memory_sizes
+from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.derive import Split
-    from obsynth.symbolic import Plant
 
 _DEFAULT_TS = 0.01
 

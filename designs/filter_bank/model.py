@@ -1,7 +1,5 @@
 """What the bank reads of a plant: signs of slopes, what outputs show, where faults enter."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stored bank: plain data from which the step, its continuous form and the proofs are made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

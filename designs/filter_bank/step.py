@@ -1,7 +1,5 @@
 """The run-time functions of the bank: envelopes between samples, unmeasured states, filters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """How wide the sets of a bank are in the long run, at most."""
 
-from __future__ import annotations
-
 import numpy as np
 import sympy as sp
 

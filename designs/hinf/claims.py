@@ -1,7 +1,5 @@
 """Proofs of the attenuation level for the stored numbers, and that these speak of the plant."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any

@@ -1,14 +1,13 @@
 """`HinfUIO`: options of the method, and the way from a model to an observer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, read_matrix
 from obsynth.designs.core.method import Contract, Method
@@ -35,12 +34,9 @@ from obsynth.designs.hinf.synthesis import (
     unstable_vertex,
 )
 from obsynth.designs.hinf.system import Filter
+from obsynth.designs.lmi import Problem
+from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.derive import JacobianBounds, Split
-    from obsynth.designs.lmi import Problem
-    from obsynth.symbolic import Plant
 
 LEVEL = Number(above=0.0, because="a level is positive and finite")
 SLACK = Number(above=0.0, because="it is positive, since an infimum is not attained")

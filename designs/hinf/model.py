@@ -1,7 +1,5 @@
 """What is read of a plant: its split and what bounds g, structural conditions first."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stored design of the method: plain data from which step and proofs are made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The sector that multipliers weigh: what it says, and how it is made from a majorant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

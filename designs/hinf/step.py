@@ -1,7 +1,5 @@
 """The run-time function of the filter: equations (18)-(19) in the order in which data arrive."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,7 +1,5 @@
 """How bad can it get: disturbances and operating points that make the fault error large."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

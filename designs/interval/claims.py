@@ -1,7 +1,5 @@
 """Proofs of a stored design, all of them in rational arithmetic."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

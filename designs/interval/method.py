@@ -1,11 +1,9 @@
 """`IntervalObserver`: options of the method, and the way from a model to an observer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -30,12 +28,9 @@ from obsynth.designs.interval.synthesis import (
     sylvester_design,
     with_gains,
 )
+from obsynth.designs.lmi import Problem
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from obsynth.designs.lmi import Problem
-
 
 Matrix = Annotated[ArrayLike | None, MATRIX]
 

@@ -1,7 +1,5 @@
 """The paper's forms as printed: Theorem 1 and equation (32), and what refuses them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stored design of the method, and the bounds that follow from it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 By a linear programme, the Sylvester equation, pole placement, or a direct search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

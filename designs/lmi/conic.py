@@ -4,8 +4,6 @@ Minimise c'x with A x + s = b, s in a product of cones; matrices stand as their 
 columns, sqrt(2) off the diagonal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -7,8 +7,6 @@ sharp, with r of the size of its accuracy (C. Jansson, D. Chaykin, C. Keil, SIAM
 Anal. 46, 2007, use the same argument with intervals).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction

@@ -5,8 +5,6 @@ minimises the objective with a small part of t kept as margin; the result is mov
 phase 1 point until the proof goes through.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

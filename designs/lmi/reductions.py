@@ -4,8 +4,6 @@ Everything here is exact: the reduced inequalities hold if and only if the given
 is only sufficient stands in :mod:`obsynth.designs.lmi.relaxation` and says so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction

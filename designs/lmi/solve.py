@@ -5,8 +5,6 @@ many vertices it is stated with few, all are checked, and the worst are added un
 violated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

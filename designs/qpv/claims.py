@@ -3,8 +3,6 @@
 Every pair of vertices, every half-space, every corner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any

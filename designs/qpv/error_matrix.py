@@ -4,8 +4,6 @@ With x' = A x + [x'N_i x] and e = x - xhat follows e' = (A - L C + Psi(x, e)) e,
 is x'(N_i + N_i') - e'N_i: equations (8)-(10), (30) and (24) of Rotondo, Buciakowski and Witczak.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """What an observer of the method promises, and what it shows of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

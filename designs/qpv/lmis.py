@@ -4,8 +4,6 @@ Divided by eta they are stated over the enlarged polytopes themselves: with x = 
 and e = (x_i - c)/eta, eta times Psi(x, e) is the Psi of (24) in Rotondo, Buciakowski and Witczak.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive import QPV
 from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.lmi import Problem
 from obsynth.designs.qpv.claims import claims, covers
 from obsynth.designs.qpv.guarantee import guarantee, numbers
 from obsynth.designs.qpv.model import (
@@ -33,14 +35,9 @@ from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.step import build_ode, build_step, first_memory, memory_sizes
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.derive import QPV
-    from obsynth.designs.lmi import Problem
-    from obsynth.symbolic import Plant
-
 
 ETA = Number(0.0, at_most=1.0, because="1 / eta enlarges the polytopes, so it lies in (0, 1]")
 DECAY = Number(at_least=0.0, because="a decay rate is not negative")
@@ -262,10 +259,6 @@ class QPVObserver(Method):
     def options(self) -> Mapping[str, Any]:
         """Return the options as JSON-able data, the region apart."""
         return {name: value for name, value in super().options().items() if name != "region"}
-
-    def with_eta(self, eta: float) -> QPVObserver:
-        """Return the same options with another eta."""
-        return replace(self, eta=eta)
 
     @property
     def _fixed_eta(self) -> float | None:

@@ -7,8 +7,6 @@ Rotondo, Buciakowski and Witczak with the sum over the distinct permutations, th
 indices and alpha P inside the sum.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the paper prints: the gains of its example, and conditions that do not prove it."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

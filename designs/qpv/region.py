@@ -1,7 +1,5 @@
 """`Ellipsoid`: the set in which a design assumes the augmented state to stay."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

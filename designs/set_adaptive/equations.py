@@ -1,7 +1,5 @@
 """The equations (6)-(8), (14) in symbols, shared by the continuous form and the step."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ range of the outputs. The largest alpha is found by a ratio iteration in which e
 design. (The paper's L = p w' solves neither p'L = w' nor the Metzler condition.)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fault indicators (16)-(18) and the monitors (13) of an observer's memory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

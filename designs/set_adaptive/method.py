@@ -1,18 +1,19 @@
 """`SetAdaptiveObserver`: options of the method, and the way from a plant to an observer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import POSITIVE, read_gains
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
+from obsynth.designs.lmi import Problem
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
 from obsynth.designs.set_adaptive.equations import memory_sizes
 from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, design_gain, gain_problem
@@ -21,15 +22,9 @@ from obsynth.designs.set_adaptive.printed import printed_gain
 from obsynth.designs.set_adaptive.record import SetDesign, System
 from obsynth.designs.set_adaptive.step import build_ode, build_step, first_memory
 from obsynth.designs.set_adaptive.transition import uniformisation
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-if TYPE_CHECKING:
-    from obsynth.derive import JacobianBounds, Split
-    from obsynth.designs.core.observer import Observer
-    from obsynth.designs.lmi import Problem
-    from obsynth.symbolic import Plant
-
 
 _DECADE = (5.0, 2.0, 1.0)
 

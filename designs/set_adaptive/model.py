@@ -1,7 +1,5 @@
 """What the method reads of a plant: x' = A(rho) x + B u + phi + G theta + W1 w, y = C x + v."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

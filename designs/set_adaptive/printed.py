@@ -1,7 +1,5 @@
 """The gain condition as the paper prints it, kept to show that it does not do what it is for."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from obsynth.designs.core.errors import InfeasibleDesign

@@ -1,7 +1,5 @@
 """The stored design: plain data from which step, ode and proofs are made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

@@ -8,8 +8,6 @@ move by the same transition, so x - zeta + Omega theta keeps its sign. The fault
 backward Euler, which is a convex combination of two bounds.
 """
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

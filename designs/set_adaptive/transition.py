@@ -1,7 +1,5 @@
 """The exact exponential of a Metzler matrix as a sum of nonnegative terms (uniformisation)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal, localcontext

@@ -2,18 +2,15 @@
 
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from obsynth.codegen import CProject
+from obsynth.derive import JacobianBounds, Split
 from obsynth.designs import InfeasibleDesign, Observer
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.table import Table, text
-
-if TYPE_CHECKING:
-    from obsynth.codegen import CProject
-    from obsynth.derive import JacobianBounds, Split
-
 
 # M_min and M_max of Section 6, by row and column from 1.
 PRINTED_BOUNDS: Mapping[tuple[int, int], tuple[float, float]] = {

@@ -4,13 +4,12 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.codegen import CProject, generate_c
 from obsynth.codegen.folder import complete_folder
-from obsynth.derive import jacobian_bounds, split
+from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.designs import BoundedErrorUIO, InfeasibleDesign, Observer
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.errors import SimulationError
@@ -29,12 +28,7 @@ from obsynth.evaluate.studies.printed import (
     width_table,
 )
 from obsynth.evaluate.table import Table
-from obsynth.symbolic import Scenario, plants, scenarios
-
-if TYPE_CHECKING:
-    from obsynth.derive import JacobianBounds, Split
-    from obsynth.symbolic import Plant
-
+from obsynth.symbolic import Plant, Scenario, plants, scenarios
 
 # The largest round value that leaves room below the largest feasible gamma of all forms.
 GAMMA = 0.005

@@ -5,8 +5,6 @@ intervals overestimates the range of a row, mean over the box of sum_j width(A_i
 divided by range(f_i). Entries that need an unmeasured signal count once more.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Rows of a plant as terms about a point, each with the ways in which it can be written."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -7,8 +7,6 @@ family can be below the largest of these; the distance to `PeakBound` shows what
 its small-gain argument may give away at most.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

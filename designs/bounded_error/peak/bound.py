@@ -13,8 +13,6 @@ and each instant follows from those before. Nothing else is needed, so the
 certificate is one inequality in numbers that are all rounded up.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

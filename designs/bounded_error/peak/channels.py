@@ -1,7 +1,5 @@
 """Rank-one channels of an affine family of Jacobians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

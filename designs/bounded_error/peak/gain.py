@@ -8,8 +8,6 @@ neighbours of them, since there are many local minima. What is found is rounded
 to few digits and proved by `peak_bound`; nothing rests on the search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -17,8 +17,6 @@ made by doubling, and one product gives all responses. The derivative goes the s
 backwards, so it costs about as much as two evaluations, whatever the number of gains.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -17,8 +17,6 @@ so that any c with ``tau + G_lambda c <= c`` and ``c >= lambda^-k beta(k)`` for
 0 < k < N makes ``beta(k) <= c lambda^k`` for every k >= 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
