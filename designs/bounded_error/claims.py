@@ -23,13 +23,12 @@ from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, elli
 from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
 from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational LDL' on the worst vertex"
-# Magnitudes up to which signals without a declared range are covered.
-LARGEST_SIGNAL = 1e6
 
 
 def claims(design: UioDesign) -> Iterator[Claim]:
@@ -243,8 +242,7 @@ def _rounding_of_matrices(design: UioDesign, parts: Split) -> float:
     rounding = parts.proof.rounding
     largest = {}
     for kind, names in (("x", ("C",)), ("d", ("D",)), ("f", ("B_f",)), ("w", ("W1", "W2"))):
-        box = np.abs(design.plant.box(kind)).max(axis=1, initial=0.0)
-        box = np.where(np.isfinite(box), box, LARGEST_SIGNAL)
+        box = np.abs(finite_box(design.plant, kind)).max(axis=1, initial=0.0)
         for name in names:
             largest[name] = float((rounding[name] @ box).max(initial=0.0))
     gain = float(np.abs(design.gain).sum(axis=1).max(initial=0.0))

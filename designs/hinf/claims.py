@@ -9,6 +9,13 @@ import numpy as np
 from obsynth.derive.rigour import ExactMatrix, is_positive_definite, prove_positive_definite
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import (
+    LARGEST_SIGNAL,
+    about_centre,
+    at_centre,
+    finite_box,
+    noise_centre,
+)
 from obsynth.designs.hinf.lmis import (
     PrintedLoop,
     decay_block,
@@ -27,8 +34,6 @@ RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational elimination at the worst vertex"
 # What rounding F and H may leave of the fault, relative to what they take away.
 RESIDUAL = 1e-12
-# Magnitude up to which signals without a declared range are covered.
-LARGEST_SIGNAL = 1e6
 # What rounding C and L may move in one step, relative to the sizes of the signals.
 ALLOWED = 2.0**-40
 
@@ -79,12 +84,14 @@ def prove_level(design: HinfDesign) -> Iterator[Claim]:
         if data.sector is None
         else f"for every nonlinearity in the sector ({data.sector.groups} multipliers)"
     )
-    level = f"V+ - V + |f - fhat|^2 < mu^2 |w|^2 with mu = {bound.mu:.9g}"
+    plant, centre = design.plant, noise_centre(design.plant)
+    about, quiet = about_centre(plant, centre), at_centre(plant, centre)
+    level = f"V+ - V + |f - fhat|^2 < mu^2 |{about}|^2 with mu = {bound.mu:.9g}"
     statements = {
         "lmi": f"{level} {where}" + (", by (45)" if printed else ""),
         "lipschitz": "(37): P > alpha M'M",
         "Q": "Q > 0",
-        "decay": f"V+ < {bound.decay} V where w = 0, {where}",
+        "decay": f"V+ < {bound.decay} V where {quiet}, {where}",
     }
     exact = {}
     for name, block in proof_blocks(design, "enclosure").items():
@@ -217,8 +224,7 @@ def _rounding_of_signals(
     """Bound what rounding C, B_f and D moves in one step, and the size to compare it with."""
     lost, size = 0.0, 1.0
     for kind, name in (("x", "C"), ("f", "B_f"), ("d", "D")):
-        box = np.abs(design.plant.box(kind)).max(axis=1, initial=0.0)
-        box = np.where(np.isfinite(box), box, LARGEST_SIGNAL)
+        box = np.abs(finite_box(design.plant, kind)).max(axis=1, initial=0.0)
         lost += float((rounding[name] @ box).max(initial=0.0))
         size = max(size, float(box.max(initial=0.0)))
     return lost, size
@@ -272,15 +278,16 @@ def guarantee(design: HinfDesign) -> Guarantee:
     """Return what is promised of the fault estimates, and what has to hold for it."""
     plant, bound = design.plant, design.bound
     faults = ", ".join(plant.names("f"))
-    noise = ", ".join(plant.names("w"))
+    centre = noise_centre(plant)
+    about, quiet = about_centre(plant, centre), at_centre(plant, centre)
     start = "e_0'Pe_0 + s_0'Qs_0" if bound.printed.size else "e_0'Pe_0"
     claims = [
         f"sum_k |f_k - fhat_k|^2 <= mu^2 sum_k |w_k|^2 + {start} over every horizon, with "
-        f"mu = {bound.mu:.9g}, f = ({faults}), w = ({noise}) and e = x - xhat",
-        f"xhat -> x and fhat -> ({faults}) where w = 0, whatever ({faults}) does",
+        f"mu = {bound.mu:.9g}, f = ({faults}), w = {about} and e = x - xhat",
+        f"xhat -> x and fhat -> ({faults}) where {quiet}, whatever ({faults}) does",
     ]
     if bound.decay is not None:
-        claims.append(f"V+ <= {bound.decay:g} V for V = e'Pe where w = 0")
+        claims.append(f"V+ <= {bound.decay:g} V for V = e'Pe where {quiet}")
     if plant.d:
         claims.append(f"whatever {', '.join(plant.names('d'))} does")
     ranges = ", ".join(
@@ -294,7 +301,7 @@ def guarantee(design: HinfDesign) -> Guarantee:
         f"{inside}: {ranges} {seen}",
         *_inputs_assumed(design),
         "every sample arrives (status bit 2); one that is missing counts as a new initial error",
-        f"({noise}) has finite energy over the horizon; no bound is used",
+        f"{about} has finite energy over the horizon; no bound is used",
         "rounding errors of the step, about 1e-16 of the signals, are not counted as disturbances",
     ]
     if residual > 0.0:

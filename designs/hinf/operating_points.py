@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -56,7 +57,7 @@ def _functions(model: Plant) -> Functions:
     """(x, u, v) -> rhs and its Jacobian by (x, u, v)."""
     n, n_u, n_f, n_d = (len(model.names(kind)) for kind in ("x", "u", "f", "d"))
     x, u, v = ca.SX.sym("x", n), ca.SX.sym("u", n_u), ca.SX.sym("v", n_f + n_d)
-    quiet = [ca.DM.zeros(len(model.names(kind))) for kind in ("w", "p", "rho")]
+    quiet = [ca.DM(noise_centre(model)), *(ca.DM.zeros(len(model.names(k))) for k in ("p", "rho"))]
     value = model.function()(x, u, v[n_f:], v[:n_f], *quiet)[0]
     slopes = ca.densify(ca.jacobian(value, ca.vertcat(x, u, v)))
     return ca.Function("rhs", [x, u, v], [value]), ca.Function("slopes", [x, u, v], [slopes])

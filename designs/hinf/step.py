@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.given import Start
+from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.core.stepping import (
     all_finite,
     clip,
@@ -51,12 +52,13 @@ def output_box(C: FloatArray, box: FloatArray) -> FloatArray:
 def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
     """Return A xhat + B u + g(c, u) with c the nearest point of the box of the states.
 
-    The right-hand side of the plant at c is A c + B u + g(c, u), so neither B nor g is needed,
-    and inside the box nothing is added.
+    The right-hand side of the plant at c, with w at its middle, is A c + B u + g(c, u) and what
+    that w adds, so neither B nor g is needed, and inside the box nothing else is added.
     """
     nearest = clip(xhat, model.box("x"))
     kinds = ("d", "f", "w", "p", "rho")
     quiet = [ca.DM.zeros(len(model.names(kind))) for kind in kinds]
+    quiet[kinds.index("w")] = ca.DM(noise_centre(model))
     value = model.function()(nearest, u, *quiet)[0]
     return value + ca.DM(A) @ (xhat - nearest)
 

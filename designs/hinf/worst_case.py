@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.hinf.method import HinfUIO
 from obsynth.designs.hinf.operating_points import OperatingPoints, frozen_gain, search_points
 from obsynth.designs.hinf.record import HinfDesign
@@ -33,6 +34,7 @@ class WorstCase:
     frequency : float
         Of w, in radians per sample.
     w : ndarray of shape (N, n_w)
+        About the middle of its range.
     error : ndarray of shape (N, n_f)
         f_k - fhat_k.
     certified : float
@@ -163,7 +165,8 @@ class _Loop:
         feedback = ca.SX.sym("feedback", (n_f + n_d) * n)
         held = v + ca.reshape(feedback, n_f + n_d, n) @ (x - at)
         empty = [ca.DM.zeros(len(model.names(kind))) for kind in ("p", "rho")]
-        following, y = model.function()(x, u, held[n_f:], held[:n_f], w, *empty)
+        noise = w + ca.DM(noise_centre(model))
+        following, y = model.function()(x, u, held[n_f:], held[:n_f], noise, *empty)
         outputs = observer.step(memory, u, y)
         state = ca.Function(
             "loop",

@@ -7,7 +7,8 @@ import numpy as np
 from obsynth.derive.rigour import UNIT, exact, nearest
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.interval.model import LARGEST_SIGNAL, IntervalModel
+from obsynth.designs.core.signals import LARGEST_SIGNAL
+from obsynth.designs.interval.model import IntervalModel
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.widths import steady_holds

@@ -18,6 +18,7 @@ from obsynth.derive.rigour import Exact, exact, nearest
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.record import Record
+from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from obsynth.designs.interval.record import IntervalDesign
 
 MOST_VERTICES = 1024
-LARGEST_SIGNAL = 1e6
-"""Magnitude up to which rounding is accounted for where a signal has no declared range."""
 RANK = 1e-9
 CLASS = PlantClass(
     who="the interval observer",
@@ -95,7 +94,7 @@ class IntervalModel(Record):
 
     def box(self, kind: str) -> Exact:
         """Return the declared box of x, u or w, `LARGEST_SIGNAL` where there is none."""
-        return exact(np.clip(self.plant.box(kind), -LARGEST_SIGNAL, LARGEST_SIGNAL))
+        return exact(finite_box(self.plant, kind))
 
     def size(self, kind: str) -> Exact:
         """Return the largest magnitudes in `box`."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.signals import about_centre, at_centre, noise_centre
 from obsynth.designs.lmi import FamilyProof, prove_family, symmetric_block
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (
@@ -22,7 +23,7 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
-from obsynth.designs.qpv.model import Derived, noise_centre
+from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
@@ -153,9 +154,10 @@ def _start(P: FloatArray, sets: ErrorSets) -> Claim:
 def _dynamics(design: QPVDesign) -> Iterator[Claim]:
     """Prove the inequalities of the error dynamics for all terms and all pairs of vertices."""
     data, terms = design.data, design.data.terms(design.polya)
+    about, quiet = about_centre(design.plant, design.w_centre), undisturbed(design)
     blocks: dict[str, tuple[str, Any]] = {
         "decay": (
-            f"V' + {design.alpha:g} V < 0 in E without disturbances, (22)",
+            f"V' + {design.alpha:g} V < 0 in E{quiet and ' where '}{quiet}, (22)",
             lambda P, closed: decay_block(P, closed, design.alpha),
         )
     }
@@ -167,10 +169,10 @@ def _dynamics(design: QPVDesign) -> Iterator[Claim]:
             lambda P, closed: noise_block(P, closed, noise.rate, type(P).of(weights)),
         )
     elif design.norm == "h2" and data.sizes[2]:
-        blocks["h2"] = ("V' < w'w in E, (41)", lambda _, closed: h2_block(closed))
+        blocks["h2"] = (f"V' < |{about}|^2 in E, (41)", lambda _, closed: h2_block(closed))
     if gamma is not None:
         blocks["l2_gain"] = (
-            f"V' + z'z < {gamma:.6g} w'w in E, (23)",
+            f"V' + z'z < {gamma:.6g} |{about}|^2 in E, (23)",
             lambda P, closed: hinf_block(closed, type(P).of(gamma)),
         )
     distinct = data.N[:1] if (data.N[0] == data.N).all() else data.N
@@ -184,6 +186,13 @@ def _dynamics(design: QPVDesign) -> Iterator[Claim]:
         kind = "vertices of the scheduling" if terms[0].total == 1 else "Polya terms"
         where = f"{pairs} pairs of vertices, {len(terms)} {kind}"
         yield _claim(name, f"{statement}: {where}", worst, RUMP)
+
+
+def undisturbed(design: QPVDesign) -> str:
+    """Say where V decays: disturbances at their centre, faults with a rate standing still."""
+    plant, moving = design.plant, () if design.noise is None else design.noise.faults
+    still = [f"d{plant.f[k - len(plant.x)].name}/dt = 0" for k in moving]
+    return ", ".join([*([at_centre(plant, design.w_centre)] if plant.w else []), *still])
 
 
 def _prove_term(
@@ -292,7 +301,7 @@ def _reset(design: QPVDesign) -> Claim:
     return Claim(
         "reset",
         f"x'P x <= {design.reset:.6g}^2 for every x in X - c",
-        result.all_proved,
+        bool(result.all_proved and design.reset >= 0.0),
         float(result.relative.min()),
         RUMP,
     )
@@ -319,8 +328,8 @@ def _noise_box(design: QPVDesign, noise: NoiseBound) -> Claim:
         room = -np.inf
     return Claim(
         "noise",
-        "the declared disturbances and rates satisfy v'W v <= 1",
-        bool(total <= 1 and room >= 0),
+        "the declared disturbances about their middle, and rates, satisfy v'W v <= 1, W > 0",
+        bool(total <= 1 and room >= 0 and min(noise.rate, *noise.weights.tolist()) > 0),
         float(1 - total),
         "exact sum of the weights over the box",
     )

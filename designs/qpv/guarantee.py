@@ -6,6 +6,8 @@ import numpy as np
 
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import about_centre
+from obsynth.designs.qpv.claims import undisturbed
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.designs.qpv.step import measured_schedule
 
@@ -45,9 +47,10 @@ def guarantee(design: QPVDesign) -> Guarantee:
 
 def _claims(design: QPVDesign) -> Iterator[str]:
     names = (*design.plant.names("x"), *design.plant.names("f"))
+    about, quiet = about_centre(design.plant, design.w_centre), undisturbed(design)
     yield (
-        f"without disturbances V = e'P e decays with exp(-{design.alpha:g} t) from every e(0) in "
-        "{e'P e <= 1}, and the error stays in this ellipsoid"
+        f"{quiet and f'where {quiet} '}V = e'P e decays with exp(-{design.alpha:g} t) from every "
+        "e(0) in {e'P e <= 1}, and the error stays in this ellipsoid"
     )
     if design.noise is not None:
         widths = np.sqrt(design.inverse_diagonal)
@@ -59,13 +62,13 @@ def _claims(design: QPVDesign) -> Iterator[str]:
         )
     elif design.norm == "h2" and design.plant.w:
         yield (
-            f"V' < w'w and trace(Cz P^-1 Cz') <= {design.trace:.6g}, as long as the error stays "
-            "in it"
+            f"V' < |{about}|^2 and trace(Cz P^-1 Cz') <= {design.trace:.6g}, as long as the "
+            "error stays in it"
         )
     if design.gamma is not None:
         yield (
-            f"the L2 gain from w to z = Cz e is at most {np.sqrt(design.gamma):.6g}, as long as "
-            "the error stays in it"
+            f"the L2 gain from {about} to z = Cz e is at most {np.sqrt(design.gamma):.6g}, as long "
+            "as the error stays in it"
         )
 
 

@@ -13,6 +13,7 @@ from obsynth.derive import QPV, qpv
 from obsynth.derive.errors import StructureError
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import PlantClass
+from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family
 from obsynth.designs.qpv.polytopes import Shape, box, cross, hull, one_of_each_pair
 from obsynth.designs.qpv.record import FormOfN, NoiseBound, QPVDesign, VertexData
@@ -245,12 +246,6 @@ def read_performance_output(value: Any, form: QPV) -> FloatArray:
             option="performance_output",
         )
     return Cz
-
-
-def noise_centre(model: Plant) -> FloatArray:
-    """Return the middle of the declared disturbances, 0 where they have no bound, shape (n_w,)."""
-    w = np.where(np.isfinite(model.box("w")).all(axis=1, keepdims=True), model.box("w"), 0.0)
-    return np.asarray(w.mean(axis=1))
 
 
 def read_noise(rate: float | None, model: Plant) -> NoiseBound | None:

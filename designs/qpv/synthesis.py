@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.lmi import (
     Affine,
     Knob,
@@ -41,7 +42,7 @@ from obsynth.designs.qpv.lmis import (
     noise_block,
     start_block,
 )
-from obsynth.designs.qpv.model import QPVModel, noise_centre
+from obsynth.designs.qpv.model import QPVModel
 from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import FASTEST, Norm, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
