@@ -1,48 +1,25 @@
 """What estimates: LMIs, certificates and observers."""
 
-from obsynth.designs.bounded_error.method import BoundedErrorUIO
-from obsynth.designs.core.certificate import Certificate, Claim, Guarantee
-from obsynth.designs.core.errors import (
-    CertificateError,
-    DetectorError,
-    InfeasibleDesign,
-    SolverTrouble,
-)
-from obsynth.designs.core.files import save
-from obsynth.designs.core.loading import load
-from obsynth.designs.core.observer import STATUS, Observer
-from obsynth.designs.detection.comparison import Detection, FaultEvent
-from obsynth.designs.detection.detector import FaultDetector
-from obsynth.designs.filter_bank.method import FilterBank
-from obsynth.designs.hinf.method import HinfUIO
-from obsynth.designs.hinf.worst_case import WorstCase, worst_case
-from obsynth.designs.interval.method import IntervalObserver
-from obsynth.designs.qpv.method import QPVObserver
-from obsynth.designs.qpv.region import Ellipsoid
-from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
-
-__all__ = [
-    "STATUS",
-    "BoundedErrorUIO",
-    "Certificate",
-    "CertificateError",
-    "Claim",
-    "Detection",
-    "DetectorError",
-    "Ellipsoid",
-    "FaultDetector",
-    "FaultEvent",
-    "FilterBank",
-    "Guarantee",
-    "HinfUIO",
-    "InfeasibleDesign",
-    "IntervalObserver",
-    "Observer",
-    "QPVObserver",
-    "SetAdaptiveObserver",
-    "SolverTrouble",
-    "WorstCase",
-    "load",
-    "save",
-    "worst_case",
-]
+from obsynth.designs.bounded_error.method import BoundedErrorUIO as BoundedErrorUIO
+from obsynth.designs.core.certificate import Certificate as Certificate
+from obsynth.designs.core.certificate import Claim as Claim
+from obsynth.designs.core.certificate import Guarantee as Guarantee
+from obsynth.designs.core.errors import CertificateError as CertificateError
+from obsynth.designs.core.errors import DetectorError as DetectorError
+from obsynth.designs.core.errors import InfeasibleDesign as InfeasibleDesign
+from obsynth.designs.core.errors import SolverTrouble as SolverTrouble
+from obsynth.designs.core.files import save as save
+from obsynth.designs.core.loading import load as load
+from obsynth.designs.core.observer import STATUS as STATUS
+from obsynth.designs.core.observer import Observer as Observer
+from obsynth.designs.detection.comparison import Detection as Detection
+from obsynth.designs.detection.comparison import FaultEvent as FaultEvent
+from obsynth.designs.detection.detector import FaultDetector as FaultDetector
+from obsynth.designs.filter_bank.method import FilterBank as FilterBank
+from obsynth.designs.hinf.method import HinfUIO as HinfUIO
+from obsynth.designs.hinf.worst_case import WorstCase as WorstCase
+from obsynth.designs.hinf.worst_case import worst_case as worst_case
+from obsynth.designs.interval.method import IntervalObserver as IntervalObserver
+from obsynth.designs.qpv.method import QPVObserver as QPVObserver
+from obsynth.designs.qpv.region import Ellipsoid as Ellipsoid
+from obsynth.designs.set_adaptive.method import SetAdaptiveObserver as SetAdaptiveObserver

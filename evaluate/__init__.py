@@ -1,32 +1,18 @@
 """What it is worth: simulation, coverage, plots, report."""
 
-from obsynth.evaluate.coverage import coverage_table
-from obsynth.evaluate.domain import Domain, StatusCount
-from obsynth.evaluate.errors import ReportError, SimulationError
-from obsynth.evaluate.plotting.alarms import plot_alarms
-from obsynth.evaluate.plotting.plots import plot_errors, plot_run, plot_signal
-from obsynth.evaluate.plotting.width_plot import plot_widths
-from obsynth.evaluate.report import report
-from obsynth.evaluate.run import Run
-from obsynth.evaluate.simulate import simulate
-from obsynth.evaluate.table import Table
-from obsynth.evaluate.trace import Trace, Violation
-
-__all__ = [
-    "Domain",
-    "ReportError",
-    "Run",
-    "SimulationError",
-    "StatusCount",
-    "Table",
-    "Trace",
-    "Violation",
-    "coverage_table",
-    "plot_alarms",
-    "plot_errors",
-    "plot_run",
-    "plot_signal",
-    "plot_widths",
-    "report",
-    "simulate",
-]
+from obsynth.evaluate.coverage import coverage_table as coverage_table
+from obsynth.evaluate.domain import Domain as Domain
+from obsynth.evaluate.domain import StatusCount as StatusCount
+from obsynth.evaluate.errors import ReportError as ReportError
+from obsynth.evaluate.errors import SimulationError as SimulationError
+from obsynth.evaluate.plotting.alarms import plot_alarms as plot_alarms
+from obsynth.evaluate.plotting.alarms import plot_widths as plot_widths
+from obsynth.evaluate.plotting.plots import plot_errors as plot_errors
+from obsynth.evaluate.plotting.plots import plot_run as plot_run
+from obsynth.evaluate.plotting.plots import plot_signal as plot_signal
+from obsynth.evaluate.report import report as report
+from obsynth.evaluate.run import Run as Run
+from obsynth.evaluate.simulate import simulate as simulate
+from obsynth.evaluate.table import Table as Table
+from obsynth.evaluate.trace import Trace as Trace
+from obsynth.evaluate.trace import Violation as Violation

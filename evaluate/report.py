@@ -3,22 +3,20 @@
 import html
 import math
 import os
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from obsynth.designs.core.files import write_whole
 from obsynth.designs.core.observer import Observer
 from obsynth.evaluate.coverage import coverage_table
-from obsynth.evaluate.equations import constants_html, equations_html, signals_table
 from obsynth.evaluate.errors import ReportError
-from obsynth.evaluate.plotting.layout import panels
+from obsynth.evaluate.plotting.alarms import plot_widths
+from obsynth.evaluate.plotting.layout import panels, style
 from obsynth.evaluate.plotting.plots import plot_errors, plot_run
-from obsynth.evaluate.plotting.style import style
-from obsynth.evaluate.plotting.width_plot import plot_widths
 from obsynth.evaluate.run import Run, percent
-from obsynth.evaluate.svg import figure_svg
+from obsynth.evaluate.svg import constants_html, equations_html, figure_svg, signals_table
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
 
@@ -124,7 +122,7 @@ def report(
         highlights=_highlights(observers, labelled) if highlights is None else dict(highlights),
         sections=[section for section in sections if section.parts],
     )
-    _replace(target, page)
+    write_whole(target, page)
     return target
 
 
@@ -342,16 +340,3 @@ def _render(**content: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template("report.html").render(**content)
-
-
-def _replace(target: Path, page: str) -> None:
-    """Write beside the target and rename, so that no reader meets half a page."""
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(page)
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

@@ -1,35 +1,22 @@
 """What the user says: plants, signals, equations, scenarios."""
 
-from obsynth.symbolic import plants, scenarios
-from obsynth.symbolic.convert import nearest_double, to_sx
-from obsynth.symbolic.errors import ObsynthError, ObsynthWarning, PlantError
-from obsynth.symbolic.functions import phi1, tanhc
-from obsynth.symbolic.plant import Plant
-from obsynth.symbolic.scenario import Scenario
-from obsynth.symbolic.signals import Role, Signal
-from obsynth.symbolic.sxmodel import ParityError, SxModel, check_parity
-from obsynth.symbolic.tape import from_tape
-from obsynth.symbolic.text import TextError, read_text, write_text
-
-__all__ = [
-    "ObsynthError",
-    "ObsynthWarning",
-    "ParityError",
-    "Plant",
-    "PlantError",
-    "Role",
-    "Scenario",
-    "Signal",
-    "SxModel",
-    "TextError",
-    "check_parity",
-    "from_tape",
-    "nearest_double",
-    "phi1",
-    "plants",
-    "read_text",
-    "scenarios",
-    "tanhc",
-    "to_sx",
-    "write_text",
-]
+from obsynth.symbolic import plants as plants
+from obsynth.symbolic import scenarios as scenarios
+from obsynth.symbolic.convert import nearest_double as nearest_double
+from obsynth.symbolic.convert import to_sx as to_sx
+from obsynth.symbolic.errors import ObsynthError as ObsynthError
+from obsynth.symbolic.errors import ObsynthWarning as ObsynthWarning
+from obsynth.symbolic.errors import PlantError as PlantError
+from obsynth.symbolic.functions import phi1 as phi1
+from obsynth.symbolic.functions import tanhc as tanhc
+from obsynth.symbolic.plant import Plant as Plant
+from obsynth.symbolic.scenario import Scenario as Scenario
+from obsynth.symbolic.signals import Role as Role
+from obsynth.symbolic.signals import Signal as Signal
+from obsynth.symbolic.sxmodel import ParityError as ParityError
+from obsynth.symbolic.sxmodel import SxModel as SxModel
+from obsynth.symbolic.sxmodel import check_parity as check_parity
+from obsynth.symbolic.tape import from_tape as from_tape
+from obsynth.symbolic.text import TextError as TextError
+from obsynth.symbolic.text import read_text as read_text
+from obsynth.symbolic.text import write_text as write_text

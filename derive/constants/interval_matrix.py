@@ -88,16 +88,3 @@ def eigenvalue_over_interval(centre: FloatArray, radius: FloatArray) -> Interval
         if float(lower[k]) > attained:
             attained, matrix = float(lower[k]), corners[k]
     return IntervalExtreme(best, attained, matrix, True)
-
-
-def norm_over_interval(centre: FloatArray, radius: FloatArray) -> IntervalExtreme:
-    """Bound the norm of all matrices of an interval.
-
-    J. Rohn, Bounds on eigenvalues of interval matrices, ZAMM 78(S3), 1998; M. Hladik, D. Daney,
-    E. Tsigaridas, Bounds on real eigenvalues and singular values of interval matrices, SIAM Journal
-    on Matrix Analysis and Applications 31(4), 2010.
-    """
-    found = eigenvalue_over_interval(augment(centre), augment(radius))
-    return IntervalExtreme(
-        found.upper, found.attained, found.matrix[: len(centre), len(centre) :], found.exact
-    )

@@ -25,31 +25,11 @@ def _above(value: FloatArray) -> FloatArray:
     return np.where(value > 0.0, np.nextafter(value * _ROUND, np.inf), 0.0)
 
 
-def drop_scalars(
-    family: AffineFamily, drop: Sequence[int] | None = None, most_vertices: int | None = None
-) -> AffineFamily:
+def drop_scalars(family: AffineFamily, dropped: Sequence[int]) -> AffineFamily:
     """Fix scalars at the middle of their ranges and keep their variation as an interval.
 
-    drop: positions; most_vertices: in place of them, drop what moves the matrix least. The family
-    found has a larger ``radius`` and holds every matrix of the given one.
+    The family found has a larger ``radius`` and holds every matrix of the given one.
     """
-    count = len(family.ranges)
-    if (drop is None) == (most_vertices is None):
-        raise DerivationError("give drop= (positions of scalars) or most_vertices=, one of them")
-    size = np.abs(family.directions).max(axis=(1, 2), initial=0.0) * family.half_ranges
-    if most_vertices is not None:
-        if most_vertices < 1:
-            raise DerivationError(f"most_vertices={most_vertices} leaves nothing")
-        varying = [int(k) for k in np.argsort(size, kind="stable") if family.half_ranges[k] > 0.0]
-        keep = int(np.log2(most_vertices))
-        drop = varying[: max(len(varying) - keep, 0)]
-    dropped = sorted(set(drop or ()))
-    if any(not 0 <= k < count for k in dropped):
-        raise DerivationError(f"the family has the scalars 0 to {count - 1}, not {dropped}")
-    return _without(family, dropped)
-
-
-def _without(family: AffineFamily, dropped: Sequence[int]) -> AffineFamily:
     kept = [k for k in range(len(family.ranges)) if k not in dropped]
     constant, radius = family.constant.copy(), family.radius.copy()
     for k in dropped:
@@ -159,4 +139,4 @@ def principal_family(
         labels=tuple(f"c{k + 1}({', '.join(entries.names)})" for k in range(count)),
         exact=False,
     )
-    return _without(whole, range(keep, count))
+    return drop_scalars(whole, range(keep, count))

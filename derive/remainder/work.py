@@ -8,8 +8,7 @@ import sympy as sp
 
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.program import enclose, evaluate
-from obsynth.derive.remainder.flow import flow_box, flow_tubes
-from obsynth.derive.remainder.pieces import PIECES, hull_over_pieces, plan_cuts
+from obsynth.derive.remainder.flow import PIECES, flow_box, flow_tubes, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.system import System, step_derivatives, time_derivatives
 from obsynth.derive.remainder.trees import difference_term
 from obsynth.derive.rigour import Interval, enclose_number, up

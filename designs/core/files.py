@@ -32,6 +32,11 @@ def save(observer: Observer, path: str | os.PathLike[str]) -> None:
     target = Path(path)
     claims = [_claim(claim) for claim in observer.certificate]
     text = json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
+    write_whole(target, text)
+
+
+def write_whole(target: Path, text: str) -> None:
+    """Write beside the target and rename, so that no reader meets half a file."""
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:

@@ -29,76 +29,38 @@ as it is stored:
 True
 """
 
-from obsynth.designs.lmi.conic import Solution
-from obsynth.designs.lmi.expression import (
-    Affine,
-    ExpressionError,
-    constant,
-    diagonal,
-    full,
-    scalar,
-    symmetric,
-    trace,
-)
-from obsynth.designs.lmi.margin import Margin, MarginSolution, largest_margin, solve_with_margin
-from obsynth.designs.lmi.problem import Problem, block, cap_gain, he, symmetric_block
-from obsynth.designs.lmi.proof import FamilyProof, prove_family
-from obsynth.designs.lmi.reductions import (
-    distinct_members,
-    extreme_points,
-    split_common,
-)
-from obsynth.designs.lmi.relaxation import (
-    RowMultipliers,
-    UncertainRow,
-    corner_block,
-    relax_sum,
-    row_multipliers,
-)
-from obsynth.designs.lmi.search import (
-    Knob,
-    bisect_feasible,
-    search_line,
-    search_log_convex,
-    smallest_changes,
-)
-from obsynth.designs.lmi.solve import solve_lazily, solve_reliably, solve_with_retries
-
-__all__ = [
-    "Affine",
-    "ExpressionError",
-    "FamilyProof",
-    "Knob",
-    "Margin",
-    "MarginSolution",
-    "Problem",
-    "RowMultipliers",
-    "Solution",
-    "UncertainRow",
-    "bisect_feasible",
-    "block",
-    "cap_gain",
-    "constant",
-    "corner_block",
-    "diagonal",
-    "distinct_members",
-    "extreme_points",
-    "full",
-    "he",
-    "largest_margin",
-    "prove_family",
-    "relax_sum",
-    "row_multipliers",
-    "scalar",
-    "search_line",
-    "search_log_convex",
-    "smallest_changes",
-    "solve_lazily",
-    "solve_reliably",
-    "solve_with_margin",
-    "solve_with_retries",
-    "split_common",
-    "symmetric",
-    "symmetric_block",
-    "trace",
-]
+from obsynth.designs.lmi.conic import Solution as Solution
+from obsynth.designs.lmi.expression import Affine as Affine
+from obsynth.designs.lmi.expression import ExpressionError as ExpressionError
+from obsynth.designs.lmi.expression import constant as constant
+from obsynth.designs.lmi.expression import diagonal as diagonal
+from obsynth.designs.lmi.expression import full as full
+from obsynth.designs.lmi.expression import scalar as scalar
+from obsynth.designs.lmi.expression import symmetric as symmetric
+from obsynth.designs.lmi.expression import trace as trace
+from obsynth.designs.lmi.margin import Margin as Margin
+from obsynth.designs.lmi.margin import MarginSolution as MarginSolution
+from obsynth.designs.lmi.margin import largest_margin as largest_margin
+from obsynth.designs.lmi.margin import solve_with_margin as solve_with_margin
+from obsynth.designs.lmi.problem import Problem as Problem
+from obsynth.designs.lmi.problem import block as block
+from obsynth.designs.lmi.problem import cap_gain as cap_gain
+from obsynth.designs.lmi.problem import he as he
+from obsynth.designs.lmi.problem import symmetric_block as symmetric_block
+from obsynth.designs.lmi.proof import FamilyProof as FamilyProof
+from obsynth.designs.lmi.proof import prove_family as prove_family
+from obsynth.designs.lmi.reductions import extreme_points as extreme_points
+from obsynth.designs.lmi.reductions import split_common as split_common
+from obsynth.designs.lmi.relaxation import RowMultipliers as RowMultipliers
+from obsynth.designs.lmi.relaxation import UncertainRow as UncertainRow
+from obsynth.designs.lmi.relaxation import corner_block as corner_block
+from obsynth.designs.lmi.relaxation import relax_sum as relax_sum
+from obsynth.designs.lmi.relaxation import row_multipliers as row_multipliers
+from obsynth.designs.lmi.search import Knob as Knob
+from obsynth.designs.lmi.search import bisect_feasible as bisect_feasible
+from obsynth.designs.lmi.search import search_line as search_line
+from obsynth.designs.lmi.search import search_log_convex as search_log_convex
+from obsynth.designs.lmi.search import smallest_changes as smallest_changes
+from obsynth.designs.lmi.solve import solve_lazily as solve_lazily
+from obsynth.designs.lmi.solve import solve_reliably as solve_reliably
+from obsynth.designs.lmi.solve import solve_with_retries as solve_with_retries

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
 from obsynth.designs.lmi.conic import Solution
-from obsynth.designs.lmi.dual import Binding, MarginBound, binding_blocks, bound_margin
 from obsynth.designs.lmi.expression import Inequality, scalar
 from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.proof import Binding, MarginBound, binding_blocks, bound_margin
 from obsynth.designs.lmi.solve import LazySolution, solve_lazily, solve_with_retries
 
 Values = Mapping[str, NDArray[np.float64]]

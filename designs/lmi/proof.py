@@ -1,11 +1,23 @@
-"""Proof of a matrix inequality at every vertex, for the numbers as they are stored."""
+"""Why yes and why no: proofs at every vertex; blocks that bind, and a bound on the margin.
+
+Why no design exists: the blocks that bind, and a bound on the margin in exact arithmetic.
+
+Maximise t subject to F_i(x) - t I >= 0. For any matrices Z_i >= 0 the sum of <Z_i, F_i(x) - t I>
+is not negative at a feasible point, and it is affine in x and t: c0 + r'x - t sum tr Z_i >= 0.
+So t <= (c0 + r'x) / sum tr Z_i whatever the solver did; its dual solution only makes the bound
+sharp, with r of the size of its accuracy (C. Jansson, D. Chaykin, C. Keil, SIAM J. Numer.
+Anal. 46, 2007, use the same argument with intervals).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.derive.rigour import (
     Enclosure,
@@ -14,7 +26,9 @@ from obsynth.derive.rigour import (
     prove_positive_definite,
 )
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.lmi.expression import IntArray
+from obsynth.designs.lmi.conic import Solution
+from obsynth.designs.lmi.expression import Affine, IntArray
+from obsynth.designs.lmi.problem import Problem
 
 # Entries of the blocks formed at a time, so that the work arrays stay in the cache.
 _CHUNK_ENTRIES = 2**16
@@ -111,3 +125,150 @@ def prove_family(
         worst=tuple(worst),
         exact=tuple(confirmed),
     )
+
+
+# Blocks with less than this share of the dual weight get the multiplier zero.
+_NEGLIGIBLE = 1e-10
+
+
+@dataclass(frozen=True)
+class Binding:
+    """A block (at a vertex) that stands in the way, and its share of the dual weight."""
+
+    block: str
+    vertex: int | None
+    share: float
+
+    def __str__(self) -> str:
+        where = "" if self.vertex is None else f" at vertex {self.vertex}"
+        return f"{self.block}{where}: {100 * self.share:.0f} %"
+
+
+@dataclass(frozen=True, eq=False)
+class MarginBound:
+    """An upper bound of the margin, checked in exact rational arithmetic.
+
+    multipliers: Z_i by block, exactly positive definite or zero (psd), or not negative; doubles
+    offset, slope: every design whose free entries are below s in size has a margin of at most
+        ``offset + slope s``
+    """
+
+    multipliers: Mapping[str, NDArray[np.float64]]
+    offset: Fraction
+    slope: Fraction
+
+    def at(self, size: float) -> float:
+        """Bound of the margin for free entries below ``size``."""
+        return float(self.offset + self.slope * Fraction(size))
+
+    @property
+    def size_excluded(self) -> float:
+        """No design with free entries below this size satisfies the constraints at all."""
+        if self.offset >= 0:
+            return 0.0
+        return float(-self.offset / self.slope) if self.slope else float("inf")
+
+
+def binding_blocks(
+    problem: Problem,
+    solution: Solution,
+    chosen: Mapping[str, NDArray[np.intp]] | None = None,
+    count: int = 5,
+) -> tuple[Binding, ...]:
+    """List the strict blocks with the largest dual weight."""
+    found = []
+    for name, item in problem.blocks.items():
+        if not item.asks_margin or name not in solution.duals:
+            continue
+        dual = solution.duals[name]
+        weights = np.atleast_1d(np.trace(dual, axis1=-2, axis2=-1))
+        numbers = (chosen or {}).get(name, np.arange(len(weights)))
+        family = item.expression.members is not None
+        found += [
+            Binding(name, int(k) if family else None, float(w))
+            for k, w in zip(numbers, weights, strict=True)
+        ]
+    total = sum(binding.share for binding in found) or 1.0
+    shares = [Binding(b.block, b.vertex, b.share / total) for b in found]
+    ranked = sorted(shares, key=lambda b: -b.share)
+    return tuple(binding for binding in ranked[:count] if binding.share > 0.01)
+
+
+def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBound | None:
+    """Bound the margin that any values of the variables can reach.
+
+    The coefficients are those of the problem as assembled from doubles.
+    """
+    multipliers = {}
+    traces = [np.trace(z, axis1=-2, axis2=-1).sum() for z in _matrix_duals(problem, solution)]
+    weight = _NEGLIGIBLE * float(sum(traces))
+    for name, item in problem.blocks.items():
+        dual = solution.duals.get(name)
+        if dual is None or not np.isfinite(dual).all() or item.cone == "exponential":
+            return None
+        if item.cone == "psd":
+            stack = dual.reshape(-1, *dual.shape[-2:])
+            multipliers[name] = np.stack([_definite(z, weight) for z in stack]).reshape(dual.shape)
+        else:
+            multipliers[name] = dual if item.cone == "zero" else np.maximum(dual, 0.0)
+    constant, residuals = Fraction(0), dict.fromkeys(_unknowns(problem), Fraction(0))
+    for name, weights in multipliers.items():
+        offset, slopes = _pairing(problem.blocks[name].expression, weights)
+        constant += offset
+        for key, slope in slopes.items():
+            residuals[key] += slope
+    total = -residuals.pop((margin, 0))
+    if total <= 0:
+        return None
+    return MarginBound(
+        multipliers=multipliers,
+        offset=constant / total,
+        slope=sum((abs(r) for r in residuals.values()), Fraction(0)) / total,
+    )
+
+
+def _matrix_duals(problem: Problem, solution: Solution) -> list[NDArray[np.float64]]:
+    names = [name for name, item in problem.blocks.items() if item.cone == "psd"]
+    return [solution.duals[name] for name in names if name in solution.duals]
+
+
+def _unknowns(problem: Problem) -> list[tuple[str, int]]:
+    return [(name, k) for name, v in problem.variables.items() for k in range(v.size)]
+
+
+def _definite(dual: NDArray[np.float64], negligible: float) -> NDArray[np.float64]:
+    """Shift a dual matrix until it is exactly positive definite, or drop it."""
+    if not float(np.trace(dual)) > negligible:
+        return np.zeros_like(dual)
+    middle = 0.5 * (dual + dual.T)
+    eye = np.eye(len(middle))
+    size = float(np.abs(middle).max()) or 1e-300
+    least = float(np.linalg.eigvalsh(middle)[0])
+    shift = max(-least, 0.0) + 1e-15 * size
+    while not is_positive_definite(middle + shift * eye):
+        shift = 2.0 * shift
+    return middle + shift * eye
+
+
+def _pairing(
+    expression: Affine, weights: NDArray[np.float64]
+) -> tuple[Fraction, dict[tuple[str, int], Fraction]]:
+    """Exact inner product of the weights with an expression: constant and coefficients."""
+    column = ExactMatrix.of(np.swapaxes(weights, -1, -2).reshape(1, -1))
+    flat = column.entries.entries()
+    fixed = np.swapaxes(expression.constant, -1, -2).ravel()
+    total: Any = 0
+    for k in np.flatnonzero(fixed):
+        total += flat[k] * ExactMatrix.of(fixed[k]).entries[0, 0]
+    slopes: dict[tuple[str, int], Any] = {}
+    for variable, operator in expression.terms.items():
+        entries = operator.tocoo()
+        exact = ExactMatrix.of(entries.data.reshape(1, -1)).entries.entries()
+        for value, row, unknown in zip(exact, entries.row, entries.col, strict=True):
+            key = (variable.name, int(unknown))
+            slopes[key] = slopes.get(key, 0) + flat[row] * value
+    return _fraction(total), {key: _fraction(slope) for key, slope in slopes.items()}
+
+
+def _fraction(number: Any) -> Fraction:
+    return Fraction(int(number.p), int(number.q)) if hasattr(number, "p") else Fraction(number)

@@ -68,18 +68,6 @@ def extreme_points(points: ArrayLike) -> Extremes:
     return Extremes(np.array(alive, dtype=np.intp), weights)
 
 
-def distinct_members(family: Affine) -> IntArray:
-    """Find the first member of every set of equal members of a family."""
-    count = family.members or 1
-    rows = [family.constant.reshape(count, -1)]
-    rows += [
-        np.asarray(sparse.csr_array(op).reshape((count, -1)).todense())
-        for op in family.terms.values()
-    ]
-    _, first = np.unique(np.hstack(rows), axis=0, return_index=True)
-    return np.sort(first)
-
-
 @dataclass(frozen=True, eq=False)
 class SplitFamily:
     """A family written as one common inequality and a small one per vertex.

@@ -15,6 +15,7 @@ from obsynth.designs.core.signals import about_centre, at_centre, noise_centre
 from obsynth.designs.lmi import FamilyProof, prove_family, symmetric_block
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (
+    PolyaTerm,
     close,
     decay_block,
     h2_block,
@@ -24,7 +25,6 @@ from obsynth.designs.qpv.lmis import (
     start_block,
 )
 from obsynth.designs.qpv.model import Derived
-from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.text import write_text

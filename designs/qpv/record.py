@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from obsynth.derive.forms.qpv.form import QPVVertices
-from obsynth.derive.forms.qpv.layout import QPVLayout
+from obsynth.derive.forms.qpv.form import QPVLayout, QPVVertices
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_kept
-from obsynth.designs.qpv.polya import PolyaTerm, collapsed_terms, polya_terms
+from obsynth.designs.qpv.lmis import PolyaTerm, collapsed_terms, polya_terms
 from obsynth.designs.qpv.polytopes import Shape
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.symbolic import Plant

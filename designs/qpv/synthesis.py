@@ -34,6 +34,7 @@ from obsynth.designs.qpv.claims import inverse_bounds, prove_inequalities, regio
 from obsynth.designs.qpv.error_matrix import ErrorSets
 from obsynth.designs.qpv.lmis import (
     Closed,
+    PolyaTerm,
     close,
     decay_block,
     h2_block,
@@ -43,7 +44,6 @@ from obsynth.designs.qpv.lmis import (
     start_block,
 )
 from obsynth.designs.qpv.model import QPVModel
-from obsynth.designs.qpv.polya import PolyaTerm
 from obsynth.designs.qpv.record import FASTEST, Norm, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -11,15 +11,18 @@ import numpy as np
 
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import shade
-from obsynth.evaluate.plotting.layout import grid, name_lines, new_figure, thin
-from obsynth.evaluate.plotting.style import (
+from obsynth.evaluate.plotting.layout import (
     BARS,
     ESTIMATE,
     INK,
     INTERVAL,
     INTERVAL_FILL,
     SOFT,
+    grid,
+    name_lines,
+    new_figure,
     style,
+    thin,
 )
 from obsynth.evaluate.trace import Trace
 from obsynth.symbolic.arrays import FloatArray

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from obsynth.evaluate import Table
 
-__all__ = ["app", "main"]
-
 STUDIES = ("quadruple-tank",)
 
 app = typer.Typer(

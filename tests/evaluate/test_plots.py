@@ -98,7 +98,7 @@ def test_the_settings_of_the_user_stay_untouched(toy_run):
 def test_what_pyplot_sets_on_its_first_import_is_kept():
     import matplotlib as mpl
 
-    from obsynth.evaluate.plotting.style import style
+    from obsynth.evaluate.plotting.layout import style
 
     interactive = mpl.rcParams["interactive"]
     with style():

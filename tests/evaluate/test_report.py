@@ -8,7 +8,7 @@ import pytest
 
 from obsynth.evaluate import ReportError, Table, report
 from obsynth.evaluate import report as report_function
-from obsynth.evaluate.equations import equations_html
+from obsynth.evaluate.svg import equations_html
 from obsynth.symbolic import Plant
 
 VOID = {"meta", "link", "br", "hr", "img", "input", "path", "use", "rect"}

@@ -7,8 +7,7 @@ import sympy as sp
 from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.qpv.augment import Augmented, augment_plant
-from obsynth.derive.forms.qpv.form import QPV
-from obsynth.derive.forms.qpv.layout import QPVLayout
+from obsynth.derive.forms.qpv.form import QPV, QPVLayout
 from obsynth.derive.forms.qpv.polynomial import read_coefficients
 from obsynth.derive.forms.scheduling import make_schedule
 from obsynth.derive.forms.varying import prove_rows

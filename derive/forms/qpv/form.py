@@ -1,18 +1,98 @@
-"""The quadratic parameter-varying form of a plant."""
+"""The quadratic parameter-varying form of a plant, its text, and where its matrices stand."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from html import escape
+from typing import ClassVar, Literal
 
 import casadi as ca
 import sympy as sp
 
 from obsynth.derive.forms.qpv.augment import Augmented
-from obsynth.derive.forms.qpv.display import qpv_html, qpv_latex, qpv_text
-from obsynth.derive.forms.qpv.layout import QPVLayout
-from obsynth.derive.forms.varying import VaryingForm, Vertices, casadi_elements
+from obsynth.derive.forms.varying import Layout, VaryingForm, Vertices, casadi_elements, short
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
+
+
+@dataclass(frozen=True)
+class QPVLayout(Layout):
+    """Columns [c A N M B D B_f G] over the rows of the dynamics, then of the outputs.
+
+    A row of N holds the matrix N_i row by row, a row of M the rows of M_1, M_2, ... one after the
+    other.
+
+    states, outputs, inputs, unknown, faults, disturbances: numbers of signals, states after
+        augmentation
+    """
+
+    BLOCKS: ClassVar[dict[str, tuple[str, str]]] = {
+        "c": ("dynamics", "1"),
+        "A": ("dynamics", "x"),
+        "N": ("dynamics", "xx"),
+        "M": ("dynamics", "ux"),
+        "B": ("dynamics", "u"),
+        "D": ("dynamics", "d"),
+        "B_f": ("dynamics", "f"),
+        "G": ("dynamics", "w"),
+        "C": ("outputs", "x"),
+        "feedthrough": ("outputs", "u"),
+        "D_f": ("outputs", "f"),
+        "H": ("outputs", "w"),
+        "output_offset": ("outputs", "1"),
+    }
+
+    states: int
+    outputs: int
+    inputs: int
+    unknown: int
+    faults: int
+    disturbances: int
+
+    @classmethod
+    def of(cls, plant: Augmented) -> QPVLayout:
+        """Return the layout of an augmented plant."""
+        model = plant.model
+        return cls(
+            len(plant.states),
+            len(plant.outputs),
+            len(model.u),
+            len(model.d),
+            len(plant.faults),
+            len(model.w),
+        )
+
+    @property
+    def heights(self) -> tuple[int, int]:
+        """Number of states and of outputs."""
+        return self.states, self.outputs
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Columns by the signals they multiply."""
+        n, k = self.states, self.inputs
+        counts = (1, n, n * n, n * k, k, self.unknown, self.faults, self.disturbances)
+        return dict(zip(("1", "x", "xx", "ux", "u", "d", "f", "w"), counts, strict=True))
+
+    def unfold(self, block: str, values: FloatArray) -> FloatArray:
+        """Give N and M their shapes, (n, n, n) and (n_u, n, n)."""
+        n, before = self.states, values.shape[:-1]
+        if block == "N":
+            return values.reshape(*before, n, n)
+        return values.reshape(*before, -1, n).swapaxes(-3, -2) if block == "M" else values
+
+    def start(self, block: str) -> int:
+        """First column of a block."""
+        return int(self.place(block)[1].start)
+
+    def quadratic(self, a: int, b: int) -> int:
+        """Column of the entry (a, b) of N_i."""
+        return self.start("N") + a * self.states + b
+
+    def bilinear(self, j: int, a: int) -> int:
+        """Column of u_j x_a."""
+        return self.start("M") + j * self.states + a
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +302,65 @@ class QPV(VaryingForm):
 
     def _repr_html_(self) -> str:
         return qpv_html(self)
+
+
+def _quadratic(form: QPV, i: int) -> sp.Expr:
+    """Quadratic part of a row as an expression."""
+    x = sp.Matrix([s.symbol for s in form.plant.states])
+    return (x.T * form.N[i] * x)[0]
+
+
+def _bilinear(form: QPV, i: int) -> sp.Expr:
+    x = sp.Matrix([s.symbol for s in form.plant.states])
+    u = [s.symbol for s in form.model.u]
+    parts = (s * (part[i, :] * x)[0] for s, part in zip(u, form.M, strict=True))
+    return sum(parts, sp.Integer(0))
+
+
+def qpv_text(form: QPV) -> str:
+    """Return a quadratic form as plain text."""
+    time = "x+" if form.model.Ts is not None else "x'"
+    lines = [
+        f"{form.model.name}: {time} = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + ...; "
+        f"x = ({', '.join(form.names)}), N {form.form_of_N}"
+    ]
+    for i, name in enumerate(form.names):
+        parts = [p for p in (_quadratic(form, i), _bilinear(form, i)) if p != 0]
+        if parts:
+            listed = " + ".join(sp.sstr(short(p)) for p in parts).replace("+ -", "- ")
+            lines.append(f"  {name}: {listed}")
+    lines += [f"  scheduling {v}" for v in form.scheduling]
+    lines.append(str(form.proof))
+    return "\n".join(lines)
+
+
+def qpv_latex(form: QPV) -> str:
+    r"""Return the matrices of a quadratic form as LaTeX."""
+    blocks: list[tuple[str, sp.Matrix]] = [("c", form.c), ("A", form.A)]
+    blocks += [(f"N_{{{i + 1}}}", part) for i, part in enumerate(form.N)]
+    blocks += [(f"M_{{{j + 1}}}", part) for j, part in enumerate(form.M)]
+    blocks += [("B", form.B), ("D", form.D), ("B_f", form.B_f), ("G", form.G)]
+    blocks += [("C", form.C), ("D_f", form.D_f), ("H", form.H)]
+    rows = [
+        f"{name} &= {sp.latex(sp.Matrix(part).applyfunc(short))}"
+        for name, part in blocks
+        if any(entry != 0 for entry in part)
+    ]
+    body = " \\\\\n".join(rows)
+    return f"\\begin{{aligned}}\n{body}\n\\end{{aligned}}"
+
+
+def qpv_html(form: QPV) -> str:
+    """Return a quadratic form for a notebook."""
+    states = "".join(
+        f"<tr><td>{escape(s.name)}</td><td>{escape(str(s.role))}</td>"
+        f"<td>{s.lower:.6g}</td><td>{s.upper:.6g}</td></tr>"
+        for s in form.plant.states
+    )
+    scheduling = "".join(f"<li>{escape(str(v))}</li>" for v in form.scheduling)
+    head, *_ = qpv_text(form).split("\n")
+    return (
+        f"<p><b>{escape(head)}</b></p><div>$${escape(qpv_latex(form), quote=False)}$$</div>"
+        f"<table><tr><th>state</th><th>role</th><th>min</th><th>max</th></tr>{states}</table>"
+        f"<ul>{scheduling}<li>{escape(str(form.proof))}</li></ul>"
+    )

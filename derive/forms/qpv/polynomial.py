@@ -8,7 +8,7 @@ import sympy as sp
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.qpv.augment import Augmented
-from obsynth.derive.forms.qpv.layout import QPVLayout
+from obsynth.derive.forms.qpv.form import QPVLayout
 
 _KINDS = ("states", "inputs", "unknown inputs", "faults", "disturbances")
 

@@ -24,12 +24,68 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.bounded_error.peak.channels import Channels, split_channels
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Rank-one uncertainties ``delta_j b_j c_j'``, ``|delta_j| <= r_j``, of the Jacobian.
+
+    columns: the b_j
+    rows: the c_j'
+    radii: the r_j, rounded up
+    source: which direction of the affine family a channel comes from. A direction that is not of
+        rank one makes one channel for each of its columns
+    """
+
+    columns: FloatArray
+    rows: FloatArray
+    radii: FloatArray
+    source: IntArray
+
+    def __len__(self) -> int:
+        return int(self.radii.size)
+
+
+def split_channels(directions: FloatArray, ranges: FloatArray, middle: FloatArray) -> Channels:
+    """Turn the directions of an affine family into rank-one channels, without rounding."""
+    n = directions.shape[-1]
+    columns, rows, radii, source = [], [], [], []
+    half = np.maximum(ranges[:, 1] - middle, middle - ranges[:, 0])
+    for k, direction in enumerate(directions):
+        if ranges[k, 0] == ranges[k, 1] or not np.any(direction):
+            continue
+        for column, row in _rank_one_parts(direction):
+            columns.append(column)
+            rows.append(row)
+            radii.append(np.nextafter(half[k], np.inf))
+            source.append(k)
+    return Channels(
+        columns=np.array(columns).reshape(-1, n).T,
+        rows=np.array(rows).reshape(-1, n),
+        radii=np.array(radii),
+        source=np.array(source, dtype=np.int64),
+    )
+
+
+def _rank_one_parts(direction: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Split a matrix into b c' without rounding: one part where that is exact, else columns."""
+    i, j = np.unravel_index(np.argmax(np.abs(direction)), direction.shape)
+    column, row, pivot = direction[:, j], direction[i], direction[i, j]
+    given = ExactMatrix.of(direction).to_fractions()
+    for left, right in ((column, row / pivot), (column / pivot, row)):
+        product = ExactMatrix.of(left[:, None]) @ ExactMatrix.of(right[None, :])
+        if product.to_fractions() == given:
+            return [(left, right)]
+    eye = np.eye(direction.shape[1])
+    return [(direction[:, k], eye[k]) for k in np.flatnonzero(np.any(direction, axis=0))]
+
 
 DATA = (
     *("A", "B_f", "C", "D", "W1", "W2", "E", "K", "F"),
@@ -125,49 +181,18 @@ def peak_system(
 ) -> PeakSystem:
     """Form the error system of an observer in exact arithmetic and round it with its error.
 
-    Buciakowski et al., "A bounded-error approach to simultaneous state and
-    actuator fault estimation for a class of nonlinear systems", eqs. (10)-(16).
+    Buciakowski et al., eqs. (10)-(16). The numbers are those of a record that was read; see
+    `UioDesign` for the shapes.
     """
-    A = _array("A", A, 2)
-    n = A.shape[0]
-    C = _array("C", C, 2)
-    m = C.shape[0]
-    B_f, D, W1 = (_columns(k, v, n) for k, v in (("B_f", B_f), ("D", D), ("W1", W1)))
-    n_f, q, n_w = B_f.shape[1], D.shape[1], W1.shape[1]
-    W2, K, F = _columns("W2", W2, m), _columns("K", K, n), _array("F", F, 2).reshape(-1, m)
-    constant = _array("constant", constant, 2)
-    directions = _array("directions", directions, 3).reshape(-1, n, n)
-    ranges = _array("ranges", ranges, 2).reshape(-1, 2)
-    radius = np.zeros((n, n)) if radius is None else _array("radius", radius, 2)
-    E = _decoupling(C, D) if E is None else _columns("E", E, n)
-    expected = {
-        "A": (A, (n, n)),
-        "C": (C, (m, n)),
-        "W2": (W2, (m, n_w)),
-        "K": (K, (n, m)),
-        "F": (F, (n_f, m)),
-        "E": (E, (n, m)),
-        "constant": (constant, (n, n)),
-        "ranges": (ranges, (directions.shape[0], 2)),
-        "radius": (radius, (n, n)),
-    }
-    for name, (value, shape) in expected.items():
-        if value.shape != shape:
-            raise ObsynthError(
-                f"{name} has shape {value.shape}; with {n} states, {m} outputs, {n_f} faults, {q} "
-                f"unknown inputs and {n_w} disturbances it has to be {shape}",
-                argument=name,
-                shape=value.shape,
-                expected=shape,
-            )
-    if np.any(ranges[:, 0] > ranges[:, 1]):
-        worst = int(np.argmax(ranges[:, 0] - ranges[:, 1]))
-        raise ObsynthError(
-            f"ranges[{worst}] = {ranges[worst].tolist()} is empty: lower bound first", index=worst
-        )
-    if np.any(radius < 0):
-        raise ObsynthError("radius has a negative entry; it is a bound of an absolute value")
-
+    A, C, constant = (np.asarray(v, dtype=float) for v in (A, C, constant))
+    n, m = len(A), len(C)
+    B_f, D, W1, K = (np.asarray(v, dtype=float).reshape(n, -1) for v in (B_f, D, W1, K))
+    W2, F = np.asarray(W2, dtype=float).reshape(m, -1), np.asarray(F, dtype=float).reshape(-1, m)
+    n_f, n_w = B_f.shape[1], W1.shape[1]
+    directions = np.asarray(directions, dtype=float).reshape(-1, n, n)
+    ranges = np.asarray(ranges, dtype=float).reshape(-1, 2)
+    radius = np.zeros((n, n)) if radius is None else np.asarray(radius, dtype=float)
+    E = _decoupling(C, D) if E is None else np.asarray(E, dtype=float)
     middle = ranges.mean(axis=1)
     channels = split_channels(directions, ranges, middle)
     of = ExactMatrix.of
@@ -216,36 +241,11 @@ def projected_gains(
     decoupling would have removed.
     """
     of = ExactMatrix.of
-    eE, eC = of(_array("E", E, 2)), of(_array("C", C, 2))
+    eE, eC = of(np.asarray(E)), of(np.asarray(C))
     T = of(np.eye(eE.shape[0])) + eE @ eC
     Pi = of(np.eye(eC.shape[0])) + eC @ eE
-    F = _array("F", F, 2).reshape(-1, eC.shape[0])
-    return Enclosure.of(T @ of(_array("K", K, 2)) @ Pi).mid, Enclosure.of(of(F) @ Pi).mid
-
-
-def _array(name: str, value: ArrayLike, dimensions: int) -> FloatArray:
-    array = np.asarray(value, dtype=float)
-    if array.ndim != dimensions and array.size:
-        raise ObsynthError(
-            f"{name} has {array.ndim} dimensions, it has to have {dimensions}", argument=name
-        )
-    if not np.all(np.isfinite(array)):
-        where = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise ObsynthError(f"{name}{where} = {array[tuple(where)]} is not finite", argument=name)
-    return array
-
-
-def _columns(name: str, value: ArrayLike, rows: int) -> FloatArray:
-    array = _array(name, value, 2)
-    if array.size == 0:
-        return np.zeros((rows, 0))
-    if array.shape[0] != rows:
-        raise ObsynthError(
-            f"{name} has shape {array.shape}; it has to have {rows} rows",
-            argument=name,
-            shape=array.shape,
-        )
-    return array
+    F = np.asarray(F, dtype=float).reshape(-1, eC.shape[0])
+    return Enclosure.of(T @ of(np.asarray(K, dtype=float)) @ Pi).mid, Enclosure.of(of(F) @ Pi).mid
 
 
 def _decoupling(C: FloatArray, D: FloatArray) -> FloatArray:

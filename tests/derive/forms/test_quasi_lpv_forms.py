@@ -6,7 +6,7 @@ import sympy as sp
 
 from obsynth.derive import DerivationError, StructureError, split
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
-from obsynth.derive.forms.quasi_lpv.display import UNMEASURED_NOTE
+from obsynth.derive.forms.quasi_lpv.form import UNMEASURED_NOTE
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational

@@ -336,18 +336,6 @@ def test_dropped_scalars_stay_as_intervals(drop):
     assert found.radius[0, 0] == pytest.approx(2.0 if 0 in drop else 0.0, abs=1e-12)
 
 
-def test_the_least_important_scalars_go_first():
-    assert drop_scalars(family_of_three(), most_vertices=4).labels == ("a", "c")
-    assert drop_scalars(family_of_three(), most_vertices=3).labels == ("a",)
-    assert drop_scalars(family_of_three(), most_vertices=8).labels == ("a", "b", "c")
-
-
-@pytest.mark.parametrize("options", [{}, {"drop": [0], "most_vertices": 2}, {"drop": [3]}])
-def test_bad_wishes_are_refused(options):
-    with pytest.raises(DerivationError):
-        drop_scalars(family_of_three(), **options)
-
-
 @pytest.mark.parametrize("name", ["curve", "space", "CSTR", "van der Pol"])
 def test_principal_coordinates_hold_the_jacobians(name):
     plant = PLANTS[name]()
@@ -363,9 +351,9 @@ def test_principal_coordinates_hold_the_jacobians(name):
 
 def test_forgetting_the_remainder_is_caught(monkeypatch):
     matrices = jacobians(curve(), 100)
-    real = fewer._without
+    real = fewer.drop_scalars
     monkeypatch.setattr(
-        fewer, "_without", lambda family, k: replace(real(family, k), radius=family.radius)
+        fewer, "drop_scalars", lambda family, k: replace(real(family, k), radius=family.radius)
     )
     assert escapes(principal_family(curve(), keep=1), matrices)
 

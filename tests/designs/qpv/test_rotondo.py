@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.qpv.polya import polya_terms
+from obsynth.designs.qpv.lmis import polya_terms
 from obsynth.designs.qpv.record import VertexData
 from obsynth.designs.qpv.synthesis import rough_objective
 
