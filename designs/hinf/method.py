@@ -25,6 +25,8 @@ from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.sector import Multipliers, SectorForm
 from obsynth.designs.hinf.step import build_step, first_memory, memory_sizes
 from obsynth.designs.hinf.synthesis import (
+    CAP,
+    NOT_FOUND,
     Found,
     Structure,
     find_filter,
@@ -249,7 +251,7 @@ class HinfUIO(Method):
             if design is not None:
                 return design
         if least is None and gains is None:
-            raise self._refusal(model) from last
+            raise self._refusal(model, last) from last
         if least is None and last is not None:
             raise last
         raise SolverTrouble(
@@ -282,23 +284,27 @@ class HinfUIO(Method):
         mixed = (complete(found.mixed(more, float(s))) for s in np.geomspace(1e-8, 1.0, 17))
         return next((design for design in mixed if holds(design)), None)
 
-    def _refusal(self, model: HinfModel) -> InfeasibleDesign:
-        """Say which level is feasible where the given one is not."""
+    def _refusal(
+        self, model: HinfModel, last: Exception | None
+    ) -> InfeasibleDesign | SolverTrouble:
+        """Say which level was found where the given one is not; infeasible only what was shown."""
         data = model.design.data
         least = find_level(data, self._structure, self.decay)
-        details = [f"the least level of this form is {least:.6g}"]
-        if self.mu is not None and self.mu > least:
-            return InfeasibleDesign(
-                f"mu = {self.mu:.6g} leaves too little room for a proof",
+        details = [f"the least level of this form found with P <= {CAP:g} I is {least:.6g}"]
+        facts = {"mu": self.mu, "least_mu": least}
+        if not isinstance(last, InfeasibleDesign):
+            return SolverTrouble(
+                f"mu = {self.mu:.9g} leaves too little room for a proof, or for the solver",
                 [*details, "ask for a level .01 % above it"],
-                mu=self.mu,
-                least_mu=least,
+                **facts,
             )
         if self.method != "general" and model.design.family.vertex_count == len(data.vertices):
             other = find_level(replace(data, sector=None), "general", self.decay)
             details.append(f'method="general" reaches {other:.6g}')
         return InfeasibleDesign(
-            f"mu = {self.mu:.6g} is infeasible", details, mu=self.mu, least_mu=least
+            f"mu = {self.mu:.9g} is {NOT_FOUND}",
+            [*last.details, *details],
+            **facts,
         )
 
 

@@ -40,9 +40,15 @@ from obsynth.symbolic.arrays import FloatArray
 Structure = Literal["standard", "general", "printed"]
 Values = Mapping[str, FloatArray]
 
-# Several infima need one direction of P to go to infinity; within these limits, in units in
-# which the rest of P is about one, the least mu is off by less than 1e-6 of itself.
+# Several infima need one direction of P to go to infinity. The least mu is the least one within
+# these limits, in units in which the rest of P is about one; a plant is known where it lies 6e-5
+# (1.4e-4 with multipliers) above the infimum. A given mu is looked for under the wider ones too.
 CAP = 1e4
+WIDER = (1e6, 1e8)
+NOT_FOUND = (
+    f"infeasible with P <= {CAP:g} I, and not found up to {WIDER[-1]:g} I, in units where "
+    "its least entries are about one"
+)
 FLOOR = 1e-3
 # Room between the solver's answer and the boundary: large against the solver's tolerance.
 MARGIN = 1e-7
@@ -176,8 +182,8 @@ def find_level(
             except SolverTrouble:
                 continue
         least = min(levels) if levels else _bisected(scaled, structure, decay, given)
-    except InfeasibleDesign as refusal:
-        raise _explained(scaled, structure, decay, given) from refusal
+    except (InfeasibleDesign, SolverTrouble) as refusal:
+        raise _explained(refusal, scaled, structure, decay, given) from refusal
     return max(least, LEAST_LEVEL) * units.f
 
 
@@ -217,10 +223,19 @@ def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] 
         except InfeasibleDesign:
             if not troubles:
                 raise
-    margin = largest_margin(state(CAP), explain=False)
-    if margin.feasible:
-        raise troubles[0]
-    raise InfeasibleDesign(f"{state(CAP).name}: no room", margin.lines(), margin=margin.value)
+    raise troubles[0]
+
+
+def _roomiest(state: Callable[[float], Problem], what: str) -> Margin:
+    """Return the largest margin under the first cap of P that leaves any, or refuse."""
+    first = largest_margin(state(CAP))
+    if first.feasible:
+        return first
+    for cap in WIDER:
+        margin = largest_margin(state(cap), explain=False)
+        if margin.feasible:
+            return margin
+    raise InfeasibleDesign(f"{what}: {NOT_FOUND}", first.lines(), margin=first.value)
 
 
 def find_filter(
@@ -230,15 +245,14 @@ def find_filter(
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
 
-    def state(cap: float) -> Problem:
-        return state_problem(scaled, structure, mu / units.f, decay, cap=cap)
+    def state(cap: float, margin: float = MARGIN) -> Problem:
+        return state_problem(scaled, structure, mu / units.f, decay, margin=margin, cap=cap)
 
     try:
         solution = _solve_with_caps(state)
-    except SolverTrouble:
+    except (SolverTrouble, InfeasibleDesign):
         # A filter with room is better than none with the smallest trace.
-        roomy = state_problem(scaled, structure, mu / units.f, decay, margin=0.0)
-        solution = largest_margin(roomy, explain=False).found.solution
+        solution = _roomiest(lambda cap: state(cap, 0.0), f"mu = {mu:.9g}").found.solution
     P = solution["P"]
     m, n_f = len(data.C), data.n_f
     K: FloatArray = np.asarray(np.linalg.solve(P, solution["N"]), dtype=float)
@@ -282,12 +296,11 @@ def find_storage(
     units = find_units(data, structure == "printed")
     scaled = units.scaled(data)
     given = units.filter_from_plant(gains)
-    problem = state_problem(scaled, structure, mu / units.f, decay, given, margin=0.0)
-    margin = largest_margin(problem, explain=False)
-    if not margin.feasible:
-        raise InfeasibleDesign(
-            f"mu = {mu:.6g} cannot be shown for these gains", margin.lines(), margin=margin.value
-        )
+
+    def state(cap: float) -> Problem:
+        return state_problem(scaled, structure, mu / units.f, decay, given, margin=0.0, cap=cap)
+
+    margin = _roomiest(state, f"mu = {mu:.9g} cannot be shown for these gains")
     return _found(units, data, margin.found.solution.values, decay)
 
 
@@ -299,25 +312,38 @@ def unstable_vertex(data: FilterData, gains: Filter) -> tuple[int, float] | None
 
 
 def _explained(
-    scaled: FilterData, structure: Structure, decay: float | None, gains: Filter | None
-) -> InfeasibleDesign:
+    refusal: InfeasibleDesign | SolverTrouble,
+    scaled: FilterData,
+    structure: Structure,
+    decay: float | None,
+    gains: Filter | None,
+) -> InfeasibleDesign | SolverTrouble:
     """Say what binds where no mu is feasible: the decay of V alone, a homogeneous problem."""
     what = "these gains" if gains is not None else "any gain"
     how = "decays" if decay is None else f"shrinks to {decay:g} of itself in a step"
     headline = f"no quadratic V {how} along every error with {what}, so there is no level mu"
-    details = []
-    if structure != "printed":
+    if structure == "printed":
+        problem = state_problem(scaled, structure, None, None, gains, margin=0.0)
+        headline = f"(45) with (37) leaves no room with {what}, so it shows no level mu"
+        caps = {}
+    else:
         problem = Problem("decay of V")
         P = symmetric("P", len(scaled.A))
         loop = open_loop(scaled, structure, P, gains)
         keep = 1.0 if decay is None else decay
         block = decay_block(loop, keep, scaled.sector, multipliers("tau", scaled))
         problem.add_lmi("decay", block, ">>")
-        try:
-            margin = largest_margin(problem, caps={"size": P << np.eye(len(scaled.A))})
-            details += margin.lines()
-        except SolverTrouble as trouble:
-            details.append(str(trouble).splitlines()[0])
+        caps = {"size": P << np.eye(len(scaled.A))}
+    try:
+        margin = largest_margin(problem, caps=caps)
+    except SolverTrouble as trouble:
+        margin, refusal = None, trouble
+    if margin is None or margin.feasible:
+        return SolverTrouble(
+            "no level mu was found, nor was it shown that there is none",
+            [refusal.headline, *refusal.details],
+        )
+    details = margin.lines()
     if decay is not None:
         details.append("a larger decay= asks for less")
     if scaled.sector is not None:

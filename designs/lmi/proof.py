@@ -199,6 +199,38 @@ def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBou
 
     The coefficients are those of the problem as assembled from doubles.
     """
+    found = _multipliers(problem, solution)
+    if found is None:
+        return None
+    constant, residuals = _pairings(problem, found)
+    total = -residuals.pop((margin, 0))
+    if total <= 0:
+        return None
+    return MarginBound(
+        multipliers=found,
+        offset=constant / total,
+        slope=sum((abs(r) for r in residuals.values()), Fraction(0)) / total,
+    )
+
+
+def excluded_size(problem: Problem, solution: Solution) -> float:
+    """Size of free entries below which none satisfies the constraints, 0 where that is not shown.
+
+    With t left out, c0 + r'x >= 0 at a feasible point, for the ray that a solver gives for
+    infeasibility as for any other matrices Z_i >= 0.
+    """
+    found = _multipliers(problem, solution)
+    if found is None:
+        return 0.0
+    constant, residuals = _pairings(problem, found)
+    slope = sum((abs(r) for r in residuals.values()), Fraction(0))
+    if constant >= 0:
+        return 0.0
+    return float(-constant / slope) if slope else float("inf")
+
+
+def _multipliers(problem: Problem, solution: Solution) -> dict[str, NDArray[np.float64]] | None:
+    """Return the dual solution moved into its cones, exactly."""
     multipliers = {}
     traces = [np.trace(z, axis1=-2, axis2=-1).sum() for z in _matrix_duals(problem, solution)]
     weight = _NEGLIGIBLE * float(sum(traces))
@@ -211,20 +243,20 @@ def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBou
             multipliers[name] = np.stack([_definite(z, weight) for z in stack]).reshape(dual.shape)
         else:
             multipliers[name] = dual if item.cone == "zero" else np.maximum(dual, 0.0)
+    return multipliers
+
+
+def _pairings(
+    problem: Problem, multipliers: Mapping[str, NDArray[np.float64]]
+) -> tuple[Fraction, dict[tuple[str, int], Fraction]]:
+    """Return c0 and r of the weighted sum of all constraints, exactly."""
     constant, residuals = Fraction(0), dict.fromkeys(_unknowns(problem), Fraction(0))
     for name, weights in multipliers.items():
         offset, slopes = _pairing(problem.blocks[name].expression, weights)
         constant += offset
         for key, slope in slopes.items():
             residuals[key] += slope
-    total = -residuals.pop((margin, 0))
-    if total <= 0:
-        return None
-    return MarginBound(
-        multipliers=multipliers,
-        offset=constant / total,
-        slope=sum((abs(r) for r in residuals.values()), Fraction(0)) / total,
-    )
+    return constant, residuals
 
 
 def _matrix_duals(problem: Problem, solution: Solution) -> list[NDArray[np.float64]]:

@@ -129,10 +129,8 @@ def search_line(
     for value in track(grid, description=name, disable=not terminal, transient=True):
         record.add(value, _attempt(design, value))
     if record.best is None:
-        raise InfeasibleDesign(
-            f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design",
-            record.troubles,
-            tried=tuple(record.tried),
+        raise record.refusal(
+            f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design"
         )
     if refine:
         values = sorted(grid)
@@ -167,11 +165,7 @@ def search_log_convex(
 
     _refine(lambda value: record.add(value, _attempt(design, value)), low, high, most, enough)
     if record.best is None:
-        raise InfeasibleDesign(
-            f"no value between {low:.4g} and {high:.4g} gives a design",
-            record.troubles,
-            tried=tuple(record.tried),
-        )
+        raise record.refusal(f"no value between {low:.4g} and {high:.4g} gives a design")
     _require_log_convex(record, rtol)
     value, least, result = record.best
     return Search(value, result, least, tuple(record.tried), min(left_over(), least))
@@ -230,17 +224,24 @@ class _Record(Generic[Result]):
         self.tried: list[tuple[float, float]] = []
         self.troubles: list[str] = []
         self.best: tuple[float, float, Result] | None = None
+        self.all_infeasible = True
 
     def add(self, value: float, outcome: Result | Exception) -> float:
         if isinstance(outcome, Exception):
             self.troubles.append(f"{value:.4g}: {str(outcome).splitlines()[0]}")
             measured = np.inf
+            self.all_infeasible &= isinstance(outcome, InfeasibleDesign)
         else:
             measured = float(self.objective(outcome))
             if self.best is None or measured < self.best[1]:
                 self.best = (value, measured, outcome)
         self.tried.append((value, measured))
         return measured
+
+    def refusal(self, headline: str) -> InfeasibleDesign | SolverTrouble:
+        """Say that nothing was found; infeasible only where every value was."""
+        kind = InfeasibleDesign if self.all_infeasible else SolverTrouble
+        return kind(headline, self.troubles, tried=tuple(self.tried))
 
 
 def _refine(

@@ -17,8 +17,12 @@ from obsynth.designs.lmi.conic import Solution, conic_form, rescaled, solve_form
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy
 from obsynth.designs.lmi.expression import IntArray
 from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.proof import excluded_size
 
 SECOND_SOLVERS = ("SDPA", "SCS")
+
+# A problem counts as infeasible where all values below this size are excluded.
+SHOWN = 1e3
 
 # A family with no more vertices is stated whole.
 _FEW = 24
@@ -46,7 +50,10 @@ def solve_with_retries(
     second_solvers: Sequence[str] = SECOND_SOLVERS,
     good_enough: Callable[[Solution], bool] | None = None,
 ) -> Solution:
-    """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers."""
+    """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers.
+
+    A report of infeasibility counts where its dual solution shows it in exact arithmetic.
+    """
     attempts: list[str] = []
     status = ""
     for outcome in _attempts(problem, second_solvers):
@@ -55,10 +62,12 @@ def solve_with_retries(
             continue
         status = outcome.status
         attempts.append(f"{outcome.solver}: {status}")
-        if outcome.infeasible:
+        excluded = excluded_size(problem, outcome) if outcome.infeasible else 0.0
+        if excluded > SHOWN:
             raise InfeasibleDesign(
-                f"{problem.name}: the solver reports that no values satisfy all constraints",
-                attempts,
+                f"{problem.name}: no values below {excluded:.3g} in size satisfy all constraints",
+                ["shown in exact arithmetic from the solver's dual solution", *attempts],
+                excluded=excluded,
                 duals=outcome.duals,
                 attempts=tuple(attempts),
                 **outcome.facts(),

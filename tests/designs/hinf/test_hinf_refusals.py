@@ -218,3 +218,37 @@ def test_options(options):
 def test_a_majorant_may_be_a_diagonal_matrix():
     diagonal = (0.0, 0.517, 0.1089)
     assert ob.HinfUIO(majorant=np.diag(diagonal)) == ob.HinfUIO(majorant=diagonal)
+
+
+def seen_in_x2():
+    """The example with y = x2 alone: P wants to be infinite in one direction."""
+    stored = ob.plants.hinf_example().to_dict()
+    stored["outputs"] = [{"name": "y1", "unit": "", "expression": "x2"}]
+    return ob.Plant.from_dict(stored)
+
+
+@pytest.mark.parametrize("options", [{"method": "polytopic"}, {"multipliers": "per_entry"}])
+def test_a_level_that_only_a_large_storage_function_shows(options):
+    """1.001925 lies below the least level under the first cap of P, and is proved under a wider.
+
+    Mutant: no wider caps.
+    """
+    plant = seen_in_x2()
+    assert ob.HinfUIO(**options).design(plant).performance["least_mu"] > 1.00195
+    observer = ob.HinfUIO(mu=1.001925, **options).design(plant)
+    assert observer.certificate.check().valid
+    worst = ob.worst_case(observer, steps=500)
+    assert worst.gain <= 1.001925
+
+
+def test_a_refused_level_says_what_was_shown():
+    """Mutants: a refusal without the caps of P; infeasible where only the proof failed."""
+    error = refused(
+        ob.InfeasibleDesign,
+        "mu = 1.0018 is infeasible with P <= ",
+        seen_in_x2(),
+        ob.HinfUIO(method="polytopic", mu=1.0018),
+    )
+    assert "not found up to 1e+08 I" in str(error)
+    assert "exact arithmetic: " in str(error)
+    assert "found with P <= 10000 I is 1.00195" in str(error)

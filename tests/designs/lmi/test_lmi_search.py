@@ -63,9 +63,12 @@ def test_the_line_search_refines_around_the_best_value():
 
 
 def test_a_search_without_a_design_says_what_happened():
-    with pytest.raises(InfeasibleDesign, match="gamma") as caught:
+    """It is infeasible only where every value is. Mutant: infeasible whatever the troubles."""
+    with pytest.raises(SolverTrouble, match="gamma") as caught:
         search_line(design, cost, [0.01, 0.9], name="gamma")
     assert "stuck" in str(caught.value) and "no room" in str(caught.value)
+    with pytest.raises(InfeasibleDesign, match="gamma"):
+        search_line(design, cost, [0.85, 0.9], name="gamma")
 
 
 def lyapunov_trace(gamma):

@@ -118,6 +118,27 @@ def test_infeasibility_is_final():
     assert solve_with_cvxpy(infeasible().statement, "CLARABEL").infeasible
 
 
+def test_a_report_of_infeasibility_is_checked(monkeypatch):
+    """A solver that reports a feasible problem infeasible, with whatever duals, is not believed.
+
+    Mutant: the report alone refuses.
+    """
+    from dataclasses import replace
+
+    from obsynth.designs.lmi import solve as module
+
+    run = module.solve_form
+
+    def liar(form, settings):
+        return replace(run(form, settings), solved=False, infeasible=True)
+
+    monkeypatch.setattr(module, "solve_form", liar)
+    with pytest.raises(SolverTrouble):
+        solve_with_retries(problem(), ())
+    with pytest.raises(InfeasibleDesign, match="exact arithmetic"):
+        solve_with_retries(infeasible(), ())
+
+
 @pytest.mark.parametrize("name", ["SDPA", "SCS"])
 def test_second_solvers_agree_with_clarabel(name):
     pytest.importorskip({"SDPA": "sdpap", "SCS": "scs"}[name])
