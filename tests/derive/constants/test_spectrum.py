@@ -1,6 +1,7 @@
 """Largest eigenvalues: verified for matrices, exact over interval matrices, enclosed over boxes."""
 
 import dataclasses
+from fractions import Fraction
 from itertools import product
 
 import casadi as ca
@@ -252,3 +253,13 @@ def test_what_is_known_already_is_only_improved():
     best = largest_over_box(field, ("a", "b", "c"), rtol=1e-6)
     given = largest_over_box(field, ("a", "b", "c"), best.upper, "a friend", rtol=1e-6)
     assert (given.upper, given.method, given.boxes) == (best.upper, "a friend", 0)
+
+
+def test_the_rounding_of_a_corner_is_counted():
+    """1e16 + 1 rounds to 1e16; mutant: the corner's own rounding left out."""
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        centre = rng.uniform(1e16, 9e16, (1, 1))
+        radius = rng.uniform(0.1, 8.0, (1, 1))
+        found = eigenvalue_over_interval(centre, radius)
+        assert Fraction(found.upper) >= Fraction(centre[0, 0]) + Fraction(radius[0, 0])

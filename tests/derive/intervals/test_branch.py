@@ -306,3 +306,9 @@ def test_unbounded_variables_that_do_not_matter():
 def test_bad_questions_are_refused(call):
     with pytest.raises(DerivationError):
         call()
+
+
+def test_a_slope_however_small_is_not_taken_for_none():
+    """Mutant: slopes below 1e-12 count as falling, so the wrong end is looked at."""
+    _, low, high = one(1e-13 * X[0])
+    assert low <= -1e-13 and high >= 2e-13

@@ -303,3 +303,15 @@ def test_a_range_of_a_quantity_that_is_too_narrow_is_caught(exactly, monkeypatch
     monkeypatch.setattr(ranges, "make_problem", narrow)
     rising = ca.atan(X[0] + X[1] + ca.sin(4 * X[0] * X[1])) * ca.exp(X[2] * X[3] - X[2])
     assert wrong_bounds(exactly, rising, ROOM)
+
+
+def test_the_spread_of_a_product_is_reached_at_a_corner():
+    """c x y about the middle rises by c r_x r_y; mutant: the cross term halved."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        c, radius = rng.uniform(0.1, 10.0), rng.uniform(0.1, 3.0, (2, 1))
+        bend = np.array([[[0.0, c], [c, 0.0]]])
+        hessians = curvature.Hessians(bend, bend, np.array([True]))
+        flat = np.zeros((2, 1))
+        spread = curvature.taylor_spread(-radius, radius, flat, (flat, flat), hessians)
+        assert c * radius.prod() <= spread[0] <= c * radius.prod() * (1.0 + 1e-12)

@@ -310,6 +310,26 @@ def family_of_three():
     return AffineFamily(constant, directions, ranges, np.zeros((2, 2)), ("a", "b", "c"), True)
 
 
+def test_the_rounding_of_what_is_dropped_is_counted():
+    """Large constants, narrow ranges: the interval alone is smaller than one rounding."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        middle = rng.uniform(1e5, 1e6)
+        family = AffineFamily(
+            rng.uniform(-1e6, 1e6, (2, 2)),
+            rng.uniform(-1.0, 1.0, (1, 2, 2)),
+            np.array([[middle, np.nextafter(middle, np.inf)]]),
+            np.zeros((2, 2)),
+            ("s",),
+            True,
+        )
+        found = drop_scalars(family, [0])
+        for end in map(Fraction, family.ranges[0]):
+            for i, j in np.ndindex(2, 2):
+                exact = Fraction(family.constant[i, j]) + end * Fraction(family.directions[0, i, j])
+                assert abs(exact - Fraction(found.constant[i, j])) <= Fraction(found.radius[i, j])
+
+
 @pytest.mark.parametrize("drop", [[0], [1], [0, 2], [0, 1, 2]])
 def test_dropped_scalars_stay_as_intervals(drop):
     family = family_of_three()

@@ -96,3 +96,18 @@ def test_unknown_operands_stay_unknown():
         assert np.isnan(ends(rule(nothing, interval(1, 2)))).all()
     for rule in (arithmetic.absolute, arithmetic.sqrt, arithmetic.negate):
         assert np.isnan(ends(rule(nothing))).all()
+
+
+def test_a_pole_between_two_neighbouring_doubles_is_never_missed():
+    """Mutant: without its margin the search for poles rounds past some of them."""
+    from mpmath import mp
+
+    from obsynth.derive.intervals.functions import tangent
+
+    with mp.workdps(60):
+        for k in (0, 1, -19, 22, 30, -164, 654321, *range(-250, 250, 7)):
+            pole = (k + mp.mpf(1) / 2) * mp.pi
+            near = float(pole)
+            low = near if mp.mpf(near) < pole else float(np.nextafter(near, -np.inf))
+            assert mp.mpf(low) < pole < mp.mpf(float(np.nextafter(low, np.inf)))
+            assert np.isnan(ends(tangent(interval(low, np.nextafter(low, np.inf))))).all(), k

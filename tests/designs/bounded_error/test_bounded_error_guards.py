@@ -1,6 +1,7 @@
 """What guards the guarantee of the bounded-error observer, each with a mutant that it catches."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from obsynth.designs.bounded_error.lmis import (
 )
 from obsynth.designs.bounded_error.model import NoiseBox, read
 from obsynth.designs.bounded_error.record import UioDesign
-from obsynth.designs.bounded_error.step import build_step
+from obsynth.designs.bounded_error.step import build_step, ellipsoid_runtime
 from obsynth.designs.bounded_error.synthesis import analyse_gain, synthesise
 
 
@@ -315,3 +316,15 @@ def test_the_best_trace_of_a_given_gain_is_log_convex_in_gamma(base, tank_split,
     assert np.diff(values, 2).min() > 1e-4
     best = analyse_gain(system, gain, noise, weights)
     assert best.inverse_diagonal.sum() <= min(traces) * (1 + 1e-3)
+
+
+def test_the_recursion_of_the_ellipsoid_counts_the_rounding_of_a_step(design):
+    """xi+ moved by tau raises V+ to (sqrt(V+) + rho)^2 at most; mutant: no rho in the offset."""
+    rough = replace(design, rounding=np.full_like(design.rounding, 1e-3))
+    bound, ellipsoid = ellipsoid_runtime(rough), design.bound
+    P, gamma = ellipsoid.P[0], float(ellipsoid.gamma[0])
+    tau = rough.rounding
+    rho = np.sqrt(max(s @ P @ s for s in tau * np.array(list(product((-1, 1), repeat=len(tau))))))
+    for V in np.linspace(0.0, 3.0, 61):
+        moved = (np.sqrt((1 - gamma) * V + gamma) + rho) ** 2
+        assert np.all(bound.decay * V + bound.offset >= moved)

@@ -1,5 +1,6 @@
 """Disturbances whose range is not centred on zero: what is promised, and around which value."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 
 import obsynth as ob
 from obsynth.designs.core.signals import about_centre, at_centre, finite_box, noise_centre
+
+QPV = ob.QPVObserver.CONTRACT
 
 
 def vessel(low, high):
@@ -137,3 +140,18 @@ def test_words_and_numbers_of_declared_ranges():
     assert about_centre(plant, centre) == "(a - 2.5, b, c + 2.5)"
     assert at_centre(plant, centre) == "a = 2.5, b = 0, c = -2.5"
     assert finite_box(plant, "x").tolist() == [[-3e6, 5e7], [-1e6, 1e6], [0, 1]]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.5, 5.0), (0.0, 5.5)])
+def test_a_wider_disturbance_on_either_side_is_no_longer_covered(offset, low, high):
+    """Mutants: one half of the box is not compared, or a fault with a rate is left out."""
+    design = offset.certificate.design
+    wider = vessel(low, high)
+    claim = {c.name: c for c in QPV.claims(replace(design, plant=wider))}["noise"]
+    assert not claim.holds
+    moving = ob.Plant.from_dict(design.plant.to_dict())
+    record = json.loads(json.dumps(moving.to_dict()))
+    (fault,) = [s for s in record["signals"] if s["name"] == "f"]
+    fault["rate"] = 0.1
+    fast = replace(design, plant=ob.Plant.from_dict(record))
+    assert not {c.name: c for c in QPV.claims(fast)}["noise"].holds

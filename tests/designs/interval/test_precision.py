@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.derive.rigour import exact
+from obsynth.derive.rigour import UNIT, exact
+from obsynth.designs.core.certificate import Certificate
+from obsynth.designs.interval.claims import claims
 from obsynth.designs.interval.record import IntervalDesign
+from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.step import build_step, first_box
 
 BOX = np.tile([0.5, 1.5], (3, 1))
@@ -121,3 +124,18 @@ def test_the_first_box_is_rounded_outwards(precision, two_faults):
         assert exact(low)[i] <= least
         assert largest <= exact(high)[i]
         assert exact(low + np.spacing(np.abs(low).astype(kind)).astype(float) * 2)[i] > least
+
+
+@pytest.mark.parametrize(("units", "holds"), [(6, True), (3, True), (2, False), (0, False)])
+def test_a_widening_below_what_rounding_costs_is_no_proof(single, monkeypatch, units, holds):
+    """(t + 3) u per absolute term are needed; mutants: fewer units in the claim, or in the step."""
+    real = Rows.slack
+
+    def narrower(self, precision):
+        every = np.stack([*self.upper, *self.lower])
+        taken = np.abs(every).max(axis=0) * exact(np.array(6 - units, dtype=float)).item()
+        return real(self, precision) - np.array(taken * exact(UNIT[precision]).item(), dtype=float)
+
+    monkeypatch.setattr(Rows, "slack", narrower)
+    claim = Certificate((*claims(single.certificate.design),), None, None)["rounding"]
+    assert claim.holds is holds

@@ -1,5 +1,7 @@
 """The bank: delays, no false alarm, inclusion of weighted means, refusals by name."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from obsynth.derive.jacobian.slope_signs import Monotone, with_ranges
 from obsynth.designs.filter_bank import step as step_module
 from obsynth.designs.filter_bank.indicators import bank_intervals
 from obsynth.designs.filter_bank.method import FilterBank
+from obsynth.designs.filter_bank.model import read as filter_bank_model
 from obsynth.symbolic.noise import bounded_noise
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
@@ -446,3 +449,17 @@ def test_an_unmeasured_state_that_grows_by_itself_is_refused():
     plant.outputs([a])
     with pytest.raises(ob.StructureError, match="derivative of b rises with b itself"):
         FilterBank().design(plant)
+
+
+def test_the_range_of_the_noise_is_rounded_outwards():
+    """Thirds of decimal bounds are no doubles; mutant: no rounding of the sums."""
+    plant = ob.Plant("sum of thirds")
+    (x,) = plant.states("x", range=(1, 2))
+    (f,) = plant.process_faults("f", range=(-1, 1))
+    w = plant.disturbances("w1:6", bound=[0.1, 0.3, 0.7, 0.9, 1.1])
+    plant.dynamics([-x + f])
+    plant.outputs([x + sum(w) / 3])
+    low, high = filter_bank_model(plant).noise[0]
+    exact = sum(Fraction(s.upper) for s in plant.w) / 3
+    assert Fraction(low) <= -exact and exact <= Fraction(high)
+    assert float(high) <= float(exact) * (1.0 + 1e-12)
