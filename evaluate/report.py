@@ -202,7 +202,7 @@ def _design_section(observers: Mapping[str, "Observer"]) -> _Section:
             _bullets("Guaranteed", observer.guarantee.claims),
             _bullets("Provided that", observer.guarantee.assumptions),
         )
-        figures = [[key, value] for key, value in observer.performance.items()]
+        figures = [[key, value] for key, value in observer.figures.items()]
         if figures:
             section.add(Table("Performance", ["key", "value"], figures)._repr_html_())
         section.add(_gains(observer))

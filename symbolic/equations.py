@@ -14,7 +14,14 @@ from sympy.logic.boolalg import ITE, And, BooleanFalse, BooleanFunction, Boolean
 from obsynth.symbolic.convert import nearest_double
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_CLASS, BY_NAME
-from obsynth.symbolic.signals import Role, Signal, expand_names, per_symbol
+from obsynth.symbolic.signals import (
+    LONGEST_UNIT,
+    Role,
+    Signal,
+    expand_names,
+    one_line,
+    per_symbol,
+)
 from obsynth.symbolic.text import TextError, read_text, undeclared
 
 _PLAIN = (
@@ -81,8 +88,7 @@ def read_outputs(
             f"output {taken}: the name is taken by a signal; give other names=", symbol=taken
         )
     units = per_symbol(unit, named, "unit")
-    if not all(isinstance(item, str) for item in units):
-        raise PlantError(f"outputs: unit= is text such as 'cm', not {unit!r}", unit=unit)
+    units = [one_line(item, "outputs: unit=", LONGEST_UNIT, unit=item) for item in units]
     return dict(zip(named, found, strict=True)), tuple(units)
 
 

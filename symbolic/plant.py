@@ -17,7 +17,7 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.from_casadi import plant_from_casadi
 from obsynth.symbolic.serialize import check_format, fill_from_dict, plant_to_dict, read_field
 from obsynth.symbolic.signal_table import SignalTable, check_targets
-from obsynth.symbolic.signals import KINDS, Role, Signal
+from obsynth.symbolic.signals import KINDS, LONGEST_NAME, Role, Signal, one_line
 from obsynth.symbolic.sxmodel import SxModel, build_sx, check_method, next_values, sampling_time
 from obsynth.symbolic.text import read_text
 
@@ -60,7 +60,7 @@ class Plant:
     def __init__(self, name: str) -> None:
         if not isinstance(name, str) or not name.strip():
             raise PlantError(f"a plant's name is a non-empty text, not {name!r}", name=name)
-        self._name = name
+        self._name = one_line(name, "a plant's name", LONGEST_NAME, name=name)
         self._table = SignalTable()
         self._dynamics: Rows | None = None
         self._outputs: dict[str, sp.Expr] | None = None

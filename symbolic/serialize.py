@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import sympy as sp
 
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.signals import Role, Signal, expand_names
+from obsynth.symbolic.signals import Role, Signal, is_name
 from obsynth.symbolic.text import read_text, write_text
 
 if TYPE_CHECKING:
@@ -66,8 +66,9 @@ def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
         raise PlantError(f"stored plant: dynamics are texts, not {rows!r}", key="dynamics")
     plant.dynamics(rows, Ts=None if step is None else read_text(step, {}))
     outputs = read_field(data, "outputs", list)
-    names, units, texts = (
-        [read_field(item, key, str) for item in outputs] for key in ("name", "unit", "expression")
+    names = [_read_name(item) for item in outputs]
+    units, texts = (
+        [read_field(item, key, str) for item in outputs] for key in ("unit", "expression")
     )
     plant.outputs(texts, names=names, unit=units)
 
@@ -99,9 +100,7 @@ def signal_to_dict(signal: Signal) -> dict[str, Any]:
 
 def signal_from_dict(data: Any) -> Signal:
     """Read a signal back."""
-    name = read_field(data, "name", str)
-    if expand_names(name) != (name,):
-        raise PlantError(f"stored signal {name!r}: this is not the name of one signal", symbol=name)
+    name = _read_name(data)
     role = read_field(data, "role", str)
     if role not in list(Role):
         raise PlantError(f"stored signal {name!r}: the role {role!r} is unknown", symbol=name)
@@ -123,6 +122,13 @@ def signal_from_dict(data: Any) -> Signal:
     )
 
 
+def _read_name(data: Any) -> str:
+    name: str = read_field(data, "name", str)
+    if not is_name(name):
+        raise PlantError(f"stored plant: {name[:100]!r} is not the name of one signal", symbol=name)
+    return name
+
+
 def read_field(data: Any, key: str, kind: type, default: Any = _REQUIRED) -> Any:
     """Read one field of stored data and check its type."""
     if not isinstance(data, Mapping):
@@ -130,10 +136,10 @@ def read_field(data: Any, key: str, kind: type, default: Any = _REQUIRED) -> Any
     value = data.get(key)
     if value is None and default is not _REQUIRED:
         return default
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if kind is float and type(value) is int and abs(value) < 2**1023:
         return float(value)
     if not isinstance(value, kind):
         raise PlantError(
-            f"stored plant: {key!r} is {value!r}, not of type {kind.__name__}", key=key
+            f"stored plant: {key!r} is {repr(value)[:200]}, not of type {kind.__name__}", key=key
         )
     return value

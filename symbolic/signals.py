@@ -18,7 +18,9 @@ from obsynth.symbolic.text import WORDS
 RESERVED = (WORDS | BY_NAME.keys() | ALIASES.keys()) - {"phi1", "tanhc"}
 """Names that would read as something else; phi1 is too good a name for an angle."""
 
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
+LONGEST_NAME, LONGEST_UNIT = 200, 60
+"""Characters of a plant's name, and of a unit."""
 
 
 class Role(StrEnum):
@@ -113,6 +115,7 @@ class Signal:
 
     def __post_init__(self) -> None:
         who = f"{self.role} {self.name}"
+        one_line(self.unit, f"{who}: unit", LONGEST_UNIT, symbol=self.name)
         if math.isnan(self.lower) or math.isnan(self.upper):
             raise PlantError(f"{who}: a bound of its range is not a number", symbol=self.name)
         unbounded = self.lower == -math.inf and self.upper == math.inf
@@ -162,6 +165,22 @@ class Signal:
         return math.isfinite(self.lower) and math.isfinite(self.upper)
 
 
+def one_line(text: Any, what: str, longest: int, **facts: Any) -> str:
+    """Return a text that stands in titles and guarantees: one line of printable characters."""
+    if not isinstance(text, str) or not text.isprintable() or len(text) > longest:
+        given = f"{text[:longest]!r}..." if isinstance(text, str) else repr(text)
+        raise PlantError(
+            f"{what} is text of one line, at most {longest} printable characters, not {given}",
+            **facts,
+        )
+    return text
+
+
+def is_name(text: str) -> bool:
+    """Whether a text is the name of one signal, without expanding it."""
+    return _IDENTIFIER.fullmatch(text) is not None and text not in RESERVED
+
+
 def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str, ...]:
     """Expand names as ``sympy.symbols`` does."""
     parts = [names] if isinstance(names, str) else names
@@ -176,7 +195,8 @@ def expand_names(names: str | Sequence[str], what: str = "signal") -> tuple[str,
     for name in found:
         if not _IDENTIFIER.fullmatch(name):
             raise PlantError(
-                f"{what}: {name!r} is no name; use letters, digits and underscores", symbol=name
+                f"{what}: {name!r} is no name; use letters, digits and underscores, at most 100",
+                symbol=name,
             )
         if name in RESERVED:
             raise PlantError(
@@ -274,8 +294,7 @@ def _one(
     tolerance: Any,
 ) -> Signal:
     who = f"{role} {name}"
-    if not isinstance(unit, str):
-        raise PlantError(f"{who}: unit= is text such as 'cm', not {unit!r}", symbol=name)
+    one_line(unit, f"{who}: unit=", LONGEST_UNIT, symbol=name)
     for flag, word in ((constant, "constant"), (measured, "measured")):
         if not isinstance(flag, bool):
             raise PlantError(f"{who}: {word}= is True or False, not {flag!r}", symbol=name)

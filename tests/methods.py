@@ -1,5 +1,6 @@
 """The table of methods: with one entry, tests/designs/test_contract.py holds a method to all."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -172,3 +173,23 @@ METHODS = {
         module="luenberger.method",
     ),
 }
+
+
+@functools.cache
+def observer_of(name: str) -> ob.Observer:
+    """The design of a method's entry, made once."""
+    return METHODS[name].method.design(METHODS[name].plant())
+
+
+@functools.cache
+def run_of(name: str) -> ob.Run:
+    """The scenario of a method's entry, simulated once."""
+    return simulated(METHODS[name], observer_of(name))
+
+
+def simulated(entry: Entry, observer: Any) -> ob.Run:
+    """Run the scenario; an observer whose step is not covered together with its plant."""
+    options: dict[str, Any] = {}
+    if observer.ode is not None:
+        options = {"substeps": 4} if observer.step_covered else {"engine": "joint"}
+    return ob.simulate(entry.plant(), observer, entry.scenario(), seed=1, **options)

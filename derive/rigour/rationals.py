@@ -7,6 +7,7 @@ elimination over the integers; arrays of rationals (`exact`) have the operators 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,6 +21,7 @@ from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 Exact = NDArray[np.object_]
+_WRITTEN = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{0,3999})?")
 
 
 def number(value: Any) -> Any:
@@ -271,4 +273,7 @@ def to_text(values: Exact) -> list[Any]:
 def from_text(nested: Any, shape: tuple[int, ...]) -> Exact:
     """Read what `to_text` wrote; empty arrays get their shape from the caller."""
     flat = np.array(nested, dtype=object).ravel()
-    return exact(np.array([Fraction(str(v)) for v in flat], dtype=object).reshape(shape))
+    for value in flat:
+        if not isinstance(value, str) or not _WRITTEN.fullmatch(value):
+            raise ValueError(f"{str(value)[:60]!r} is no rational number such as '-1/3'")
+    return exact(np.array([Fraction(v) for v in flat], dtype=object).reshape(shape))

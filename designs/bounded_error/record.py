@@ -11,9 +11,12 @@ from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData
+from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
+
+MOST_VERTICES = 2**16
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +36,13 @@ class EllipsoidBound(Record):
     gamma: Annotated[FloatArray, "s"]
     weights: Annotated[FloatArray, "s n_v"]
     inverse_diagonal: Annotated[FloatArray, "p"]
+
+    def check(self) -> None:
+        """Refuse ellipsoids that are neither one nor one per component."""
+        if len(self.P) not in (1, self.P.shape[1]):
+            raise CertificateError(
+                f"the stored design has {len(self.P)} ellipsoids for {self.P.shape[1]} components"
+            )
 
     def shape_of(self, component: int) -> int:
         """Return the number of the ellipsoid that bounds a component of xi."""
@@ -120,6 +130,10 @@ class UioDesign(Record):
 
 def _enclosed_vertices(family: AffineFamily) -> Enclosure:
     """All vertices ``constant + sum_k s_k direction_k``, rounding and radius enclosed."""
+    if family.vertex_count > MOST_VERTICES:
+        raise CertificateError(
+            f"the stored family has {family.vertex_count} vertices, more than {MOST_VERTICES}"
+        )
     total = Enclosure.of(family.constant[None], family.radius)
     for ends, direction in zip(family.ranges, family.directions, strict=True):
         different = sorted(set(ends.tolist()))

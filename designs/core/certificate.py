@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from math import isclose, isfinite
 from typing import TYPE_CHECKING, Any, Literal
 
 from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.record import reading, shown
 
 if TYPE_CHECKING:
     from obsynth.designs.core.method import Contract
@@ -45,6 +47,19 @@ class Claim:
         word = "proved" if self.holds else "NOT PROVED"
         return f"{self.statement}: {word} (margin {self.margin:.3g}; {self.proof})"
 
+    def to_record(self) -> dict[str, Any]:
+        """Return the claim as JSON-able data, a margin that is not finite as None."""
+        return {**asdict(self), "margin": self.margin if isfinite(self.margin) else None}
+
+    def is_told_by(self, entry: Any) -> bool:
+        """Whether a file lists this claim; margins may differ by what other processors round."""
+        mine = self.to_record()
+        margin, told = mine.pop("margin"), entry.get("margin")
+        same = {**entry, "margin": None} == {**mine, "margin": None}
+        if margin is None or type(told) is not float:
+            return same and type(told) is type(margin) and told == margin
+        return same and isclose(told, margin, rel_tol=1e-2, abs_tol=1e-12)
+
 
 @dataclass(frozen=True)
 class Guarantee:
@@ -77,31 +92,53 @@ class Certificate:
         The stored design: everything the proofs use.
     contract : Contract
         Of the design's method: what is claimed of it and what runs.
+    told : list of dict or None
+        What the file that the design was read from lists as claims.
     """
 
     claims: tuple[Claim, ...]
     design: Any = field(repr=False)
     contract: Contract[Any] = field(repr=False)
+    told: Any = field(default=None, repr=False)
 
     @cached_property
     def record(self) -> Mapping[str, Any]:
         """The stored design as JSON-able data."""
         return self.contract.to_record(self.design)
 
-    def stored_as(self, record: Mapping[str, Any]) -> Certificate:
-        """Return the certificate itself; its record is what the design was read from."""
-        self.__dict__["record"] = record
+    def stored_as(self, record: Mapping[str, Any], told: Any) -> Certificate:
+        """Return the certificate itself, read from a record in a file that lists claims too."""
+        self.__dict__.update(record=record, told=told)
+        return self.agreeing_with(told, "lmi")
+
+    def agreeing_with(self, told: Any, level: Level) -> Certificate:
+        """Return the certificate itself unless claims listed in a file contradict its own.
+
+        What "lmi" does not prove is compared in a full check; no list, no contradiction.
+        """
+        mine = {claim.name: claim for claim in self.claims}
+        listed = [] if told is None else told
+        if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+            raise CertificateError("the claims that the file lists are no list of claims")
+        names = [str(entry.get("name")) for entry in listed]
+        for name, entry in zip(names, listed, strict=True):
+            proved = name in mine and mine[name].is_told_by(entry)
+            if names.count(name) > 1 or not (proved or (level == "lmi" and name not in mine)):
+                found = mine.get(name, "no claim of that name")
+                raise CertificateError(
+                    f"the file lists the claim {shown(repr(name))}, which is not what is proved; "
+                    "delete the list from the file to read the design without it",
+                    [f"listed: {shown(repr(entry))}", f"proved: {found}"],
+                )
         return self
 
-    def __getstate__(self) -> tuple[tuple[Claim, ...], Mapping[str, Any], Contract[Any]]:
-        return self.claims, self.record, self.contract
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self.claims, self.record, self.contract, self.told
 
-    def __setstate__(
-        self, state: tuple[tuple[Claim, ...], Mapping[str, Any], Contract[Any]]
-    ) -> None:
-        claims, record, contract = state
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        claims, record, contract, told = state
         design = contract.record.from_record(record)
-        self.__dict__.update(claims=claims, design=design, contract=contract)
+        self.__dict__.update(claims=claims, design=design, contract=contract, told=told)
 
     @property
     def valid(self) -> bool:
@@ -145,7 +182,9 @@ class Certificate:
         if level not in LEVELS:
             raise CertificateError(f"level is {level!r}; it has to be one of {', '.join(LEVELS)}")
         # A copy, since a design keeps what was computed from its stored numbers before.
-        return self.contract.certify(replace(self.design), level).require()
+        with reading():
+            certificate = self.contract.certify(replace(self.design), level).require()
+            return certificate.agreeing_with(self.told, level)
 
     def observer(self) -> Observer:
         """Return the observer of the design.

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from obsynth.designs.core.certificate import Claim
     from obsynth.designs.core.observer import Observer
 
 
@@ -21,8 +18,8 @@ CLAIMS = "claims"
 def save(observer: Observer, path: str | os.PathLike[str]) -> None:
     """Write the record of an observer; an existing file is replaced only when complete.
 
-    The claims stand in the file too, for people to read; `load` proves them again and never
-    believes them.
+    The claims stand in the file too, for people to read; `load` proves them again and refuses a
+    file that lists others.
 
     Raises
     ------
@@ -30,7 +27,7 @@ def save(observer: Observer, path: str | os.PathLike[str]) -> None:
         If the folder does not exist.
     """
     target = Path(path)
-    claims = [_claim(claim) for claim in observer.certificate]
+    claims = [claim.to_record() for claim in observer.certificate]
     text = json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
     write_whole(target, text)
 
@@ -46,8 +43,3 @@ def write_whole(target: Path, text: str) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
-
-
-def _claim(claim: Claim) -> dict[str, Any]:
-    margin = claim.margin if math.isfinite(claim.margin) else None
-    return {**asdict(claim), "margin": margin}

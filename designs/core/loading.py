@@ -10,6 +10,7 @@ from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.files import CLAIMS
 from obsynth.designs.core.method import CONTRACTS, FORMAT, VERSION, Contract
 from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.record import reading, shown
 
 
 def load(path: str | os.PathLike[str]) -> Observer:
@@ -25,30 +26,56 @@ def load(path: str | os.PathLike[str]) -> Observer:
         If the file is no design, or a claim does not hold for what is in it.
     """
     source = Path(path)
+    record = _read_json(source)
+    told = record.pop(CLAIMS, None)
+    contract = contract_of(record)
+    design = contract.record.from_record(record)
+    with reading():
+        certificate = contract.certify(design, "lmi").require()
+        return certificate.stored_as(record, told).observer()
+
+
+def _read_json(source: Path) -> dict[str, Any]:
+    """Read a table; a key that stands twice, NaN and what is no JSON are refused."""
+    data = source.read_bytes()
+
+    def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            keys = [key for key, _ in pairs]
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise CertificateError(f"{source.name} has the key {shown(repr(twice))} twice")
+        return found
+
+    def constant(word: str) -> None:
+        raise CertificateError(f"{source.name} holds {word}, which is no number of JSON")
+
     try:
-        record = json.loads(source.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise CertificateError(f"{source.name} is not JSON: {error}") from error
+        text = data.decode("utf-8")
+        record = json.loads(text, object_pairs_hook=table, parse_constant=constant)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, CertificateError):
+            raise
+        raise CertificateError(f"{source.name} is not JSON: {shown(str(error))}") from error
     if not isinstance(record, dict):
         raise CertificateError(f"{source.name} holds no design")
-    record.pop(CLAIMS, None)
-    contract = contract_of(record)
-    certificate = contract.certify(contract.record.from_record(record), "lmi")
-    return certificate.stored_as(record).observer()
+    return record
 
 
 def contract_of(record: Mapping[str, Any]) -> Contract[Any]:
     """Return the contract of a record's method, or refuse its header."""
     if record.get("format") != FORMAT:
         raise CertificateError(
-            f"this is no design: its format is {record.get('format')!r}, not {FORMAT!r}"
+            f"this is no design: its format is {shown(repr(record.get('format')))}, not {FORMAT!r}"
         )
-    if record.get("version") != VERSION:
+    version, method = record.get("version"), record.get("method")
+    if type(version) is not int or version != VERSION:
         raise CertificateError(
-            f"the design has version {record.get('version')!r} and this obsynth reads version "
+            f"the design has version {shown(repr(version))} and this obsynth reads version "
             f"{VERSION}: design it again"
         )
-    method = record.get("method")
-    if method not in CONTRACTS:
-        raise CertificateError(f"method {method!r} is not known; known are {sorted(CONTRACTS)}")
-    return CONTRACTS[str(method)]
+    if not isinstance(method, str) or method not in CONTRACTS:
+        raise CertificateError(
+            f"method {shown(repr(method))} is not known; known are {sorted(CONTRACTS)}"
+        )
+    return CONTRACTS[method]

@@ -31,11 +31,15 @@ VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What an observer shows of itself: gains by the paper's letters, performance, half widths."""
+    """What an observer shows of itself: gains by the paper's letters, performance, half widths.
+
+    searched: entries of the performance that a search found; no claim proves them
+    """
 
     gains: Mapping[str, FloatArray]
     performance: Mapping[str, float]
     half_widths: FloatArray | None = None
+    searched: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,7 @@ class Contract(Generic[D]):
             fault_delay=self.fault_delay,
             ode=None if self.ode is None else self.ode(design),
             step_covered=self.step_covered,
+            searched=numbers.searched,
         )
 
     def layout(self, design: Any) -> dict[str, slice]:

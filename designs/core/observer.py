@@ -71,6 +71,8 @@ class Observer:
     step_covered : bool
         Continuous-time methods: whether the guarantee covers the step too, called
         every `model.Ts` seconds on the continuous plant.
+    searched : tuple of str
+        Entries of `performance` that a search found and no claim proves.
     """
 
     method: str
@@ -85,6 +87,13 @@ class Observer:
     fault_delay: int = 0
     ode: ca.Function | None = None
     step_covered: bool = False
+    searched: tuple[str, ...] = ()
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The performance as it is shown: what no claim proves says so."""
+        marks = dict.fromkeys(self.searched, " (searched, not proved)")
+        return {key + marks.get(key, ""): value for key, value in self.performance.items()}
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -156,7 +165,7 @@ class Observer:
         if self.half_widths is not None:
             pairs = zip(names, self.half_widths, strict=True)
             lines.append("  " + ", ".join(f"{name} +-{width:.4g}" for name, width in pairs))
-        lines += [f"  {key} = {value:.6g}" for key, value in self.performance.items()]
+        lines += [f"  {key} = {value:.6g}" for key, value in self.figures.items()]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -171,7 +180,7 @@ class Observer:
             )
         facts = "".join(
             f"<tr><td {left}>{escape(key)}</td><td>{value:.6g}</td></tr>"
-            for key, value in self.performance.items()
+            for key, value in self.figures.items()
         )
         words = f"{escape(self.method)} for {escape(self.model.name)}"
         title = f"<caption style='text-align:left;white-space:nowrap'>{words}</caption>"

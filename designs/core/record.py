@@ -29,8 +29,11 @@ from obsynth.derive.rigour import Exact, from_text, to_text
 from obsynth.designs.core.errors import CertificateError
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.errors import ObsynthError
 
 ARRAYS = {FloatArray: float, IntArray: np.int64}
+MOST_SHOWN = 400
+"""Characters of a file that a refusal repeats."""
 
 
 def sizes_of(plant: Plant) -> dict[str, int]:
@@ -90,13 +93,21 @@ class Record:
 
 @contextmanager
 def reading() -> Iterator[None]:
-    """Turn whatever goes wrong while a record is read into one kind of refusal."""
+    """Turn whatever goes wrong with a stranger's record into one kind of refusal."""
     try:
         yield
     except CertificateError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise CertificateError(f"the stored design cannot be read: {error!r}") from error
+    except Exception as error:
+        said = str(error) if isinstance(error, ObsynthError) else repr(error)
+        raise CertificateError(f"the stored design cannot be read: {shown(said)}") from error
+
+
+def shown(value: Any) -> str:
+    """Return what a record holds as a short line for a refusal."""
+    text = value if isinstance(value, str) else repr(value)
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return line if len(line) <= MOST_SHOWN else f"{line[:MOST_SHOWN]} ..."
 
 
 def plain(value: Any) -> Any:
@@ -172,6 +183,8 @@ def read_value(kind: Any, stored: Any, name: str, context: Context) -> Any:
 
 
 def _read_array(stored: Any, letters: str, name: str, context: Context, kind: Any) -> Any:
+    if not _all_numbers(stored):
+        raise CertificateError(f"{name} of the stored design has to hold numbers only")
     array = np.asarray(stored, dtype=kind)
     if kind is not float and not np.array_equal(array, np.asarray(stored, dtype=float)):
         raise CertificateError(f"{name} of the stored design has to hold whole numbers")
@@ -185,6 +198,12 @@ def _read_array(stored: Any, letters: str, name: str, context: Context, kind: An
     if not np.isfinite(array).all():
         raise CertificateError(f"{name} of the stored design is not finite")
     return array
+
+
+def _all_numbers(stored: Any) -> bool:
+    if isinstance(stored, list | tuple):
+        return all(map(_all_numbers, stored))
+    return isinstance(stored, int | float) and not isinstance(stored, bool)
 
 
 def read_family(stored: Mapping[str, Any], shape: tuple[int, ...], name: str) -> AffineFamily:
@@ -202,8 +221,8 @@ def read_family(stored: Mapping[str, Any], shape: tuple[int, ...], name: str) ->
         directions=read("directions", f"K {rows} {columns}"),
         ranges=read("ranges", "K 2"),
         radius=read("radius", f"{rows} {columns}"),
-        labels=tuple(map(str, stored["labels"])),
-        exact=bool(stored["exact"]),
+        labels=_read_tuple((str, ...), stored["labels"], f"{name}.labels", context),
+        exact=_read_scalar(bool, stored["exact"], f"{name}.exact"),
     )
     if family.radius.min(initial=0.0) < 0.0:
         raise CertificateError(f"{name}.radius of the stored design is negative")
@@ -222,7 +241,7 @@ def _read_union(
         tags = {kind.KIND: kind for kind in rest}
         if stored["kind"] not in tags:
             raise CertificateError(
-                f"{name} of the stored design is of kind {stored['kind']!r}; "
+                f"{name} of the stored design is of kind {shown(repr(stored['kind']))}; "
                 f"{', '.join(map(repr, tags))} are known"
             )
         return read_value(tags[stored["kind"]], stored, name, context)
@@ -235,7 +254,7 @@ def _read_literal(allowed: tuple[Any, ...], stored: Any, name: str) -> Any:
         if type(stored) is type(one) and stored == one:
             return one
     raise CertificateError(
-        f"{name} is {stored!r} in the stored design; it has to be one of "
+        f"{name} is {shown(repr(stored))} in the stored design; it has to be one of "
         f"{', '.join(map(repr, allowed))}"
     )
 
@@ -256,7 +275,6 @@ def _read_scalar(kind: Any, stored: Any, name: str) -> Any:
     elif kind in (int, bool, str) and type(stored) is kind:
         return stored
     raise CertificateError(
-        f"{name} is {stored!r} in the stored design; a finite {kind.__name__} is needed"
-        if kind in (int, float)
-        else f"{name} is {stored!r} in the stored design; {kind.__name__} is needed"
+        f"{name} is {shown(repr(stored))} in the stored design; "
+        f"{'a finite ' if kind in (int, float) else ''}{kind.__name__} is needed"
     )

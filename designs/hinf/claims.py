@@ -232,7 +232,8 @@ def _rounding_of_signals(
 
 def numbers(design: HinfDesign) -> Numbers:
     """Return gains and performance; no set is carried along, so there are no half widths."""
-    return Numbers(_gains(design), _performance(design))
+    searched = () if design.bound.least_mu is None else ("least_mu",)
+    return Numbers(_gains(design), _performance(design), searched=searched)
 
 
 def _gains(design: HinfDesign) -> dict[str, FloatArray]:

@@ -20,7 +20,7 @@ def numbers(design: QPVDesign) -> Numbers:
     elif not design.plant.w:
         widths = np.zeros(len(design.P))
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
-    return Numbers(gains, _performance(design), widths)
+    return Numbers(gains, _performance(design), widths, ("eta",))
 
 
 def _performance(design: QPVDesign) -> dict[str, float]:

@@ -1,7 +1,6 @@
 """What every method of tests/methods.py owes; a new method enters a line there and meets it all."""
 
 import copy
-import functools
 import json
 import os
 import pickle
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from methods import METHODS
+from methods import METHODS, observer_of, run_of, simulated
 from obsynth.codegen import find_compiler
 from obsynth.designs.core.certificate import Certificate, Claim
 from obsynth.designs.core.errors import DetectorError
@@ -32,24 +31,6 @@ for module, path in zip(sys.argv[1::2], sys.argv[2::2]):
     certificate = ob.load(path).certificate.check()
     print(path, len(certificate.claims), certificate.valid)
 """
-
-
-@functools.cache
-def observer_of(name):
-    return METHODS[name].method.design(METHODS[name].plant())
-
-
-@functools.cache
-def run_of(name):
-    return simulated(METHODS[name], observer_of(name))
-
-
-def simulated(entry, observer):
-    """Run the scenario; an observer whose step is not covered together with its plant."""
-    options = {}
-    if observer.ode is not None:
-        options = {"substeps": 4} if observer.step_covered else {"engine": "joint"}
-    return ob.simulate(entry.plant(), observer, entry.scenario(), seed=1, **options)
 
 
 @pytest.fixture(params=METHODS)

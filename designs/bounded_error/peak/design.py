@@ -142,6 +142,26 @@ def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
             1.0 - proof.small_gain,
             "max (G v)_i / v_i for a positive v, rounded up",
         ),
+        _prove_decay(design, bound),
+    )
+
+
+def _prove_decay(design: UioDesign, bound: PeakData) -> Claim:
+    """Prove that the step may forget the first error as fast as the stored decay says."""
+    proof = "powers of the error system divided by those of the decay, rounded up"
+    try:
+        transient(stored_bound(design), _widest_start(design), decay=bound.decay)
+    except InfeasibleDesign as error:
+        proof = str(error)
+        holds = False
+    else:
+        holds = True
+    return Claim(
+        "decay",
+        f"what the first error adds to the bounds decays with {bound.decay:.7g} per sample",
+        holds,
+        1.0 - bound.decay if holds else -np.inf,
+        proof,
     )
 
 

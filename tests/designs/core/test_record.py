@@ -100,7 +100,7 @@ def test_what_is_read_is_what_was_written():
     [
         ("A", [[1.0, 2.0]], r"A has shape \(1, 2\) in the stored design; \(2, 2\) is needed"),
         ("A", [[1.0, float("nan")], [0.0, 1.0]], "A of the stored design is not finite"),
-        ("A", [[1.0, "x"], [0.0, 1.0]], "cannot be read"),
+        ("A", [[1.0, "x"], [0.0, 1.0]], "A of the stored design has to hold numbers only"),
         ("A", [[1.0, 2.0], [0.0]], "cannot be read"),
         ("stack", [[[1.0] * 4] * 2] * 5, "stack has shape"),
         ("fewer", [[1.0]], r"fewer has shape \(1, 1\) in the stored design; \(1, 2\) is needed"),
