@@ -37,7 +37,7 @@ from obsynth.designs.bounded_error.synthesis import (
     synthesise,
 )
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains
+from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi import Problem
 from obsynth.symbolic import Plant
@@ -144,6 +144,9 @@ class BoundedErrorUIO(Method):
         """Refuse options that do not fit each other."""
         if self.weights is not None and not any(self.weights):
             raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
+        if self.bounds == "peak" and self.form == "corrected":
+            idle = ("post", "objective", "multipliers", "error")
+            refuse_idle(self, 'bounds="peak", which has no ellipsoid', *idle)
         if self.form != "corrected" and (
             self.error != "plain" or self.multipliers != "equal" or self.bounds != "ellipsoid"
         ):

@@ -55,6 +55,15 @@ def check_options(method: Any) -> None:
         object.__setattr__(method, option.name, value)
 
 
+def refuse_idle(method: Any, where: str, *names: str) -> None:
+    """Refuse options that differ from their default where they have no effect."""
+    for option in fields(method):
+        if option.name in names and getattr(method, option.name) != option.default:
+            raise ObsynthError(
+                f"{option.name} has no effect with {where}: leave it out", option=option.name
+            )
+
+
 def read_option(name: str, kind: Any, value: Any) -> Any:
     """Return the value of an option as its annotation describes it, or refuse it."""
     limits, extras = Number(), []
@@ -105,7 +114,7 @@ def _number(name: str, value: Any, limits: Number, whole: bool) -> float | int:
 
 def _finite_numbers(name: str, value: Any, limits: Number) -> tuple[float, ...]:
     try:
-        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+        numbers = np.atleast_1d(_floats(value))
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
     if numbers.ndim != 1 or not numbers.size or not limits.holds(numbers):
@@ -114,18 +123,18 @@ def _finite_numbers(name: str, value: Any, limits: Number) -> tuple[float, ...]:
 
 
 def _pairs(name: str, value: Any) -> tuple[tuple[float, float], ...]:
-    try:
-        return tuple((float(low), float(high)) for low, high in value)
-    except (TypeError, ValueError) as error:
+    pairs = _numbers(value)
+    if pairs is None or pairs.ndim != 2 or pairs.shape[1] != 2 or not np.all(np.diff(pairs) >= 0):
         raise ObsynthError(
-            f"{name} is {value!r}; it has to be pairs (lower, upper)", option=name
-        ) from error
+            f"{name} is {value!r}; it has to be pairs (lower, upper) of numbers", option=name
+        )
+    return tuple((low, high) for low, high in pairs.tolist())
 
 
 def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np.ndarray[Any, Any]:
     """Return an option that is an array of finite numbers; a vector serves as one column."""
     try:
-        array = np.array(value, dtype=float)
+        array = np.array(_floats(value))
     except (TypeError, ValueError) as error:
         raise ObsynthError(f"{name} is no array of numbers: {value!r}", option=name) from error
     if array.ndim == 1 and 1 not in dimensions:
@@ -350,6 +359,14 @@ def read_gains(
 
 def _numbers(value: Any) -> FloatArray | None:
     try:
-        return np.asarray(value, dtype=float)
+        return _floats(value)
     except (TypeError, ValueError):
         return None
+
+
+def _floats(value: Any) -> FloatArray:
+    """Return numbers as doubles; texts, truth values and complex numbers are none."""
+    entries = np.ravel(np.array(value, dtype=object))
+    if any(isinstance(one, str | bool | np.bool_ | complex) for one in entries):
+        raise TypeError(f"{value!r} holds no numbers")
+    return np.asarray(value, dtype=float)

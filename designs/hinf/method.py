@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains, read_matrix
+from obsynth.designs.core.given import Number, read_gains, read_matrix, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.hinf.claims import (
     RESIDUAL,
@@ -167,6 +167,10 @@ class HinfUIO(Method):
                 'majorant= is the diagonal of one M\'M and needs multipliers="single"',
                 option="majorant",
             )
+        if self.mu is not None:
+            refuse_idle(self, "mu=, which is the level itself", "slack")
+        if self._multipliers is None:
+            refuse_idle(self, "the vertices of the Jacobian", "drop_zero_rows")
         if self.form == "printed" and (
             self.method != "standard" or self._multipliers != "single" or self.decay is not None
         ):

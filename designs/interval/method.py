@@ -280,4 +280,10 @@ def _in_words(prefer: Any) -> Prefer:
         return None
     if isinstance(prefer, Mapping):
         return {str(key): str(value) for key, value in prefer.items()}
-    return tuple(map(str, [prefer] if isinstance(prefer, str) else prefer))
+    words = [prefer] if isinstance(prefer, str) else prefer
+    if not isinstance(words, list | tuple) or not all(isinstance(word, str) for word in words):
+        raise ObsynthError(
+            f"prefer is {prefer!r}; it has to be names of signals, or a mapping of them",
+            option="prefer",
+        )
+    return tuple(words)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.core.given import POSITIVE, read_gains
+from obsynth.designs.core.given import POSITIVE, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
@@ -60,7 +60,7 @@ class SetAdaptiveObserver(Method):
         Time constant in seconds of the monitors (13); all time by default.
     robust : bool
         Design a `FilterBank` with the options ``filters``, ``region``, ``Ts`` and ``precision``
-        instead; the others are ignored.
+        instead; it has none of the others.
     filters, region
         Of the `FilterBank`.
     precision : {"double", "single"}
@@ -139,6 +139,8 @@ class SetAdaptiveObserver(Method):
 
     def check(self) -> None:
         """Refuse a printed bank; the printed form has the printed law and no noise."""
+        own, bank = ("law", "Gamma", "gain_cap", "noise", "window"), ("filters", "region")
+        refuse_idle(self, f"robust={self.robust}", *(own if self.robust else bank))
         if self.form == "printed":
             if self.robust:
                 raise ObsynthError(
@@ -146,6 +148,7 @@ class SetAdaptiveObserver(Method):
                     "the paper",
                     option="form",
                 )
+            refuse_idle(self, 'form="printed"', "gain_cap")
             object.__setattr__(self, "law", "printed")
             object.__setattr__(self, "noise", False)
 

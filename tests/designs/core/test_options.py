@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
+import obsynth as ob
 from obsynth.designs.core.given import MATRIX, POSITIVE, Number, check_options
 from obsynth.symbolic import ObsynthError
 
@@ -23,6 +24,7 @@ class Options:
     weights: Annotated[tuple[float, ...] | None, Number(at_least=0.0)] = None
     turn: Annotated[Any | None, MATRIX] = None
     own: Any = None
+    pairs: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -56,6 +58,17 @@ def test_what_fits_is_kept_and_sequences_become_tuples():
         ("weights", [[1.0]], "it has to be"),
         ("weights", [], "it has to be"),
         ("weights", "many", "it has to be"),
+        ("weights", "12", "it has to be"),
+        ("weights", True, "it has to be"),
+        ("weights", [True, 1.0], "it has to be"),
+        ("weights", np.array([1.0 + 1.0j]), "it has to be"),
+        ("turn", [["1", "2"]], "no array of numbers"),
+        ("turn", [[True]], "no array of numbers"),
+        ("pairs", [(1, 0)], "pairs (lower, upper)"),
+        ("pairs", [(float("nan"), 1)], "pairs (lower, upper)"),
+        ("pairs", [(True, 1)], "pairs (lower, upper)"),
+        ("pairs", [("0", "1")], "pairs (lower, upper)"),
+        ("pairs", 3, "pairs (lower, upper)"),
         ("turn", "far", "no array of numbers"),
         ("turn", [[np.inf]], "finite numbers in 2 dimensions"),
         ("turn", np.ones((1, 1, 1)), "finite numbers in 2 dimensions"),
@@ -74,3 +87,51 @@ def test_limits_are_those_that_were_said():
     closed = Number(at_least=0.0, at_most=1.0)
     assert [closed.holds(v) for v in values] == [0.0 <= v <= 1.0 for v in values]
     assert SHARE.holds([0.1, 0.9]) and not SHARE.holds([0.1, 1.1])
+
+
+IDLE = [
+    (ob.SetAdaptiveObserver, {"robust": True}, {"Gamma": 0.02}),
+    (ob.SetAdaptiveObserver, {"robust": True}, {"Gamma": (0.01, 0.01)}),
+    (ob.SetAdaptiveObserver, {"robust": True}, {"law": "printed"}),
+    (ob.SetAdaptiveObserver, {"robust": True}, {"gain_cap": 1.0}),
+    (ob.SetAdaptiveObserver, {"robust": True}, {"noise": False}),
+    (ob.SetAdaptiveObserver, {"robust": True}, {"window": 3.0}),
+    (ob.SetAdaptiveObserver, {}, {"filters": (1.0,)}),
+    (ob.SetAdaptiveObserver, {}, {"region": [(0, 1)]}),
+    (ob.SetAdaptiveObserver, {"form": "printed"}, {"gain_cap": 1.0}),
+    (ob.BoundedErrorUIO, {"bounds": "peak"}, {"post": "per_component"}),
+    (ob.BoundedErrorUIO, {"bounds": "peak"}, {"objective": "log_det"}),
+    (ob.BoundedErrorUIO, {"bounds": "peak"}, {"multipliers": "per_component"}),
+    (ob.BoundedErrorUIO, {"bounds": "peak"}, {"error": "shifted"}),
+    (ob.HinfUIO, {"mu": 1.0}, {"slack": 1e-3}),
+    (ob.HinfUIO, {"method": "general"}, {"drop_zero_rows": False}),
+]
+
+
+@pytest.mark.parametrize(("method", "mode", "idle"), IDLE)
+def test_options_without_effect_are_refused(method, mode, idle):
+    """Mutant: a name left out of the list of what has no effect in a mode."""
+    (name,) = idle
+    with pytest.raises(ObsynthError, match=f"^{name} has no effect with ") as refusal:
+        method(**mode, **idle)
+    assert refusal.value.option == name
+    assert method(**mode)
+    again = {**method(**mode).options()}
+    assert method(**again) == method(**mode)
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        (ob.BoundedErrorUIO, {"gamma": "x"}),
+        (ob.SetAdaptiveObserver, {"noise": "no"}),
+        (ob.HinfUIO, {"mu": True}),
+        (ob.SetAdaptiveObserver, {"Gamma": (True, 1.0)}),
+        (ob.FilterBank, {"filters": [True]}),
+        (ob.IntervalObserver, {"prefer": 3}),
+    ],
+)
+def test_types_of_options_are_checked(method, options):
+    (name,) = options
+    with pytest.raises(ObsynthError, match=f"^{name} is "):
+        method(**options)

@@ -323,7 +323,7 @@ def test_steady_widths_are_predicted(tanks, closed_loop, bank):
 
 
 def test_the_old_spelling_designs_the_bank(bank, tanks, certify):
-    old = ob.SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION, Gamma=3.0, noise=False)
+    old = ob.SetAdaptiveObserver(robust=True, Ts=0.01, region=REGION)
     observer = old.design(tanks)
     assert observer.method == bank.method == "filter_bank"
     assert observer.record == bank.record
