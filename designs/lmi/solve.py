@@ -145,7 +145,7 @@ def solve_lazily(
         solution = solve(stated)
         least = floor(stated, solution) if callable(floor) else floor
         fresh = {
-            name: _to_add(name, solution.value(family), chosen[name], least)
+            name: _to_add(name, _symmetric(solution.value(family)), chosen[name], least)
             for name, family in families.items()
         }
         if not any(len(new) for new in fresh.values()):
@@ -170,6 +170,11 @@ def solve_reliably(problem: Problem, *, floor: float, gap: float) -> Solution:
 def _first_choice(count: int) -> IntArray:
     drawn = np.random.default_rng(0).choice(count, _FIRST, replace=False)
     return np.union1d(drawn, [0, count - 1])
+
+
+def _symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Symmetric part, which is what is stated: products may round differently on either side."""
+    return 0.5 * matrices + 0.5 * np.swapaxes(matrices, -1, -2)
 
 
 def _to_add(name: str, matrices: NDArray[np.float64], stated: IntArray, floor: float) -> IntArray:

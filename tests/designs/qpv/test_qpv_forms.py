@@ -267,3 +267,19 @@ def test_a_form_serves_as_well_as_a_plant():
     assert given.performance["mu"] == pytest.approx(small().design(plant).performance["mu"])
     with pytest.raises(ob.StructureError, match="all 1 faults"):
         small().design(ob.qpv(varying(process=False)))
+
+
+def test_outputs_that_vary_off_the_diagonal():
+    """Expressions round differently on either side of the diagonal, which is no asymmetry.
+
+    Mutant: vertices that are looked at without taking the symmetric part.
+    """
+    from obsynth.designs.qpv.synthesis import rough_objective
+
+    stored = ob.plants.qpv_example().to_dict()
+    stored["outputs"][0]["expression"] += " + 0.1*theta1*x2"
+    stored["outputs"][1]["expression"] += " + 0.3*theta2*x3"
+    region = ob.Ellipsoid([0.2, 0.2, 0.2, 0.1, 0.1, 0.1], [10, 10, 10, 0, 0, 0])
+    method = ob.QPVObserver(region=region, eta=0.2, kappa=0.2, polya=2)
+    setting = method.setting(method.read(ob.Plant.from_dict(stored)))
+    assert 1e-3 < rough_objective(setting) < 1.0
