@@ -6,7 +6,7 @@ CasADi differentiates past the jump of a sign, a step or a piecewise definition 
 there. A kink is harmless (both slopes enter the bounds), a jump is not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +16,7 @@ import sympy as sp
 from numpy.typing import NDArray
 from sympy.core.relational import Relational
 
-from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.algebra.zero_test import is_zero, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries, sample_entries
@@ -27,7 +27,7 @@ from obsynth.derive.jacobian.family import (
     entry_name,
     find_dependences,
 )
-from obsynth.derive.rigour import enclose_number, substitute
+from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
@@ -35,97 +35,113 @@ from obsynth.symbolic.plant import Plant
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 _STEPS = (sp.floor, sp.ceiling, sp.Mod)
+_SWITCHES = (sp.sign, sp.Heaviside, Relational)
+_CORNERS = (*_SWITCHES, *_STEPS, sp.Piecewise, sp.Abs, sp.Max, sp.Min)
 
 
 def refuse_jumps(model: Plant) -> None:
     """Check that the right-hand side of a plant is continuous over its box.
 
-    Every sign, step and piecewise definition has to agree on both sides of its switching surface,
-    provably, or the surface has to lie outside the box.
+    Off its switching surfaces a row is smooth or has kinks. Two of them meet in no more than edges,
+    round which every path leads: it is enough that the limits from both sides and the value on the
+    surface agree, provably, on every surface by itself, with all switches that it moves together.
     """
     kinds = ("x", "u", "d", "f", "w", "p", "rho")
     box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    held = {symbol: rational(low) for symbol, (low, high) in box.items() if low == high}
     for name, row in zip(model.names("x"), model.rhs, strict=True):
-        exact = substitute(row, model.constant_values)
-        for switch in _switches(exact):
-            if not _meets(switch, box):
-                continue
-            if all(_vanishes_on(d, switch.surface) for d in switch.differences):
-                continue
+        surface = _jump(substitute(row, model.constant_values).xreplace(held), box)
+        if surface is not None:
             raise StructureError(
-                f"the row of {name} may jump where {switch.surface} = 0, which lies inside the "
+                f"the row of {name} may jump where {surface} = 0, which lies inside the "
                 "box; the bounds of its Jacobian would say nothing about the jump. Make both "
                 "sides agree there, or restrict the ranges to one side",
                 row=name,
-                surface=switch.surface,
+                surface=surface,
                 condition="continuity",
             )
 
 
-@dataclass(frozen=True)
-class _Switch:
-    """Where a row changes its definition, and by what.
-
-    surface: zero on the switching surface
-    differences: the row on one side minus the row on the other, for every pair of sides that may
-        meet
-    only_where_negative: the surface counts only where this expression is not positive
-    """
-
-    surface: sp.Expr
-    differences: tuple[sp.Expr, ...]
-    only_where_negative: sp.Expr | None = None
-
-
-def _switches(row: sp.Expr) -> Iterator[_Switch]:
-    one = sp.Integer(1)
-    for atom in sorted(row.atoms(sp.sign, sp.Heaviside, sp.Piecewise, sp.atan2, *_STEPS), key=str):
-        if isinstance(atom, _STEPS):
-            # jumps wherever the argument passes an integer, none between two of them
-            argument = atom.args[0] / atom.args[1] if isinstance(atom, sp.Mod) else atom.args[0]
-            yield _Switch(sp.sin(sp.pi * argument), (one,))
-        elif isinstance(atom, sp.atan2):
-            yield _Switch(atom.args[0], (one,), atom.args[1])
-        elif isinstance(atom, sp.Piecewise):
-            yield from _branches(row, atom)
-        else:
-            low = sp.Integer(-1 if isinstance(atom, sp.sign) else 0)
-            yield _Switch(atom.args[0], (row.xreplace({atom: one}) - row.xreplace({atom: low}),))
+def _jump(row: sp.Expr, box: Box) -> sp.Expr | None:
+    """Return a surface on which a row is not proved to be continuous; None where it is."""
+    for atom in sorted(row.atoms(sp.atan2, *_STEPS), key=str):
+        if isinstance(atom, sp.atan2):
+            if _meets(atom.args[0], box) and _range(atom.args[1], box)[0] <= 0.0:
+                return atom.args[0]
+            continue
+        # jumps wherever the argument passes an integer, none between two of them
+        argument = atom.args[0] / atom.args[1] if isinstance(atom, sp.Mod) else atom.args[0]
+        if _meets(sp.sin(sp.pi * argument), box):
+            return sp.sin(sp.pi * argument)
+    surfaces = {f: None for s in _arguments(row) for f in _factors(s) if _meets(f, box)}
+    return next((s for s in surfaces if not _agrees(row, s, box)), None)
 
 
-def _branches(row: sp.Expr, atom: sp.Piecewise) -> Iterator[_Switch]:
-    for k, (value, condition) in enumerate(atom.args[:-1]):
-        for relation in sorted(condition.atoms(Relational), key=str):
-            surface = relation.lhs - relation.rhs
-            across = []
-            for other, later in atom.args[k + 1 :]:
-                holds = _on_surface(later, surface)
-                if holds is not False:
-                    across.append(row.xreplace({atom: value}) - row.xreplace({atom: other}))
-                if holds is True:
-                    break
-            yield _Switch(surface, tuple(across))
+def _argument(switch: sp.Basic) -> sp.Expr:
+    """Return what changes its sign where a switch does, without denominators."""
+    given = switch.lhs - switch.rhs if isinstance(switch, Relational) else switch.args[0]
+    top, bottom = sp.fraction(sp.together(given))
+    return top * bottom
 
 
-def _on_surface(condition: sp.Basic, surface: sp.Expr) -> bool | None:
-    """Tell whether a later condition holds near a surface; None when that is open."""
-    solution = _solved(surface)
-    if condition is sp.true:
-        return True
+def _arguments(row: sp.Expr) -> list[sp.Expr]:
+    return sorted({_argument(a) for a in row.atoms(*_SWITCHES)}, key=str)
+
+
+def _factors(argument: sp.Expr) -> list[sp.Expr]:
+    try:
+        return [factor for factor, _ in sp.factor_list(argument)[1]]
+    except sp.PolynomialError:
+        return [argument]
+
+
+def _agrees(row: sp.Expr, surface: sp.Expr, box: Box) -> bool:
+    """Prove that a row has the same limits on both sides of a surface, and its value on it."""
+    solution = _solved(surface, box)
     if solution is None:
-        return None
-    for relation in condition.atoms(Relational):
-        if sp.expand((relation.lhs - relation.rhs).subs(*solution)) == 0:
-            return None
-    value = condition.subs(*solution)
-    return {sp.true: True, sp.false: False}.get(value)
+        return False
+    sides = [_moved(row, surface, solution, box, sign).subs(*solution) for sign in (1, 0, -1)]
+    return all(is_zero(sides[0] - other) for other in sides[1:])
 
 
-def _solved(surface: sp.Expr) -> tuple[sp.Symbol, sp.Expr] | None:
-    """Solve surface = 0 for a symbol that enters linearly."""
+def _moved(
+    node: sp.Basic, surface: sp.Expr, solution: tuple[sp.Symbol, sp.Expr], box: Box, sign: int
+) -> sp.Basic:
+    """Move all switches to one side of a surface, or onto it (0)."""
+    if not node.has(*_SWITCHES):
+        return node
+    node = node.func(*(_moved(a, surface, solution, box, sign) for a in node.args))
+    if not isinstance(node, _SWITCHES):
+        return node
+    others = (0,) if isinstance(node, Relational) else node.args[1:]
+    rest, order = _argument(node), 0
+    while _vanishes(rest, solution, box):
+        rest, order = _cancelled(rest / surface), order + 1
+    there = rest.subs(*solution)
+    if there.has(sp.nan, sp.zoo) or (there.has(*_CORNERS) and _meets(there, box)):
+        # it may be zero on a part of the surface: what is proved is to hold whatever it says
+        return node.func(sp.Symbol(str(node), real=True), *others)
+    return node.func(sp.Integer(sign) ** order * rest, *others) if order else node
+
+
+def _vanishes(expression: sp.Expr, solution: tuple[sp.Symbol, sp.Expr], box: Box) -> bool:
+    """Tell whether an expression is zero on a whole surface; true rather than wrong."""
+    there = expression.subs(*solution)
+    return bool(is_zero(there) if there.has(*_CORNERS) else prove_zero(there, box))
+
+
+def _cancelled(quotient: sp.Expr) -> sp.Expr:
+    try:
+        return sp.cancel(quotient)
+    except sp.PolynomialError:
+        return quotient
+
+
+def _solved(surface: sp.Expr, box: Box) -> tuple[sp.Symbol, sp.Expr] | None:
+    """Solve surface = 0 for a symbol that enters linearly, with a slope that does not vanish."""
     for symbol in sorted(surface.free_symbols, key=str):
         slope = sp.diff(surface, symbol)
-        if slope != 0 and not slope.has(symbol):
+        if not slope.has(symbol) and not _meets(slope, box):
             return symbol, sp.expand(symbol - surface / slope)
     return None
 
@@ -141,19 +157,10 @@ def _range(expression: sp.Expr, box: Box) -> tuple[float, float]:
     return float(found.lower[0]), float(found.upper[0])
 
 
-def _meets(switch: _Switch, box: Box) -> bool:
-    """Tell whether the switching surface may have a point inside the box."""
-    low, high = _range(switch.surface, box)
-    if low > 0.0 or high < 0.0:
-        return False
-    guard = switch.only_where_negative
-    return guard is None or _range(guard, box)[0] <= 0.0
-
-
-def _vanishes_on(difference: sp.Expr, surface: sp.Expr) -> bool:
-    """Prove that the difference is zero wherever the surface is."""
-    solution = _solved(surface)
-    return solution is not None and bool(is_zero(difference.subs(*solution)))
+def _meets(surface: sp.Expr, box: Box) -> bool:
+    """Tell whether a surface may have a point inside the box."""
+    low, high = _range(surface, box)
+    return low <= 0.0 <= high
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import StructureError, UnboundedError, jacobian_bounds
+from obsynth.derive.jacobian.bounds import _jump
 from obsynth.symbolic import Plant
 
 half = sp.Rational(1, 2)
@@ -18,6 +19,10 @@ def plant_with(row, limits=(-1, 1)):
     return plant
 
 
+def on(condition, value, otherwise=0):
+    return sp.Piecewise((value, condition), (otherwise, True))
+
+
 CONTINUOUS = {
     "kink": lambda x, y: sp.Abs(x) * y,
     "sign times itself": lambda x, y: x * sp.sign(x) * y,
@@ -27,6 +32,13 @@ CONTINUOUS = {
     "step inside one cell": lambda x, y: sp.floor(x / 3 + half) + y,
     "angle in the right half plane": lambda x, y: sp.atan2(y, x + 2),
     "surface outside the box": lambda x, y: sp.sign(x + 3) * y,
+    "kinks along both axes": lambda x, y: sp.sign(x * y) * x * y,
+    "two surfaces of one condition": lambda x, y: on(x**2 < y**2, y**2 - x**2),
+    "two switches on one surface": lambda x, y: on(x > 0, x) * on(x > 0, 2, 1),
+    "switches that cancel": lambda x, y: on(x > y, 1) + on(2 * y >= 2 * x, 1),
+    "two cones that share a half": lambda x, y: on(y > sp.Abs(x), y - sp.Abs(x)) + on(y > x, y - x),
+    "an even order": lambda x, y: on(x**2 * y > 0, y, on(y > 0, y)),
+    "a switch of a switch": lambda x, y: on(x + sp.sign(x - y) * (x - y) > 4, 1),
 }
 JUMPS = {
     "sign": lambda x, y: sp.sign(x) + y,
@@ -36,6 +48,18 @@ JUMPS = {
     "a gap": lambda x, y: sp.Piecewise((x, x < half), (0, x <= half), (x - half, True)),
     "floor": lambda x, y: sp.floor(x),
     "angle over the cut": lambda x, y: sp.atan2(y, x),
+    "two switches on one surface": lambda x, y: on(x > 0, 1) * on(x > 0, 2),
+    "one surface, written twice": lambda x, y: on(x > y, 1) * on(2 * y < 2 * x, 2),
+    "one surface inside another": lambda x, y: on(x * (y + 3) > 0, 1) * on(x > 0, 2),
+    "product surface": lambda x, y: sp.sign(x * y) * x,
+    "gear efficiency": lambda x, y: x * on(x * y > 0, sp.Rational(9, 10), sp.Rational(11, 10)) - y,
+    "a point that is left out": lambda x, y: sp.sign(x) ** 2 * y,
+    "a switch of a switch": lambda x, y: on(
+        x + sp.Heaviside(y, 1) > half, x**2 - (sp.Heaviside(y, 1) - half) ** 2
+    ),
+    "a pole as a switch": lambda x, y: on(1 / x > -half, 1),
+    "a line where the slope vanishes": lambda x, y: sp.sign(x * sp.Abs(y) - y**2) * (x - sp.Abs(y)),
+    "surfaces that share a half": lambda x, y: on(y > sp.Abs(x), 1) * on(y > x, 1),
 }
 
 
@@ -53,6 +77,77 @@ def test_continuous_dynamics_pass(name):
         high = np.maximum(found.min * (b - a), found.max * (b - a)).sum(axis=1)
         assert (change >= low - 1e-12).all()
         assert (change <= high + 1e-12).all()
+
+
+def random_row(rng, x, y, continuous):
+    """A product or sum of switches on few surfaces, some of them the same one."""
+    surfaces = [x, -2 * x, y, x - y, x * y, x + half, 3 * y - x, x**2 - y**2, y * (x - half)]
+    values = [sp.Integer(0), sp.Integer(1), x, y, x * y, x - y, x + y + 1]
+
+    def factor():
+        surface = surfaces[rng.integers(len(surfaces))]
+        a, b = (values[rng.integers(len(values))] for _ in range(2))
+        if continuous or rng.random() < 0.5:
+            a = b + surface * a
+        return on(surface > 0, a, b) if rng.random() < 0.7 else on(surface <= 0, b, a)
+
+    parts = [factor() for _ in range(rng.integers(1, 4))]
+    return sp.Add(*parts) if rng.random() < 0.5 else sp.Mul(*parts)
+
+
+def jump_at(row, x, y):
+    """The largest difference over 2e-9 across and onto lines on which switches lie."""
+    function = sp.lambdify((x, y), row, "numpy")
+    t = np.linspace(-0.97, 0.97, 38)
+    lines = [
+        (0 * t, t),
+        (t, 0 * t),
+        (t, t),
+        (t, -t),
+        (0 * t - 0.5, t),
+        (0 * t + 0.5, t),
+        (t, t / 3),
+    ]
+    worst = 0.0
+    for a, b in lines:
+        there = np.broadcast_to(function(a, b), t.shape)
+        for da, db in ((1e-9, 0), (-1e-9, 0), (0, 1e-9), (0, -1e-9)):
+            near = np.broadcast_to(function(a + da, b + db), t.shape)
+            worst = max(worst, float(np.abs(near - there).max()))
+    return worst
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_random_switches_against_dense_samples(seed):
+    """Whatever jumps is refused; what is continuous by construction is not.
+
+    Mutants: switches moved one by one (`_moved` returns the node where the rest is not a number),
+    no factors of a product surface and no condition on the slope, the value on the surface (0) not
+    compared, the sign without its order, inner switches not moved, denominators forgotten.
+    """
+    rng = np.random.default_rng(seed)
+    x, y = sp.symbols("x y", real=True)
+    box = {x: (-1.0, 1.0), y: (-1.0, 1.0)}
+    jumps = 0
+    for k in range(20):
+        row = random_row(rng, x, y, continuous=k % 4 == 0)
+        refused = _jump(row, box) is not None
+        if jump_at(row, x, y) > 1e-6:
+            jumps += 1
+            assert refused, row
+        elif k % 4 == 0:
+            assert not refused, row
+    assert jumps >= 5
+
+
+def test_a_signal_that_is_held_makes_two_surfaces_one():
+    """Mutant: refuse_jumps without ``held``."""
+    limits = [(-1, 1), (0, 0)]
+    kink = plant_with(lambda x, y: on(x + y > 0, x + y) * on(x > 0, 1, 2), limits)
+    assert jacobian_bounds(kink, effort="fast").max[0, 0] == 2.0
+    jump = plant_with(lambda x, y: on(x + y > 0, 1) * on(x > 0, 1), limits)
+    with pytest.raises(StructureError, match="may jump where x = 0"):
+        jacobian_bounds(jump)
 
 
 @pytest.mark.parametrize("name", sorted(JUMPS))
