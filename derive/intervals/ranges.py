@@ -137,7 +137,7 @@ def _merged(first: Outcome, second: Outcome, expressions: list[int]) -> Outcome:
         points=first.points.copy(),
         noise=np.maximum(first.noise, second.noise),
         finished=first.finished.copy(),
-        singular=first.singular | second.singular,
+        singular={},
         boxes=first.boxes + second.boxes,
         sweeps=first.sweeps + second.sweeps,
     )
@@ -146,6 +146,9 @@ def _merged(first: Outcome, second: Outcome, expressions: list[int]) -> Outcome:
     merged.attained[better] = second.attained[better]
     merged.points[better] = second.points[better]
     merged.finished[goals] = second.finished[goals]
+    for goal, where in (first.singular | second.singular).items():
+        if not np.isfinite(merged.bound[goal]):
+            merged.singular[goal] = where
     return merged
 
 

@@ -361,14 +361,18 @@ def find_dependences(
         return sorted(entries), []
     basis: list[Entry] = []
     columns: list[FloatArray] = []
+    units: list[float] = []
     dependences: list[AffineDependence] = []
     prover = _Prover(entries, known, name)
     for entry in sorted(entries, key=lambda e: _preferred(e, entries[e], known)):
-        centred = samples[entry] - samples[entry].mean()
+        # in units of the largest value: the square of exp(400) is no double, nor that of exp(-400)
+        largest = float(np.abs(samples[entry]).max(initial=0.0))
+        unit = max(largest, 1e-300)
+        centred = samples[entry] / unit
+        centred -= centred.mean()
         size = float(np.linalg.norm(centred))
-        floor = _RANK_TOLERANCE * max(float(np.abs(samples[entry]).max(initial=0.0)), 1e-300)
         proved: AffineDependence | None
-        if size <= floor * np.sqrt(len(centred)):
+        if size <= _RANK_TOLERANCE * np.sqrt(len(centred)):
             proved = prover.constant(entry)
         else:
             matrix = np.array(columns).T if columns else np.zeros((len(centred), 0))
@@ -377,13 +381,15 @@ def find_dependences(
             proved = None
             if np.linalg.norm(centred / size - matrix / scale @ weights) <= _RANK_TOLERANCE:
                 used = np.flatnonzero(np.abs(weights) > _RANK_TOLERANCE)
-                guess = {basis[k]: float(weights[k] * size / scale[k]) for k in used}
+                guess = {
+                    basis[k]: float(weights[k] * size / scale[k]) * (unit / units[k]) for k in used
+                }
                 proved = prover.combination(entry, guess)
         if proved is None:
             basis.append(entry)
             columns.append(centred if size > 0.0 else np.ones_like(centred))
+            units.append(unit)
         else:
-            largest = float(np.abs(samples[entry]).max(initial=0.0))
             dependences.append(replace(proved, size=largest))
     return sorted(basis), sorted(dependences, key=lambda d: d.entry)
 

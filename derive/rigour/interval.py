@@ -22,6 +22,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -116,6 +117,9 @@ def outward(box: FloatArray, precision: str) -> FloatArray:
 
 
 _DIGITS = 60
+_BITS = 400
+_CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan")
+_ANALYTIC = (*_CIRCULAR, *(f"{name}h" for name in _CIRCULAR), "exp", "log", "erf")
 _LARGEST = sp.Integer(int(sys.float_info.max))
 
 
@@ -137,19 +141,14 @@ def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.E
 def round_number(number: sp.Expr) -> tuple[float, float]:
     """Round an exact real number to a double, with a bound of the rounding error."""
     number = sp.sympify(number)
-    approximation = number if number.is_Rational else number.evalf(_DIGITS)
-    if not (number.is_Rational or approximation.is_Float) or not approximation.is_finite:
+    middle, radius = (number, Fraction(0)) if number.is_Rational else _decimal(number)
+    if not middle.is_Rational:
         raise DerivationError(f"{number} is not a finite real number", expression=number)
-    if abs(approximation) > _LARGEST:
+    if abs(middle) > _LARGEST:
         raise DerivationError(f"{number} is too large for a double", expression=number)
-    if number.is_Rational:
-        exact = Fraction(int(number.p), int(number.q))
-        value = float(exact)
-        return value, smallest_above(abs(exact - Fraction(value)))
-    value = float(approximation)
-    distance = abs(approximation - sp.Float(rational(value), 2 * _DIGITS))
-    margin = sp.Float(10, _DIGITS) ** (10 - _DIGITS) * abs(approximation)
-    return value, math.nextafter(float(distance + margin), math.inf)
+    exact = Fraction(int(middle.p), int(middle.q))
+    value = 0.0 if abs(exact) <= radius else float(exact)
+    return value, smallest_above(abs(exact - Fraction(value)) + radius)
 
 
 def enclose_number(number: sp.Expr) -> tuple[float, float]:
@@ -157,7 +156,56 @@ def enclose_number(number: sp.Expr) -> tuple[float, float]:
     value, error = round_number(number)
     if error == 0.0:
         return value, value
-    return math.nextafter(value, -math.inf), math.nextafter(value, math.inf)
+    lo, hi = math.nextafter(value, -math.inf), math.nextafter(value, math.inf)
+    return min(lo, float(down(value - error))), max(hi, float(up(value + error)))
+
+
+def _decimal(number: sp.Expr) -> tuple[sp.Expr, Fraction]:
+    """Return a rational near a real number and a bound of their distance; nan where it is none.
+
+    SymPy's `evalf` gives up on an exact zero after some digits, with a number that is not zero.
+    """
+    import flint
+
+    if number.is_number:
+        with flint.ctx.workprec(_BITS):
+            ball = _ball(number)
+            if ball.is_finite():
+                middle, radius = (_dyadic(part) for part in (ball.mid(), ball.rad().upper()))
+                return sp.Rational(middle.numerator, middle.denominator), radius
+    approximation = number.evalf(_DIGITS)
+    if not approximation.is_Float or approximation._prec < 3 * _DIGITS:
+        return sp.nan, Fraction(0)
+    middle = sp.Rational(approximation)
+    return middle, abs(Fraction(int(middle.p), int(middle.q))) * Fraction(10) ** (10 - _DIGITS)
+
+
+def _dyadic(number: Any) -> Fraction:
+    mantissa, exponent = number.man_exp()
+    return Fraction(int(mantissa)) * Fraction(2) ** int(exponent)
+
+
+def _ball(number: sp.Expr) -> Any:
+    """Enclose a real number of SymPy by a ball; not finite where that fails."""
+    import flint
+
+    if number.is_Rational or number.is_Float:
+        exact = sp.Rational(number)
+        return flint.arb(flint.fmpq(int(exact.p), int(exact.q)))
+    if number in (sp.pi, sp.E):
+        return flint.arb.pi() if number == sp.pi else flint.arb.const_e()
+    parts = [_ball(part) for part in number.args]
+    if number.is_Add:
+        return sum(parts, flint.arb(0))
+    if number.is_Mul:
+        return math.prod(parts, start=flint.arb(1))
+    if number.is_Pow:
+        twice = 2 * number.exp
+        if twice.is_Integer:
+            return parts[0] ** int(number.exp) if twice % 2 == 0 else parts[0].sqrt() ** int(twice)
+        return parts[0] ** parts[1]
+    name = number.func.__name__
+    return getattr(parts[0], name)() if name in _ANALYTIC else flint.arb.nan()
 
 
 Interval = tuple[FloatArray, FloatArray]

@@ -383,13 +383,20 @@ class Search:
         bound[list(self.singular)] = np.inf
         finished = np.ones(len(bound), dtype=bool)
         finished[rows.goal] = False
+        singular = dict(self.singular)
+        for goal in np.flatnonzero(~np.isfinite(bound)).tolist():
+            index = np.flatnonzero((rows.goal == goal) & ~np.isfinite(rows.bound))
+            if len(index) and goal not in singular:
+                size = ((rows.upper - rows.lower) / self.root_width[:, None])[:, index].max(axis=0)
+                k = index[np.argmin(size)]
+                singular[goal] = (rows.lower[:, k], rows.upper[:, k])
         return Outcome(
             bound,
             self.best.copy(),
             self.points.copy(),
             self.noise.copy(),
             finished,
-            dict(self.singular),
+            singular,
             self.boxes,
             self.sweeps,
         )

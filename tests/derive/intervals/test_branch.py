@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.program import evaluate
+from obsynth.derive.intervals.ranges import Status, bound_ranges, make_problem, staged
 from obsynth.derive.intervals.search import batch, branch
 
 X = ca.SX.sym("x", 3)
@@ -102,6 +103,39 @@ def test_random_expressions_stay_inside_and_reach_what_is_attained(exactly, expr
 @given(expression=expressions(depth=5), box=boxes())
 def test_many_random_expressions(exactly, expression, box):
     assert not wrong_bounds(exactly, expression, box)
+
+
+@QUICK
+@given(expression=expressions(), box=boxes(), work=st.integers(1, 60))
+def test_an_infinite_end_is_a_failure_with_its_box_whatever_the_budget(expression, box, work):
+    """And a finite one is none.
+
+    Mutants: `Search.outcome` copies ``self.singular`` only; `_merged` keeps what was singular
+    before a later search found a bound.
+    """
+    problem = make_problem(
+        ca.vertcat(expression, X[0] / (1 + (X[1] - X[2]) * (X[1] - X[2]))), X, box
+    )
+    outcome = staged(problem, 1e-3, branch.Budget(boxes=20 * work, sweeps=work))
+    endless = np.flatnonzero(~np.isfinite(outcome.bound)).tolist()
+    assert sorted(outcome.singular) == endless
+    for goal, (low, high) in outcome.singular.items():
+        assert (box[:, 0] <= low).all()
+        assert (low <= high).all()
+        assert (high <= box[:, 1]).all()
+        enclosed = evaluate(problem.program, low[:, None], high[:, None], [goal // 2])
+        assert not np.isfinite(enclosed[goal % 2]).all()
+
+
+def test_what_a_longer_search_bounds_is_no_failure():
+    """The denominator is positive, which the first boxes, without a bound, do not show."""
+    a, b, c = X[0] - X[1], X[1] - X[2], X[2] - X[0]
+    quotient = 1 / (2 + a * a + b * b + c * c + a * b + b * c)
+    problem = make_problem(quotient, X, UNIT)
+    assert branch.maximise(problem, 1e-2, branch.Budget(20, 1)).singular
+    found = bound_ranges(quotient, X, UNIT, rtol=1e-2)
+    assert np.isfinite(found.upper[0])
+    assert not found.failures
 
 
 MONOTONE = ca.vertcat(

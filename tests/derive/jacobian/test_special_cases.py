@@ -73,6 +73,31 @@ def test_pole_on_an_interior_diagonal():
     assert "df/dx[1,1]" in str(told.value)
 
 
+@pytest.mark.parametrize("effort", ["fast", "normal"])
+def test_an_infinite_end_is_refused_with_entry_and_box(effort):
+    """Near v = 0 the slopes have no bound, whether or not the budget reaches a tiny box there."""
+    plant = Plant("angle")
+    a, b, v, c = plant.states("a b v c", range=[(-0.1, 0.1), (-0.6, 0.6), (0, 40), (-0.1, 0.1)])
+    plant.dynamics([sp.atan(a + b / v - c) / v, -b, -v, -c])
+    plant.outputs([a])
+    with pytest.raises(UnboundedError, match="Keep the range of") as told:
+        jacobian_bounds(plant, effort=effort)
+    assert told.value.entries == ("df/dx[1,1]", "df/dx[1,2]", "df/dx[1,3]", "df/dx[1,4]")
+    for box in told.value.sub_boxes.values():
+        assert box["v"][0] == 0.0
+
+
+@pytest.mark.parametrize("top", [300, 709, 709.78])
+def test_slopes_whose_squares_are_no_doubles(top):
+    """Mutant: samples of dependences that are not in units of their largest value."""
+    plant = plant_with(lambda x, y: sp.exp(x), [(0, top), (-1, 1)], lambda x, y: sp.exp(x) / 2 - y)
+    found = jacobian_bounds(plant, effort="fast")
+    assert found.min[0, 0] <= 1.0
+    assert sp.Float(float(found.max[0, 0]), 30) >= sp.exp(sp.Rational(top)).evalf(30)
+    assert found.max[0, 0] == pytest.approx(np.exp(top), rel=1e-12)
+    assert str(found.dependences[0]).startswith("m21 = 0.5 m11")
+
+
 def test_no_pole_where_the_diagonal_is_left_out():
     low, high = slope(lambda x, y: 1 / (x - y), limits=[(1, 2), (-1, 0.5)])
     assert (low, high) == pytest.approx((-4.0, -1 / 9), rel=1e-6)

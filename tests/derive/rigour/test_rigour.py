@@ -302,6 +302,37 @@ def test_the_bound_of_the_rounding_is_half_a_unit(number):
     assert (lo == hi) == (number.is_Rational and rational(float(number)) == number)
 
 
+ZERO = sp.sqrt(5 + 2 * sp.sqrt(6)) - sp.sqrt(2) - sp.sqrt(3)
+
+
+@pytest.mark.parametrize(
+    "zero",
+    [ZERO, -3 * ZERO, ZERO**2, sp.sqrt(1 + ZERO) - 1, sp.exp(ZERO) - 1 + ZERO],
+    ids=["difference", "multiple", "square", "root", "exponential"],
+)
+def test_an_exact_zero_that_sympy_does_not_see_is_enclosed(zero):
+    """And a number next to it is.
+
+    Mutants: `_decimal` by evalf alone (-9e-190 without 0); the radius left out of the error.
+    """
+    for number, near in ((zero, 0.0), (zero + sp.Rational(1, 10**200), 1e-200), (zero + 1, 1.0)):
+        lo, hi = enclose_number(number)
+        assert lo <= near <= hi
+        assert hi - lo <= 1e-100 + 1e-15 * near
+        value, error = round_number(number)
+        assert abs(value - near) <= error + 1e-300
+
+
+@pytest.mark.parametrize("function", sorted(interval._ANALYTIC))
+def test_functions_of_numbers_agree_with_sympy(function):
+    """Balls of Arb against SymPy's own evaluation. Mutant: any name that means something else."""
+    at = sp.Rational(7, 3) if function == "acosh" else sp.Rational(3, 7)
+    number = getattr(sp, function)(at)
+    middle, radius = interval._decimal(number)
+    assert abs(middle.evalf(60) - number.evalf(60)) <= sp.Float("1e-58")
+    assert 0 < radius < 1e-100
+
+
 def test_a_rounding_whose_error_is_not_told_is_caught(monkeypatch):
     from obsynth.derive.rigour import interval as module
 
