@@ -17,7 +17,7 @@ from obsynth.derive.constants.majorant_parts import (
     row_majorant,
     scaled,
 )
-from obsynth.derive.errors import DerivationError
+from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.bounds import refuse_jumps
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
@@ -193,6 +193,8 @@ def majorant(
     sizes = np.zeros((n, n))
     for k, place in enumerate(entries.places):
         sizes[place] = max(abs(ranges.lower[k]), abs(ranges.upper[k]))
+    # an entry that is zero all over the box, as that of a saturated term, weighs nothing
+    entries = entries.take([k for k, place in enumerate(entries.places) if sizes[place] > 0.0])
     if shape == "scalar":
         return _scalar(split, entries, sizes, rounding, rtol, effort)
     shared = (sizes > 0.0).sum(axis=0)
@@ -220,6 +222,13 @@ def majorant(
         groups.append((members, columns, largest))
     for j, value in given.items():
         diagonal[j] = value
+    if not np.isfinite(diagonal).all():
+        endless = tuple(n for n, d in zip(names, diagonal, strict=True) if not np.isfinite(d))
+        raise UnboundedError(
+            f"the majorant has no finite element for {', '.join(endless)}: the square of a slope "
+            "is too large for a double; scale the states",
+            entries=endless,
+        )
     return Majorant(diagonal, tuple(rows), tuple(groups), rounding, split)
 
 

@@ -9,7 +9,7 @@ import sympy as sp
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.matrix_maximum import EntryRanges, matrix_maximum
-from obsynth.derive.errors import DerivationError
+from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.derive.rigour import rational, up
@@ -78,6 +78,18 @@ def largest_value(
         rtol=rtol,
         effort=effort,
     )
+    for failure in found.failures:
+        rows = tuple(sorted({entries.model.names("x")[i] for i, _ in entries.places}))
+        raise UnboundedError(
+            f"no finite bound for the {method} of the row of {', '.join(rows)} "
+            f"({failure.operation}); scale the states, or keep their ranges smaller",
+            entries=rows,
+            operation=failure.operation,
+            sub_box={
+                name: (float(failure.lower[k]), float(failure.upper[k]))
+                for k, name in enumerate(entries.names)
+            },
+        )
     return Maximum(
         float(found.upper[0]),
         float(found.attained_upper[0]),
@@ -119,13 +131,16 @@ def row_majorant(
             )
         if not free:
             return RowMajorant(row, diagonal, sizes, share)
-    direction = {j: sizes[j] * float(sizes[free].sum()) for j in free}
-    wanted = sum((values[j] ** 2 / direction[j] for j in free), ca.SX(0))
+    # in units of the largest entry, a power of two: squares neither overflow nor vanish
+    unit = 2.0 ** (int(np.frexp(sizes[free].max())[1]) - 1)
+    parts = np.maximum(sizes / unit, 2.0**-200)
+    direction = {j: float(parts[j]) * float(parts[free].sum()) for j in free}
+    wanted = sum(((values[j] / unit) ** 2 / direction[j] for j in free), ca.SX(0))
     if fixed:
         wanted = wanted / (1 - taken)
     found = largest_value(wanted, chosen, rtol, effort, "range of sum_j a_j^2 / d_j")
     for j in free:
-        diagonal[j] = up(found.upper * direction[j] * UP)
+        diagonal[j] = up(found.upper * direction[j] * UP * unit * unit)
     # with S the free part and B the fixed one, S / (1 - B) = t at the point of the largest value
     # gives S / t + B = 1 for t itself, and at least attained / t for what is attained
     return RowMajorant(row, diagonal, sizes, scaled(found, 1.0 / (found.upper * UP)))

@@ -9,7 +9,7 @@ import sympy as sp
 
 from obsynth.derive import Status, split
 from obsynth.derive.constants.majorant import majorant
-from obsynth.derive.errors import DerivationError
+from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.symbolic import Plant, plants
 
 
@@ -219,3 +219,50 @@ def test_majorant_can_be_read():
     assert "diag(0, 0.51663779, 0.1089)" in str(found)
     assert "x2 = " in str(found)
     assert "<table>" in found._repr_html_()
+
+
+# -- entries that vanish all over the box, slopes of any size --------------------------------------
+
+SATURATED = "min(1/2, max(-1/2, x))"
+
+
+def two_states(rows):
+    plant = Plant("two")
+    x, y = plant.states("x y", range=[(1, 2), (-1, 1)])
+    plant.dynamics(rows)
+    plant.outputs([x])
+    return split(plant, linear="terms", at=((1, 0), ()))
+
+
+@pytest.mark.parametrize("options", [{}, {"shape": "scalar"}, {"fixed": {"y": 20.0}}])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        (f"{SATURATED} + y**2", "-y"),
+        (f"{SATURATED} + y**2", "x*y"),
+        (f"{SATURATED} + y**2", f"{SATURATED} + y**3"),
+        (f"{SATURATED} + 1e-200*y**2", "-y"),
+    ],
+    ids=["alone", "shared column", "two rows", "tiny"],
+)
+def test_an_entry_that_is_zero_all_over_the_box_weighs_nothing(rows, options):
+    """The saturation never moves for x in [1, 2].
+
+    Mutants: majorant without ``entries.take``; row_majorant without ``unit``.
+    """
+    parts = two_states(rows)
+    found = majorant(parts, **options)
+    assert np.isfinite(found.diagonal).all()
+    J = jacobians(parts)
+    assert np.linalg.eigvalsh(J.transpose(0, 2, 1) @ J - found.matrix).max() <= 1e-12
+    if not options:
+        assert (found.diagonal[0] == 0.0) == ("x*y" not in rows[1])
+        tight = 4.0e-400 if "1e-200" in rows[0] else 4.0
+        assert found.diagonal[1] >= tight
+        assert found.diagonal[1] <= (1e-300 if tight < 1.0 else 14.0)
+
+
+def test_a_majorant_that_is_no_double_is_refused():
+    """Mutant: majorant without the look at its own diagonal."""
+    with pytest.raises(UnboundedError, match="no finite element for y"):
+        majorant(two_states(("1e170*y**2", "-y")))
