@@ -20,6 +20,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 _ITERATIONS = 40
 _SHIFT = 1e-12
+_LEAST = 1e-9
 # Rounds gains down to a grid: a smaller entry only raises the off-diagonal entries of A - L C.
 _GRID = 2.0**40
 
@@ -54,7 +55,8 @@ def design_gain(
     guess = -bound
     for _ in range(_ITERATIONS):
         p, W = _feasible(A_lower, A_upper, C, cap, guess)
-        gain = analyse_gain(A_lower, A_upper, C, _make_metzler(W / p[:, None], A_lower, C))
+        L = np.clip(W / p[:, None], -cap, cap)
+        gain = analyse_gain(A_lower, A_upper, C, _make_metzler(L, A_lower, C))
         if best is None or gain.alpha > alpha:
             step, alpha, best = gain.alpha - alpha, gain.alpha, gain
             if step <= _SHIFT * bound:
@@ -170,12 +172,13 @@ def _feasible(
     total[0, :n] = 1.0
     objective = np.zeros(size)
     objective[-1] = -1.0
-    bounds = [(1e-9, None)] * n + [(None, None)] * (n * m) + [(None, None)]
+    bounds = [(_LEAST, None)] * n + [(None, None)] * (n * m) + [(None, None)]
     found = linprog(objective, np.array(rows), limits, total, [1.0], bounds, method="highs-ds")
     if found.x is None:
         raise SolverTrouble(f"the gain program was not solved: {found.message}")
     x = np.asarray(found.x)
-    return x[:n], x[n:-1].reshape(n, m)
+    # the solver keeps to bounds within a tolerance that is larger than this one
+    return np.maximum(x[:n], _LEAST), x[n:-1].reshape(n, m)
 
 
 def _make_metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArray:

@@ -88,3 +88,36 @@ def test_intervals_of_faults_shrink(robust):
     wrong, width = follow(observer, plant, n, 4, steps=200)
     assert wrong == 0
     assert (width < 0.199).all()
+
+
+def coupled(A, measured):
+    """x' = A x + u + G f, with some states measured."""
+    made = ob.Plant("coupled")
+    x = made.states("x0 x1 x2", range=(0, 5))
+    (u,), (f,) = made.inputs("u", range=(0, 1)), made.process_faults("f", range=(0, 0.1))
+    rows = [sum(float(a) * s for a, s in zip(row, x, strict=True)) + u for row in A]
+    made.dynamics([rows[0], rows[1], rows[2] + f / 2])
+    made.outputs([x[i] for i in measured])
+    return made
+
+
+@pytest.mark.parametrize(
+    ("A", "measured", "word"),
+    [
+        ([[-1.5, 0, 1], [1, -1, 0], [0.5, 0, 1]], (2, 0, 1), None),
+        ([[1, 0, 0.5], [0.5, 0.499, 0], [1, 1, -3]], (2, 0, 1), None),
+        ([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], (0, 2), "no gain makes"),
+        ([[-1, 0, 0], [0, 0, 0], [0, 0, -1]], (0, 2), "no gain makes"),
+    ],
+)
+def test_unstable_and_decoupled_states_are_designed_or_refused(A, measured, word):
+    """The solver returns p = 0 where it keeps p >= 1e-9 within its tolerance.
+
+    Mutant: that p, by which W is divided.
+    """
+    if word is None:
+        assert SetAdaptiveObserver().design(coupled(A, measured)).certificate.check().valid
+    else:
+        with pytest.raises(ob.InfeasibleDesign, match=word) as refusal:
+            SetAdaptiveObserver().design(coupled(A, measured))
+        assert "x1" in str(refusal.value)
