@@ -198,17 +198,32 @@ def majorant(
     if shape == "scalar":
         return _scalar(split, entries, sizes, rounding, rtol, effort)
     shared = (sizes > 0.0).sum(axis=0)
+    groups_of = connected_groups(sizes)
+    # what is given for all states of several rows is held against these together
+    whole = {i for m, columns in groups_of if len(m) > 1 and set(columns) <= set(given) for i in m}
     rows = []
     for i in np.flatnonzero(sizes.any(axis=1)).tolist():
-        part = {j: d / shared[j] for j, d in given.items() if sizes[i, j] > 0.0}
+        part = {j: d / shared[j] for j, d in given.items() if sizes[i, j] > 0.0 and i not in whole}
         rows.append(row_majorant(entries, sizes[i], i, part, names, rtol, effort))
     diagonal = np.zeros(n)
     groups = []
-    for members, columns in connected_groups(sizes):
+    for members, columns in groups_of:
         inside = [part for part in rows if part.row in members]
         total = np.sum([part.diagonal for part in inside], axis=0)
         if len(inside) == 1:
             largest = inside[0].largest
+        elif whole.issuperset(members):
+            total = np.array([given.get(j, 0.0) if j in columns else 0.0 for j in range(n)])
+            largest = largest_together(entries, sizes, members, total, rtol, effort)
+            if largest.upper > 1.0:
+                listed = ", ".join(f"{names[j]}: {given[j]:.6g}" for j in columns)
+                raise DerivationError(
+                    f"the fixed elements ({listed}) are too small for the rows of "
+                    f"{', '.join(names[i] for i in members)}: the largest eigenvalue of "
+                    f"D^-1/2 J'J D^-1/2 reaches {largest.attained:.6g}; multiply them by more",
+                    symbols=tuple(names[j] for j in columns),
+                    factor=largest.upper,
+                )
         else:
             largest = largest_together(entries, sizes, members, total, rtol, effort)
             free = [j for j in columns if j not in given]

@@ -266,3 +266,27 @@ def test_a_majorant_that_is_no_double_is_refused():
     """Mutant: majorant without the look at its own diagonal."""
     with pytest.raises(UnboundedError, match="no finite element for y"):
         majorant(two_states(("1e170*y**2", "-y")))
+
+
+def rows_that_share():
+    plant = Plant("rows that share a state")
+    x, z = plant.states("x z", range=(-1, 1))
+    plant.dynamics([x / 2 + sp.sin(3 * x) / 10, sp.sin(4 * x) / 10 + sp.sin(2 * z) / 10], Ts=1)
+    plant.outputs([x])
+    return split(plant, at=(np.zeros(2), np.zeros(0)), linear="terms")
+
+
+def test_a_diagonal_for_rows_that_share_states_is_held_against_them_together():
+    """gamma^2 I of a Lipschitz constant is a majorant, also where no row may have an equal share.
+
+    Mutants: shares of the rows alone (refuses .282); a sum of rows that is not looked at.
+    """
+    parts = rows_that_share()
+    # at x = z = 0 the Jacobian is [.3, 0; .4, .2]
+    gamma2 = float(np.linalg.svd(np.array([[0.3, 0.0], [0.4, 0.2]]))[1][0] ** 2)
+    enough = {"x": gamma2 * (1 + 1e-5), "z": gamma2 * (1 + 1e-5)}
+    found = majorant(parts, fixed=enough)
+    assert found.diagonal.tolist() == list(enough.values())
+    with pytest.raises(DerivationError, match="are too small for the rows of x, z") as refusal:
+        majorant(parts, fixed={"x": 0.99 * gamma2, "z": 0.99 * gamma2})
+    assert refusal.value.factor == pytest.approx(1 / 0.99, rel=1e-4)
