@@ -247,14 +247,14 @@ class Start:
     """What `Observer.memory0` is given, checked.
 
     guess (n,)
-    x_range, f_range (n, 2), (n_f, 2): where they are given
+    x_range, f_range (n, 2), (n_f, 2), y0 (m,): where they are given; a reading may be missing
     """
 
     plant: Plant
     guess: FloatArray
     x_range: FloatArray | None
     f_range: FloatArray | None
-    y0: Any = None
+    y0: FloatArray | None = None
 
     @classmethod
     def read(
@@ -272,7 +272,7 @@ class Start:
             read_vector(guess, "guess", x),
             None if x_range is None else read_box(x_range, "x_range", x),
             None if f_range is None else read_box(f_range, "f_range", f),
-            y0,
+            None if y0 is None else read_vector(y0, "y0", plant.output_names, finite=False),
         )
 
     @property
@@ -293,12 +293,14 @@ class Start:
         return np.zeros((len(self.plant.f), 2)) if self.f_range is None else self.f_range
 
 
-def read_vector(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
-    """Return one finite number for each name."""
+def read_vector(value: Any, what: str, names: tuple[str, ...], finite: bool = True) -> FloatArray:
+    """Return one number for each name, finite unless said otherwise."""
     array = _numbers(value)
-    if array is None or array.shape != (len(names),) or not np.isfinite(array).all():
+    fits = array is not None and array.shape == (len(names),)
+    if array is None or not fits or (finite and not np.isfinite(array).all()):
+        word = "finite numbers" if finite else "numbers"
         raise ObsynthError(
-            f"{what} has to be {len(names)} finite numbers ({', '.join(names)}); got {value!r}",
+            f"{what} has to be {len(names)} {word} ({', '.join(names)}); got {value!r}",
             option=what,
         )
     return array

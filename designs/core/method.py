@@ -7,6 +7,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
+from inspect import signature
 from typing import Any, ClassVar, Generic, TypeVar
 
 import casadi as ca
@@ -126,6 +127,12 @@ class Contract(Generic[D]):
         **options: Any,
     ) -> FloatArray:
         """Return the memory for the first call of the step, see `Observer.memory0`."""
+        known = [*signature(self.first).parameters][2:]
+        for option in set(options) - set(known):
+            more = ", ".join(("guess, x_range, f_range, y0", *known))
+            raise ObsynthError(
+                f"memory0 of {self.name} takes {more}; it knows no {option!r}", option=option
+            )
         given = Start.read(design.plant, guess, x_range, f_range, y0)
         return fill(self.layout(design), self.first(design, given, **options))
 

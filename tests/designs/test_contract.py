@@ -286,6 +286,28 @@ def test_zeros_are_a_memory_that_nobody_initialised(observer):
     assert not int(begun["status"][0]) & 1
 
 
+@pytest.mark.parametrize("word", ["guess", "x_range", "f_range", "y0"])
+def test_what_starts_it_is_checked_by_its_name(observer, word):
+    """Mutant: y0 passed on as it is given."""
+    model = observer.model
+    box, n_f, m = model.box("x"), len(model.f), len(model.output_names)
+    x_box = np.where(np.isfinite(box), box, [-1.0, 1.0])
+    fits = {"guess": guess(observer), "x_range": x_box, "f_range": [[0, 0]] * n_f, "y0": [0.0] * m}
+    observer.memory0(guess(observer), y0=[np.nan] * m)
+    array = np.asarray(fits[word], dtype=float)
+    wrong = [[*array, *array, [0.0, 1.0] if array.ndim == 2 else 0.0], "text", 1j, {}, [[[1.0]]]]
+    if array.size:
+        wrong += [array.astype(str), array.astype(complex), array.astype(bool)]
+    if array.size and word != "y0":
+        wrong += [array + np.nan, array + np.inf]
+    for value in wrong:
+        with pytest.raises(ob.ObsynthError, match=f"^{word} has to be ") as refusal:
+            observer.memory0(**{**fits, word: value})
+        assert refusal.value.option == word
+    with pytest.raises(ob.ObsynthError, match=r"guess, x_range, f_range, y0.* no 'x_rang'"):
+        observer.memory0(guess(observer), x_rang=x_box)
+
+
 def test_a_missing_measurement_is_told_and_survived(observer):
     given = held(observer)
     memory = observer.memory0(guess(observer), y0=given[1])
