@@ -149,8 +149,10 @@ STRANGE = {
     ),
     "NaN": replaced("luenberger", '"b": [', '"b": [NaN,'),
     "an infinity": replaced("luenberger", '"b": [', '"b": [-Infinity,'),
-    "numbers as text": changed("luenberger", "b", to=["1.0", "2.0"]),
-    "truth for a number": changed("luenberger", "b", to=[True, True]),
+    "numbers as text": changed(
+        "luenberger", "b", to=lambda record: [str(value) for value in record["b"]]
+    ),
+    "truth for a number": changed("luenberger", "model", "C", to=[[False, True]]),
     "a version twice": replaced("luenberger", '"version"', '"version": 2, "version"'),
     "a gain twice": replaced("luenberger", '"L"', '"L": [[9.0], [9.0]], "L"'),
     "version true": changed("luenberger", "version", to=True),

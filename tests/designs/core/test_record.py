@@ -108,6 +108,8 @@ def test_what_is_read_is_what_was_written():
         ("which", [0.5], "which of the stored design has to hold whole numbers"),
         ("none", [1.0], "none has shape"),
         ("thirds", [["1/3", "x"]], "cannot be read"),
+        ("thirds", [["1/3", "1e9"]], "'1e9' is no rational number"),
+        ("thirds", [["1/3", 0.5]], "'0.5' is no rational number"),
         ("shape", {"kind": "flat"}, "shape of the stored design is of kind 'flat'"),
         ("shape", {"kind": "boxed", "sides": [-1.0]}, "are negative"),
         ("word", "three", "word is 'three' in the stored design; it has to be one of"),
