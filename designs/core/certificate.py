@@ -52,10 +52,11 @@ class Claim:
         return {**asdict(self), "margin": self.margin if isfinite(self.margin) else None}
 
     def is_told_by(self, entry: Any) -> bool:
-        """Whether a file lists this claim; margins may differ by what other processors round."""
+        """Whether a file lists this claim; what other processors round is not compared."""
         mine = self.to_record()
-        margin, told = mine.pop("margin"), entry.get("margin")
-        same = {**entry, "margin": None} == {**mine, "margin": None}
+        margin, told = mine["margin"], entry.get("margin")
+        told_too = set(entry) == set(mine) and isinstance(entry["proof"], str)
+        same = told_too and all(entry[key] == mine[key] for key in ("name", "statement", "holds"))
         if margin is None or type(told) is not float:
             return same and type(told) is type(margin) and told == margin
         return same and isclose(told, margin, rel_tol=1e-2, abs_tol=1e-12)

@@ -13,10 +13,15 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
 )
 from obsynth.designs.bounded_error.model import UioModel
-from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound, prove_peak
+from obsynth.designs.bounded_error.peak.bound import (
+    PeakBound,
+    peak_bound,
+    prove_peak,
+    small_gain_solution,
+)
 from obsynth.designs.bounded_error.peak.gain import peak_gain
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
-from obsynth.designs.bounded_error.peak.transient import transient
+from obsynth.designs.bounded_error.peak.transient import decaying, transient
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
@@ -150,7 +155,8 @@ def _prove_decay(design: UioDesign, bound: PeakData) -> Claim:
     """Prove that the step may forget the first error as fast as the stored decay says."""
     proof = "powers of the error system divided by those of the decay, rounded up"
     try:
-        transient(stored_bound(design), _widest_start(design), decay=bound.decay)
+        gain = decaying(_system(design), bound.decay)[2]
+        small_gain_solution(gain, np.ones(len(gain)))
     except InfeasibleDesign as error:
         proof = str(error)
         holds = False

@@ -29,7 +29,7 @@ from obsynth.designs.bounded_error.peak.bound import (
     small_gain_solution,
     spectral_radius,
 )
-from obsynth.designs.bounded_error.peak.responses import Response, power_sum, response
+from obsynth.designs.bounded_error.peak.responses import PowerSum, Response, power_sum, response
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.symbolic.arrays import FloatArray
@@ -160,15 +160,17 @@ def _beta(system: PeakSystem, start: FloatArray, steps: int) -> FloatArray:
     return beta
 
 
-def _tail(system: PeakSystem, start: FloatArray, beta: FloatArray, decay: float) -> FloatArray:
-    """Return c, rounded up."""
-    # the tail may begin anywhere: early enough for decay^k to stay a normal number
-    steps = int(min(len(beta), max(2.0, 400.0 / -np.log(decay))))
+def decaying(system: PeakSystem, decay: float) -> tuple[PowerSum, Response, FloatArray]:
+    """Return powers and responses of the system divided by powers of a decay, and their gain.
+
+    InfeasibleDesign where the small-gain condition does not hold for the decay.
+    """
+    if not 0.0 < decay < 1.0:
+        raise InfeasibleDesign(f"peak bounds: a decay of {decay:.6g} is none below 1")
     mid = system.A0.mid / decay
     rad = raised((system.A0.rad + 2.0 * UNIT_ROUNDOFF * np.abs(system.A0.mid)) / decay, 4)
     powers = power_sum(Enclosure(mid, rad))
     B, coupling = channel_inputs(system)
-    n_i = len(coupling)
     forced = response(powers, system.outputs, B)
     gain = raised(product_up(forced.total, coupling) / decay, 1)
     rho = spectral_radius(gain)
@@ -179,6 +181,16 @@ def _tail(system: PeakSystem, start: FloatArray, beta: FloatArray, decay: float)
             ["choose a slower decay"],
             rho=rho,
         )
+    return powers, forced, gain
+
+
+def _tail(system: PeakSystem, start: FloatArray, beta: FloatArray, decay: float) -> FloatArray:
+    """Return c, rounded up."""
+    # the tail may begin anywhere: early enough for decay^k to stay a normal number
+    steps = int(min(len(beta), max(2.0, 400.0 / -np.log(decay))))
+    powers, forced, gain = decaying(system, decay)
+    coupling = channel_inputs(system)[1]
+    n_i = len(coupling)
     below = lowered(np.cumprod(np.concatenate([[1.0], np.full(steps - 1, decay)])), steps)
     scaled = raised(beta[:steps] / below[:, None], 1)
     inputs = product_up(scaled, np.ascontiguousarray(coupling.T))
