@@ -266,7 +266,7 @@ def first(**changes):
         first(holds=False),
         first(margin=1e6),
         first(margin=None),
-        first(proof="believed"),
+        first(proof=["believed"]),
         first(more="and more"),
         lambda claims: [*claims, claims[0]],
         lambda claims: [*claims, {**claims[-1], "name": "safe"}],
