@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive import Split
 from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
 from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error.lmis import (
@@ -17,13 +16,18 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
     lift,
 )
-from obsynth.designs.bounded_error.model import Derived, noise_box, rounding_allowance
+from obsynth.designs.bounded_error.model import (
+    Derived,
+    lost_by_rounding,
+    noise_box,
+    rounding_allowance,
+)
 from obsynth.designs.bounded_error.peak.design import prove_peak_claims
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
 from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
+from obsynth.designs.core.signals import LARGEST_SIGNAL
 from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
@@ -209,7 +213,8 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
     parts, family = fresh.split, fresh.bounds.family
     names = ("A", "B", "B_f", "C", "D", "W1", "W2")
     same = all(np.array_equal(getattr(design, name), getattr(parts, name)) for name in names)
-    lost = _rounding_of_matrices(design, parts)
+    gain = float(np.abs(design.gain).sum(axis=1).max(initial=0.0))
+    lost = lost_by_rounding(parts, design.E, gain)
     allowed = float(design.rounding.min(initial=np.inf))
     yield Claim(
         "model",
@@ -235,24 +240,6 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
         else -np.inf,
         "interval branch and bound with outward rounding; dependences proved symbolically",
     )
-
-
-def _rounding_of_matrices(design: UioDesign, parts: Split) -> float:
-    """Bound of the error that rounded D, B_f, W1, C, W2 cause in one step of the error."""
-    rounding = parts.proof.rounding
-    largest = {}
-    for kind, names in (("x", ("C",)), ("d", ("D",)), ("f", ("B_f",)), ("w", ("W1", "W2"))):
-        box = np.abs(finite_box(design.plant, kind)).max(axis=1, initial=0.0)
-        for name in names:
-            largest[name] = float((rounding[name] @ box).max(initial=0.0))
-    gain = float(np.abs(design.gain).sum(axis=1).max(initial=0.0))
-    into_output = largest["C"] + largest["W2"]
-    state = (1.0 + np.abs(design.E).sum(axis=1).max(initial=0.0)) * (
-        largest["D"] + largest["B_f"] + largest["W1"]
-    )
-    through_E = float(np.abs(design.E).sum(axis=1).max(initial=0.0)) * into_output
-    size = float(np.abs(design.A).sum(axis=1).max(initial=1.0))
-    return float(state + (gain + size) * into_output + through_E)
 
 
 def numbers(design: UioDesign) -> Numbers:

@@ -228,7 +228,7 @@ SATURATED = "min(1/2, max(-1/2, x))"
 
 def two_states(rows):
     plant = Plant("two")
-    x, y = plant.states("x y", range=[(1, 2), (-1, 1)])
+    x, _ = plant.states("x y", range=[(1, 2), (-1, 1)])
     plant.dynamics(rows)
     plant.outputs([x])
     return split(plant, linear="terms", at=((1, 0), ()))

@@ -1,6 +1,7 @@
 """What guards the guarantee of the bounded-error observer, each with a mutant that it catches."""
 
 from dataclasses import replace
+from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -328,3 +329,22 @@ def test_the_recursion_of_the_ellipsoid_counts_the_rounding_of_a_step(design):
     for V in np.linspace(0.0, 3.0, 61):
         moved = (np.sqrt((1 - gamma) * V + gamma) + rho) ** 2
         assert np.all(bound.decay * V + bound.offset >= moved)
+
+
+@pytest.mark.parametrize("options", [{"bounds": "peak"}, {"gamma": 0.05}])
+def test_a_fault_without_a_range_may_have_a_coefficient_that_is_no_double(options):
+    """1/3 rounds, times a fault of 1e6: more than the allowance of the states, so it is added.
+
+    Mutant: the allowance of the states alone, which ends in an unproved claim.
+    """
+    plant = ob.Plant("a third of a fault")
+    x, z = plant.states("x z", range=(-5, 5))
+    (f,) = plant.faults("f", rate=0.01)
+    (w,) = plant.disturbances("w", bound=0.1)
+    plant.dynamics([x / 2 + f / 3 + w, z / 3 + x / 7], Ts=1)
+    plant.outputs([x, z])
+    observer = ob.BoundedErrorUIO(**options).design(plant)
+    lost = float(1e6 * abs(Fraction(1, 3) - Fraction(1 / 3)))
+    assert lost > 2.0**-40 * 5
+    assert observer.certificate.design.rounding.min() > 2 * lost
+    assert observer.certificate.check()["matrix_rounding"].margin > lost
