@@ -152,6 +152,13 @@ class AffineFamily:
             scalars.append(min(max(float(matrix[tuple(places[0])]), lower), upper))
         return bool((np.abs(matrix - self.at(scalars)) <= self.radius).all())
 
+    def room(self, other: AffineFamily) -> float:
+        """By how much the ranges of another family leave these, negative; -inf for other counts."""
+        mine, its = self.ranges, other.ranges
+        if mine.shape != its.shape:
+            return -np.inf
+        return float(np.minimum(its[:, 0] - mine[:, 0], mine[:, 1] - its[:, 1]).min(initial=0.0))
+
     def covers(self, other: AffineFamily) -> bool:
         """Whether a family with the same constant and directions holds another one.
 

@@ -235,9 +235,7 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
         "jacobian",
         "every Jacobian of g over the box lies in the stored family",
         design.family.covers(family),
-        float((family.ranges - design.family.ranges)[:, 0].min(initial=0.0))
-        if design.family.ranges.shape == family.ranges.shape
-        else -np.inf,
+        design.family.room(family),
         "interval branch and bound with outward rounding; dependences proved symbolically",
     )
 

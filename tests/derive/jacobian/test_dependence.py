@@ -248,3 +248,18 @@ def test_a_family_covers_one_with_narrower_ranges_and_no_other():
         {"directions": np.ones((2, 2, 2)), "ranges": np.array([[0.0, 1.0]] * 2)},
     ):
         assert not family.covers(replace(family, **mistake)), mistake
+
+
+def test_the_room_of_a_family_counts_both_ends():
+    """Mutant: lower ends alone."""
+    family = AffineFamily(
+        constant=np.zeros((1, 1)),
+        directions=np.ones((1, 1, 1)),
+        ranges=np.array([[0.0, 1.0]]),
+        radius=np.zeros((1, 1)),
+        labels=("s",),
+        exact=True,
+    )
+    for ranges, room in (([[0.25, 0.5]], 0.0), ([[-0.25, 0.9]], -0.25), ([[0.5, 1.5]], -0.5)):
+        assert family.room(replace(family, ranges=np.array(ranges))) == room
+    assert family.room(replace(family, ranges=np.zeros((2, 2)))) == -np.inf
