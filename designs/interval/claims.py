@@ -107,7 +107,7 @@ def covers(design: IntervalDesign, fresh: IntervalModel) -> Iterator[Claim]:
     yield Claim(
         "model",
         "F, C, W1 and W2 are those of the stored equations",
-        bool(same and set(fresh.scheduled) <= set(stored.scheduled)),
+        bool(same and fresh.scheduled == stored.scheduled),
         0.0,
         "exact comparison; the quasi-LPV form is proved to be the plant",
     )
