@@ -48,7 +48,7 @@ def _read_json(source: Path) -> dict[str, Any]:
         return found
 
     def constant(word: str) -> None:
-        raise CertificateError(f"{source.name} holds {word}, which is no number of JSON")
+        raise CertificateError(f"the stored design in {source.name} holds {word}: not finite")
 
     try:
         text = data.decode("utf-8")

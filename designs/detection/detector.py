@@ -156,6 +156,11 @@ class FaultDetector:
         return self.observer.performance
 
     @property
+    def figures(self) -> Mapping[str, float]:
+        """The observer's performance as it is shown."""
+        return self.observer.figures
+
+    @property
     def certificate(self) -> Certificate:
         """The observer's certificate; an alarm rests on nothing else."""
         return self.observer.certificate

@@ -76,6 +76,8 @@ class ToyObserver:
     def performance(self):
         return {"decay": 0.2}
 
+    figures = performance
+
     @property
     def certificate(self):
         claim = Claim("interval", "a <= y + 0.1 & a >= y - 0.1", True, 0.25, "by construction")

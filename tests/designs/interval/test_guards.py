@@ -409,7 +409,7 @@ def test_a_record_that_cannot_be_read(change, designs, tmp_path):
     change(record)
     path = tmp_path / "broken.json"
     path.write_text(json.dumps(record))
-    with pytest.raises(ob.CertificateError, match="stored design|no number of JSON"):
+    with pytest.raises(ob.CertificateError, match="stored design"):
         ob.load(path)
 
 
