@@ -13,7 +13,7 @@ from sympy.logic.boolalg import ITE, And, BooleanFalse, BooleanFunction, Boolean
 
 from obsynth.symbolic.convert import nearest_double
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.functions import BY_CLASS, BY_NAME
+from obsynth.symbolic.functions import BY_CLASS, BY_NAME, phi1, tanhc
 from obsynth.symbolic.signals import (
     LONGEST_UNIT,
     Role,
@@ -123,11 +123,29 @@ def _plain(node: sp.Basic) -> sp.Basic:
     if isinstance(node, ITE):
         condition, yes, no = node.args
         return Or(And(condition, yes), And(Not(condition), no))
+    if isinstance(node, sp.Piecewise) and (continued := _continued(node)) is not None:
+        return continued
     if isinstance(node, sp.Piecewise) and node.args[-1][1] != sp.true:
         *cases, (last, condition) = node.args
         if Or(*(c for _, c in cases), condition) == sp.true:
             return sp.Piecewise(*cases, (last, True))
     return node
+
+
+def _continued(node: sp.Piecewise) -> sp.Expr | None:
+    """Return sinc, phi1 or tanhc for a quotient that is given its limit where z = 0."""
+    (first, condition), (second, *_) = node.args[0], node.args[-1]
+    if len(node.args) != 2 or not isinstance(condition, sp.Ne | sp.Eq):
+        return None
+    quotient, limit = (first, second) if isinstance(condition, sp.Ne) else (second, first)
+    for function, named in ((sp.sin, sp.sinc), (sp.exp, phi1), (sp.tanh, tanhc)):
+        for atom in sorted(quotient.atoms(function), key=str):
+            (z,), top = atom.args, atom - 1 if function is sp.exp else atom
+            share = sp.cancel(z / (condition.lhs - condition.rhs))
+            same = sp.expand(quotient * z - limit * top) == 0
+            if share.is_number and share.is_nonzero and same:
+                return limit * named(z)
+    return None
 
 
 def _read(row: Any, symbols: Mapping[str, sp.Symbol], where: str) -> sp.Expr:

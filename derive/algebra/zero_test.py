@@ -34,6 +34,8 @@ def is_zero(expression: sp.Expr) -> str:
     expression = sp.expand(expression)
     if expression == 0:
         return "expand"
+    if expression.has(sp.nan, sp.zoo):
+        return ""
     if expression.is_number and abs(expression.evalf(30)) > sp.Float("1e-20"):
         return ""
     for name, attempt in (("cancel", sp.cancel), ("simplify", sp.simplify)):

@@ -55,7 +55,8 @@ def refuse_jumps(model: Plant) -> None:
             raise StructureError(
                 f"the row of {name} may jump where {surface} = 0, which lies inside the "
                 "box; the bounds of its Jacobian would say nothing about the jump. Make both "
-                "sides agree there, or restrict the ranges to one side",
+                "sides agree there (a quotient is continued by sinc, phi1 or tanhc), or restrict "
+                "the ranges to one side",
                 row=name,
                 surface=surface,
                 condition="continuity",

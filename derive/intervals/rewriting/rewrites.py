@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from obsynth.derive.intervals.graph import Graph, Node
 
 _MOST = 12
+_DEEP = 6
 
 
 @dataclass
@@ -225,26 +226,45 @@ def _add(graph: Graph, args: list[int]) -> int:
             opposite = graph.nodes[no.args[0]]
             if opposite.op == "logical_not" and opposite.args[0] == yes.args[0]:
                 return graph.append(Node("select", (yes.args[0], yes.args[1], no.args[1])))
-        if yes.op == no.op == "multiply":
-            choice = _weighted(graph, yes, no)
-            if choice is not None:
-                return choice
+    choice = _weighted(graph, a, b, 1)
+    if choice is not None:
+        return choice
     if a == b:
         return graph.append(Node("twice", (a,)))
     return graph.plain("add", args)
 
 
-def _weighted(graph: Graph, yes: Node, no: Node) -> int | None:
-    """Join w a + (1 - w) b, with the weights of a min or max, to a choice between a and b."""
-    for i in (0, 1):
-        weight = graph.nodes[yes.args[i]]
-        if weight.op != "boundary_weight":
-            continue
-        for j in (0, 1):
-            other = graph.nodes[no.args[j]]
-            if other.op == "boundary_weight" and other.args == weight.args[::-1]:
-                return graph.append(Node("select", (yes.args[i], yes.args[1 - i], no.args[1 - j])))
+def _weighted(graph: Graph, a: int, b: int, sign: int) -> int | None:
+    """Join w a +- (1 - w) b, with the weights of a min or max, to a choice between a and +-b."""
+    for i, weight in enumerate(_weights(graph, a)):
+        for j, other in enumerate(_weights(graph, b)):
+            if graph.nodes[other].args == graph.nodes[weight].args[::-1]:
+                yes, no = _without(graph, a, [i]), _without(graph, b, [j])
+                no = no if sign > 0 else _negate(graph, [no])
+                return graph.append(Node("select", (weight, yes, no)))
     return None
+
+
+def _weights(graph: Graph, index: int, depth: int = _DEEP) -> list[int]:
+    """List the weights among the factors of a node, from left to right."""
+    node = graph.nodes[index]
+    if node.op == "boundary_weight":
+        return [index]
+    if not depth or node.op not in ("multiply", "twice", "negate"):
+        return []
+    return [w for argument in node.args for w in _weights(graph, argument, depth - 1)]
+
+
+def _without(graph: Graph, index: int, place: list[int], depth: int = _DEEP) -> int:
+    """Return a product without one of its weights, the one that ``place`` counts down to."""
+    node = graph.nodes[index]
+    if node.op == "boundary_weight":
+        place[0] -= 1
+        return graph.number(1.0, 1.0) if place[0] == -1 else index
+    if not _weights(graph, index, depth):
+        return index
+    rest = [_without(graph, argument, place, depth - 1) for argument in node.args]
+    return REWRITES[node.op](graph, rest)
 
 
 def _subtract(graph: Graph, args: list[int]) -> int:
@@ -255,7 +275,8 @@ def _subtract(graph: Graph, args: list[int]) -> int:
         return _negate(graph, [b])
     if graph.nodes[b].op == "negate":
         return _add(graph, [a, graph.nodes[b].args[0]])
-    return graph.plain("subtract", args)
+    choice = _weighted(graph, a, b, -1)
+    return graph.plain("subtract", args) if choice is None else choice
 
 
 def _negate(graph: Graph, args: list[int]) -> int:

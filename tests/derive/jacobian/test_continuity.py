@@ -174,3 +174,38 @@ def test_square_root_flow_between_tanks():
     assert apart.min[0, 0] == pytest.approx(-1.0, rel=1e-14)
     assert apart.max[0, 0] == pytest.approx(-0.5, rel=1e-14)
     assert str(apart.dependences[0]).startswith("m12 = -m11")
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("piecewise((sin(x)/x, x != 0), (1, True))", "sinc(x)"),
+        ("piecewise((1, x == 0), (sin(x)/x, True))", "sinc(x)"),
+        ("piecewise((y*sin(2*x)/x, x != 0), (2*y, True))", "2*y*sinc(2*x)"),
+        ("y*piecewise(((exp(x - y) - 1)/(x - y), x != y), (1, True))", "y*phi1(x - y)"),
+        ("piecewise((tanh(3*x)/(3*x), x != 0), (1, True))", "tanhc(3*x)"),
+    ],
+)
+def test_a_quotient_with_its_limit_is_what_it_stands_for(text, meant):
+    typed, named = (plant_with(lambda x, y, row=row: row) for row in (text, meant))
+    assert typed.rhs == named.rhs
+    found = jacobian_bounds(typed, effort="fast")
+    np.testing.assert_array_equal(found.max, jacobian_bounds(named, effort="fast").max)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "piecewise((sin(x)/x, x != 0), (2, True))",
+        "piecewise((sin(x)/x, y != 0), (1, True))",
+        "piecewise((sin(x)/x, x > 0), (1, True))",
+        "piecewise(((1 - cos(x))/x, x != 0), (0, True))",
+        "piecewise((x*sin(1/x), x != 0), (0, True))",
+    ],
+)
+def test_a_quotient_that_is_not_continued_is_refused(text):
+    """Mutants: `_continued` without ``same`` or without ``share``; `is_zero` that compares nan."""
+    plant = plant_with(lambda x, y: text)
+    assert plant.rhs[0].has(sp.Piecewise)
+    with pytest.raises(StructureError, match="sinc, phi1 or tanhc"):
+        jacobian_bounds(plant)

@@ -173,6 +173,33 @@ def test_kinks_have_both_slopes(row, low, high):
     assert float(found.max[0, 0]) == pytest.approx(high, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [
+        ("max(x, 2*x)", 1, 2),
+        ("min(x, 3*x)", 1, 3),
+        ("max(-x, -3*x)", -3, -1),
+        ("-2*max(2*x, 4*x)", -8, -4),
+        ("max(x/2, -x)", -1, 0.5),
+        ("x + max(x, 2*x)", 2, 3),
+        ("max(x, 2*x, 4*x)", 1, 4),
+        ("(y + 3)*max(-x, 5*x)/4", -1, 5),
+    ],
+)
+def test_weights_that_collapse_stay_weights(text, low, high):
+    """A slope of 1, 2 or -1 leaves w, 2 w or -w of the product of a weight and a slope.
+
+    Mutants: `_weights` that sees products alone, a sign lost in `_weighted`, `_without` that takes
+    out nothing.
+    """
+    plant = Plant("weights")
+    x, _ = plant.states("x y", range=(-1, 1))
+    plant.dynamics([text, "-y"])
+    plant.outputs([x])
+    found = jacobian_bounds(plant, effort="fast")
+    assert (found.min[0, 0], found.max[0, 0]) == pytest.approx((low, high), rel=1e-14)
+
+
 def test_a_kink_outside_the_box_is_none():
     assert slope(lambda x, y: sp.Abs(x + 2) * 3, limits=(-1, 1)) == pytest.approx((3.0, 3.0))
 
