@@ -85,6 +85,8 @@ TOLERANCE = 1e-12
 
 _BITS = 100
 _PERTURBATION = mpmath.mpf(2) ** -50
+# What an operation loses by underflow, as the size of a number that it is a rounding error of.
+_UNDERFLOW = mpmath.mpf(2) ** -1022 / TOLERANCE
 
 
 class ParityError(ObsynthError):
@@ -218,7 +220,7 @@ class _Evaluator:
     def visit(self, node: sp.Expr) -> tuple[Any, Any]:
         if node not in self.done:
             value, magnitude = self._build(node)
-            self.done[node] = _real(value), magnitude
+            self.done[node] = _real(value), max(magnitude, _UNDERFLOW) if value else magnitude
         return self.done[node]
 
     def _build(self, node: sp.Expr) -> tuple[Any, Any]:

@@ -41,6 +41,9 @@ _COMPARE = {"<": sp.Lt, "<=": sp.Le, ">": sp.Gt, ">=": sp.Ge, "==": sp.Eq, "!=":
 _SIGNS = {relation: sign for sign, relation in _COMPARE.items()}
 _CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
 _DEEPEST = 100
+_LONGEST = 100_000
+# SymPy compares the arguments of Max, Or and Piecewise with each other.
+_MOST = 100
 _LARGEST_BITS = 8192
 
 
@@ -96,6 +99,12 @@ class _Reader:
     def __init__(self, text: str, symbols: Mapping[str, sp.Symbol]) -> None:
         if not isinstance(text, str):
             raise TextError(f"an expression is text, not {text!r}", position=0)
+        if len(text) > _LONGEST:
+            raise TextError(
+                f"an expression has at most {_LONGEST} characters, this one has {len(text)} "
+                f"({text[:60]!r}...); name its parts, or build it with SymPy",
+                position=_LONGEST,
+            )
         self.text = text
         self.symbols = symbols
         self.depth = 0
@@ -157,6 +166,11 @@ class _Reader:
         if self.depth > _DEEPEST:
             self._fail(f"more than {_DEEPEST} levels of signs, powers and parentheses")
 
+    def _another(self, parts: list[Any], part: Any) -> None:
+        parts.append(part)
+        if len(parts) > _MOST:
+            self._fail(f"more than {_MOST} arguments or cases")
+
     def _number(self, rule: Any) -> sp.Expr:
         return self._as_number(self._now.position, rule())
 
@@ -186,7 +200,7 @@ class _Reader:
             return first
         parts = [self._as_truth(position, first)]
         while self._take(word):
-            parts.append(self._truth(rule))
+            self._another(parts, self._truth(rule))
         return join(*parts)
 
     def _negation(self) -> sp.Basic:
@@ -309,7 +323,7 @@ class _Reader:
         self._expect("(")
         arguments = [self._number(self._condition)]
         while self._take(","):
-            arguments.append(self._number(self._condition))
+            self._another(arguments, self._number(self._condition))
         self._expect(")")
         most = len(arguments) if function.most is None else function.most
         if not function.least <= len(arguments) <= most:
@@ -317,13 +331,13 @@ class _Reader:
         return self._finite(function.sympy(*arguments), token.position)
 
     def _piecewise(self, token: _Token) -> sp.Expr:
-        pairs = []
+        pairs: list[Any] = []
         self._expect("(")
         while True:
             self._expect("(")
             value = self._number(self._condition)
             self._expect(",")
-            pairs.append((value, self._truth(self._condition)))
+            self._another(pairs, (value, self._truth(self._condition)))
             self._expect(")")
             if not self._take(","):
                 break

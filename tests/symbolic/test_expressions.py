@@ -147,3 +147,31 @@ def test_own_functions_differentiate_in_sympy(function):
         slope = function(X).diff(X).subs(X, at).evalf(30)
         secant = ((function(at + step) - function(at - step)) / (2 * step)).evalf(30)
         assert abs(slope - secant) < 1e-14
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        X * sp.exp(-((100 * X) ** 2)),
+        (1 + sp.exp(-((1000 * X) ** 2)) / 2) * sp.tanh(100 * X),
+        1 / (1 + sp.exp(-1000 * X)),
+        sp.Integer(10) ** 20 * sp.exp(-((30 * X) ** 2)),
+        sp.sqrt(sp.exp(-1000 * X**2)),
+    ],
+    ids=["Gaussian", "Stribeck", "logistic", "amplified", "root"],
+)
+def test_underflow_is_no_difference_and_hides_none(row):
+    """Where a double underflows the two forms agree; above that they have to, to 1e-12.
+
+    Mutants: no allowance; an allowance that is not multiplied with what follows; one of 1e-12.
+    """
+    (form,) = to_sx([row], {X: ca.SX.sym("x")}, ["row"])
+    function = ca.Function("f", ca.symvar(form), [form])
+    points = np.linspace(-1, 1, 401)[:, None]
+    check_parity([row], [X], lambda v: np.array(function(v)), points, ["row"])
+    wrong = [(0.07, lambda v: (1 + 1e-9) * function(v))]
+    if float(function(-0.9)) == 0.0 and row.func is not sp.exp:
+        wrong.append((-0.9, lambda v: function(v) + 1e-250))
+    for at, other in wrong:
+        with pytest.raises(ParityError):
+            check_parity([row], [X], lambda v, f=other: np.array(f(v)), np.array([[at]]), ["row"])

@@ -1,5 +1,7 @@
 """The grammar: what is read, and where what is wrong stands."""
 
+import time
+
 import pytest
 import sympy as sp
 
@@ -132,3 +134,27 @@ def test_writing_refuses_what_it_cannot_read_back():
 def test_writing(expression, text):
     assert write_text(expression) == text
     assert read_text(text, NAMES) == expression
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1" * 1_000_000, "at most 100000 characters, this one has 1000000"),
+        ("1" + "+1" * 400_000, "at most 100000 characters, this one has 800001"),
+        ("(" * 1_000_000, "at most 100000 characters"),
+        ("(" * 40_000 + "1" + ")" * 40_000, "more than 100 levels"),
+        ("-" * 90_000 + "1", "more than 100 levels"),
+        ("1" + "**1" * 30_000, "more than 100 levels"),
+        ("max(" + ",".join(f"x**{k}" for k in range(2, 9000)) + ")", "more than 100 arguments"),
+        ("piecewise((1," + " or ".join(f"x<{k}" for k in range(9000)) + "),(0,True))", "more than"),
+        ("piecewise(" + ",".join(f"({k},x<{k})" for k in range(7000)) + ",(0,True))", "more than"),
+    ],
+    ids=["digits", "ones", "open", "nested", "signs", "powers", "max", "or", "cases"],
+)
+def test_endless_texts_are_refused_at_once(text, message):
+    """Mutants: no longest text, no largest number of arguments in one of the three places."""
+    since = time.monotonic()
+    with pytest.raises(TextError, match=message) as told:
+        read_text(text, {"x": sp.Symbol("x", real=True)})
+    assert time.monotonic() - since < 2.0
+    assert len(str(told.value)) < 400
