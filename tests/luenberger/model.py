@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
+from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.designs.core.given import PlantClass
@@ -46,6 +47,14 @@ class LuenbergerModel(Record):
 def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> LuenbergerModel:
     """Split the plant and bound the Jacobian of its nonlinear part."""
     parts = split(given, linear="terms") if isinstance(given, Plant) else given
+    rounded = [name for name in ("C", "W1", "W2") if parts.proof.rounding[name].any()]
+    if rounded or not parts.proof.holds:
+        raise StructureError(
+            f"{parts.model.name}: the split is not proved to be the plant in doubles ({parts.proof}"
+            f"; rounded: {', '.join(rounded) or 'none'}); give the coefficients of outputs and "
+            "disturbances as numbers that doubles hold",
+            condition="an exact split",
+        )
     family = (jacobian_bounds(parts) if bounds is None else bounds).family
     box = parts.model.box("w")
     centre, radius = middle_and_radius(box[:, 0], box[:, 1])
