@@ -1,6 +1,7 @@
 """Plants in notebooks: equations in LaTeX, signals in a table."""
 
 import html
+import math
 from typing import TYPE_CHECKING
 
 import sympy as sp
@@ -38,9 +39,11 @@ def plant_html(plant: "Plant") -> str:
     time = "continuous time" if plant.Ts is None else f"sampled every {plant.Ts:g} s"
     method = f", {plant.discretisation}" if plant.discretisation else ""
     heads = ("signal", "role", "range", "nominal", "rate", "unit")
+    rows = [_cells(signal) for signal in plant.signals]
+    sensors = zip(plant.output_names, plant.output_ranges, plant.output_units, strict=True)
+    rows += [(name, "output", _span(*ends), "", "", unit) for name, ends, unit in sensors]
     cells = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in _cells(signal)) + "</tr>"
-        for signal in plant.signals
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
     )
     return (
         f"<p><b>{html.escape(plant.name)}</b>, {time}{method}</p>"
@@ -55,13 +58,15 @@ def _cells(signal: Signal) -> tuple[str, ...]:
     role += "" if signal.measured else ", not measured"
     if signal.value is not None and signal.lower == signal.upper:
         span = sp.sstr(signal.value, full_prec=False)
-    elif signal.bounded:
-        span = f"[{signal.lower:g}, {signal.upper:g}]"
     else:
-        span = "unbounded"
+        span = _span(signal.lower, signal.upper)
     nominal = "" if signal.nominal is None else f"{signal.nominal:g}"
     rate = "" if signal.rate is None else f"{signal.rate:g}"
     return signal.name, role, span, nominal, rate, signal.unit
+
+
+def _span(lower: float, upper: float) -> str:
+    return "unbounded" if lower == -upper == -math.inf else f"[{lower:g}, {upper:g}]"
 
 
 def _base(name: str) -> str:

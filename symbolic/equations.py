@@ -20,6 +20,7 @@ from obsynth.symbolic.signals import (
     Signal,
     expand_names,
     one_line,
+    output_ranges,
     per_symbol,
 )
 from obsynth.symbolic.text import TextError, read_text, undeclared
@@ -68,9 +69,9 @@ def read_dynamics(
 
 
 def read_outputs(
-    rows: Any, symbols: Mapping[str, sp.Symbol], names: Any, unit: Any
-) -> tuple[dict[str, sp.Expr], tuple[str, ...]]:
-    """Read outputs with their names and units."""
+    rows: Any, symbols: Mapping[str, sp.Symbol], names: Any, unit: Any, limits: Any
+) -> tuple[dict[str, sp.Expr], tuple[str, ...], tuple[tuple[float, float], ...]]:
+    """Read outputs with their names, units and the ranges of their sensors."""
     found = read_rows(rows, symbols, "outputs")
     if not found:
         raise PlantError("outputs is empty: an observer needs at least one measurement")
@@ -89,7 +90,7 @@ def read_outputs(
         )
     units = per_symbol(unit, named, "unit")
     units = [one_line(item, "outputs: unit=", LONGEST_UNIT, unit=item) for item in units]
-    return dict(zip(named, found, strict=True)), tuple(units)
+    return dict(zip(named, found, strict=True)), tuple(units), output_ranges(limits, named)
 
 
 def canonical(expression: sp.Expr) -> sp.Expr:

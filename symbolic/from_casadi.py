@@ -123,6 +123,7 @@ def plant_from_casadi(
     names: Mapping[str, Any] | None = None,
     output_names: Names | None = None,
     output_unit: Any = "",
+    output_range: Any = None,
     **options: Any,
 ) -> "Plant":
     """Make a plant from CasADi expressions, SX or MX.
@@ -145,7 +146,8 @@ def plant_from_casadi(
     ordered = [signals[name] for named in system.names.values() for name in named]
     rows = system.expressions({signal.name: signal.symbol for signal in ordered})
     plant.dynamics(rows[: system.rows], Ts=step)
-    plant.outputs(rows[system.rows :], names=output_names, unit=output_unit)
+    keywords = {"names": output_names, "unit": output_unit, "range": output_range}
+    plant.outputs(rows[system.rows :], **keywords)
     box = np.array([(s.lower, s.upper) for s in ordered])
     centre = np.array([0.0 if s.nominal is None else s.nominal for s in ordered])
     points = sample_box(box, around=centre)

@@ -65,6 +65,7 @@ class Plant:
         self._dynamics: Rows | None = None
         self._outputs: dict[str, sp.Expr] | None = None
         self._output_units: tuple[str, ...] = ()
+        self._output_ranges: tuple[tuple[float, float], ...] = ()
         self._Ts: sp.Expr | None = None
         self._origin: tuple[Plant, str] | None = None
         self._in_use = False
@@ -115,7 +116,9 @@ class Plant:
         self._Ts = None if Ts is None else sampling_time(Ts)
         self._dynamics = found
 
-    def outputs(self, rows: Any, *, names: Names | None = None, unit: Any = "") -> tuple[str, ...]:
+    def outputs(
+        self, rows: Any, *, names: Names | None = None, unit: Any = "", range: Any = None
+    ) -> tuple[str, ...]:
         """State the measured outputs.
 
         Parameters
@@ -125,6 +128,9 @@ class Plant:
         names : str or sequence of str, optional
             One per row; ``y1``, ``y2``, ... by default.
         unit : str or sequence of str
+        range : pair of float or sequence of pairs, optional
+            What a healthy sensor shows: (lower, upper), or one pair per row, None where
+            nothing is known. Either end may be infinite. A reading outside is no measurement.
 
         Returns
         -------
@@ -134,9 +140,9 @@ class Plant:
         self._refuse_in_use("outputs")
         if self._outputs is not None:
             raise PlantError("the outputs are given twice; make a new Plant to change them")
-        found, units = read_outputs(rows, self._table.symbols, names, unit)
+        found, units, ranges = read_outputs(rows, self._table.symbols, names, unit, range)
         check_targets(self.signals, tuple(found))
-        self._outputs, self._output_units = found, units
+        self._outputs, self._output_units, self._output_ranges = found, units, ranges
         return tuple(found)
 
     # -- reading -------------------------------------------------------------------
@@ -246,6 +252,11 @@ class Plant:
         return self._output_units
 
     @property
+    def output_ranges(self) -> NDArray[np.float64]:
+        """What healthy sensors show, shape (m, 2), infinite where nothing is declared."""
+        return np.array(self._output_ranges, dtype=np.float64).reshape(-1, 2)
+
+    @property
     def continuous(self) -> "Plant | None":
         """The continuous plant this one was made from."""
         return None if self._origin is None else self._origin[0]
@@ -331,6 +342,7 @@ class Plant:
             [replace(s, rate=None if s.rate is None else s.rate * h) for s in self.signals]
         )
         result._outputs, result._output_units = self._outputs, self._output_units
+        result._output_ranges = self._output_ranges
         self._in_use = result._in_use = True
         return result
 

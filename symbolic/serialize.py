@@ -42,9 +42,13 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
         "signals": [signal_to_dict(signal) for signal in plant.signals],
         "dynamics": dynamics,
         "outputs": [
-            {"name": name, "unit": unit, "expression": text}
-            for name, unit, text in zip(
-                plant.output_names, plant.output_units, outputs, strict=True
+            {"name": name, "unit": unit, "expression": text, **_ends(*ends)}
+            for name, unit, text, ends in zip(
+                plant.output_names,
+                plant.output_units,
+                outputs,
+                plant.output_ranges.tolist(),
+                strict=True,
             )
         ],
     }
@@ -70,7 +74,7 @@ def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
     units, texts = (
         [read_field(item, key, str) for item in outputs] for key in ("unit", "expression")
     )
-    plant.outputs(texts, names=names, unit=units)
+    plant.outputs(texts, names=names, unit=units, range=[_read_ends(item) for item in outputs])
 
 
 def _row_text(row: sp.Expr, plant: "Plant") -> str:
@@ -86,8 +90,7 @@ def signal_to_dict(signal: Signal) -> dict[str, Any]:
     return {
         "name": signal.name,
         "role": str(signal.role),
-        "lower": signal.lower if math.isfinite(signal.lower) else None,
-        "upper": signal.upper if math.isfinite(signal.upper) else None,
+        **_ends(signal.lower, signal.upper),
         "unit": signal.unit,
         "nominal": signal.nominal,
         "rate": signal.rate,
@@ -104,14 +107,14 @@ def signal_from_dict(data: Any) -> Signal:
     role = read_field(data, "role", str)
     if role not in list(Role):
         raise PlantError(f"stored signal {name!r}: the role {role!r} is unknown", symbol=name)
-    lower, upper = (read_field(data, key, float, None) for key in ("lower", "upper"))
+    lower, upper = _read_ends(data)
     value = read_field(data, "value", str, None)
     return Signal(
         name=name,
         symbol=sp.Symbol(name, real=True),
         role=Role(role),
-        lower=-math.inf if lower is None else lower,
-        upper=math.inf if upper is None else upper,
+        lower=lower,
+        upper=upper,
         unit=read_field(data, "unit", str),
         nominal=read_field(data, "nominal", float, None),
         rate=read_field(data, "rate", float, None),
@@ -120,6 +123,17 @@ def signal_from_dict(data: Any) -> Signal:
         of=read_field(data, "of", str, None),
         value=None if value is None else read_text(value, {}),
     )
+
+
+def _ends(lower: float, upper: float) -> dict[str, float | None]:
+    """Return a range as JSON-able data, null for an infinite end."""
+    pairs = {"lower": lower, "upper": upper}.items()
+    return {key: value if math.isfinite(value) else None for key, value in pairs}
+
+
+def _read_ends(data: Any) -> tuple[float, float]:
+    lower, upper = (read_field(data, key, float, None) for key in ("lower", "upper"))
+    return -math.inf if lower is None else lower, math.inf if upper is None else upper
 
 
 def _read_name(data: Any) -> str:

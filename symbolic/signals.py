@@ -358,9 +358,27 @@ def _pairs(limits: Any, names: Sequence[str]) -> list[Any]:
     single = not any(isinstance(item, list | tuple | np.ndarray) or item is None for item in limits)
     pairs = [limits] * len(names) if single else per_symbol(list(limits), names, "range")
     for name, pair in zip(names, pairs, strict=True):
-        if pair is not None and len(pair) != 2:
+        if not (pair is None or (isinstance(pair, list | tuple | np.ndarray) and len(pair) == 2)):
             raise PlantError(f"range of {name}: a pair (lower, upper), not {pair!r}", symbol=name)
     return pairs
+
+
+def output_ranges(limits: Any, names: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Read what healthy sensors show, one pair each; either end may be infinite."""
+    found = []
+    for name, pair in zip(names, _pairs(limits, names), strict=True):
+        who = f"output {name}: range"
+        lower, upper = (-math.inf, math.inf) if pair is None else (_float(v, who) for v in pair)
+        if not lower < upper:
+            raise PlantError(
+                f"{who} ({lower}, {upper}) has no room for a reading; give the smallest value that "
+                "a healthy sensor shows and then the largest, -inf or inf where it has no limit",
+                symbol=name,
+                lower=lower,
+                upper=upper,
+            )
+        found.append((lower, upper))
+    return tuple(found)
 
 
 def _float(value: Any, what: str) -> float:

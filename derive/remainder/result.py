@@ -117,7 +117,8 @@ class Remainder:
             (symbol,) = result.disturbances([name], range=pair, unit=signal.unit)
             rows[i] = rows[i] + symbol
         result.dynamics(rows, Ts=step.exact_Ts)
-        result.outputs(list(outputs), names=step.output_names, unit=list(step.output_units))
+        units, ranges = list(step.output_units), step.output_ranges
+        result.outputs(list(outputs), names=step.output_names, unit=units, range=ranges)
         return result
 
     def _table(self) -> list[tuple[str, ...]]:

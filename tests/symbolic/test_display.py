@@ -46,7 +46,7 @@ def test_html_lists_every_signal_and_escapes():
     plant.scheduling("r", range=(0, 1), measured=False)
     plant.actuator_faults("f", of=u, rate=0.05)
     plant.dynamics([sp.Piecewise((x, x < 1), (u, True))])
-    plant.outputs([x])
+    plant.outputs([x, x], names="y z", unit="<m>", range=[(0, sp.oo), None])
     html = plant._repr_html_()
     assert "a &lt; b &amp; c" in html
     assert "&lt;m&gt;" in html
@@ -55,6 +55,8 @@ def test_html_lists_every_signal_and_escapes():
     for signal in plant.signals:
         assert f"<td>{signal.name}</td>" in html
     assert "actuator fault of u" in html
+    assert "<td>y</td><td>output</td><td>[0, inf]</td><td></td><td></td><td>&lt;m&gt;</td>" in html
+    assert "<td>z</td><td>output</td><td>unbounded</td>" in html
     assert "<td>1/3</td>" in html
     assert "not measured" in html
     assert "unbounded" in html

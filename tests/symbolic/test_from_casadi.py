@@ -40,12 +40,14 @@ def test_the_tank_written_in_casadi_is_the_tank(kind):
         unit={"x": "cm", "v_0": "V"},
         rate={"f": 0.05},
         output_unit="cm",
+        output_range=(0, 300),
     )
     reference = quadruple_tank()
     assert plant.names("x") == ("h_0", "h_1", "h_2", "h_3")
     assert [s.unit for s in plant.u] == ["V", ""]
     assert [s.rate for s in plant.f] == [0.05, 0.05]
     assert plant.output_units == ("cm",) * 3
+    assert plant.output_ranges.tolist() == [[0, 300]] * 3
     assert all(signal.nominal == 10 for signal in plant.u)
     np.testing.assert_array_equal(plant.box("x"), reference.box("x"))
     np.testing.assert_array_equal(plant.box("w"), reference.box("w"))

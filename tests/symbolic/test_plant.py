@@ -87,6 +87,30 @@ def test_actuator_and_sensor_faults_are_inserted():
     np.testing.assert_array_equal(np.array(y).ravel(), [3.5, 1.25])
 
 
+def test_a_sensor_says_what_it_shows_when_healthy():
+    """Mutants: discretise forgets the ranges; None becomes (0, 0)."""
+    plant = complete()
+    np.testing.assert_array_equal(
+        plant.output_ranges, [[-math.inf, math.inf]] * len(plant.output_names)
+    )
+    assert Plant("empty").output_ranges.shape == (0, 2)
+    plant = Plant("sensors")
+    x, z = plant.states("x z", range=(0, 1))
+    plant.dynamics([-x, -z])
+    plant.outputs([x, z, x + z], range=[(-0.5, sp.Rational(3, 2)), None, (0, math.inf)])
+    expected = [[-0.5, 1.5], [-math.inf, math.inf], [0, math.inf]]
+    for model in (plant, plant.discretise("euler", 0.1), plant.discretise("rk4", 0.1)):
+        np.testing.assert_array_equal(model.output_ranges, expected)
+        assert model.output_ranges.dtype == np.float64
+    pair = Plant("a pair")
+    pair.states("x z")
+    pair.dynamics(["-x", "-z"])
+    pair.outputs(["x", "z"], range=np.array([0.0, 2.0]))
+    np.testing.assert_array_equal(pair.output_ranges, [[0, 2], [0, 2]])
+    pair.output_ranges[0, 0] = 1.0
+    assert pair.output_ranges[0, 0] == 0.0, "what is returned is a copy"
+
+
 def test_numbers_keep_their_meaning():
     plant = Plant("numbers")
     (x,) = plant.states("x")
@@ -287,6 +311,17 @@ REFUSALS = {
     "output names": (lambda p: p.outputs([H[0]], names="a b"), "1 rows and 2 names"),
     "output name taken": (lambda p: p.outputs([H[0]], names="h2"), "taken by a signal"),
     "output unit": (lambda p: p.outputs([H[0]], unit=3), "unit= is text"),
+    "output range order": (lambda p: p.outputs([H[0]], range=(9, 1)), "output y1: range .9.0, 1.0"),
+    "output range without room": (lambda p: p.outputs([H[0]], range=(1, 1)), "no room"),
+    "output range at infinity": (
+        lambda p: p.outputs([H[0]], range=(math.inf, math.inf)),
+        "no room",
+    ),
+    "output range nan": (lambda p: p.outputs([H[0]], range=(math.nan, 1)), "no room"),
+    "output range text": (lambda p: p.outputs([H[0]], range=("0", 1)), "y1: range: '0' is not a"),
+    "output range no pair": (lambda p: p.outputs([H[0], H[1]], range=[(0, 1), 2]), "y2: a pair"),
+    "output range half": (lambda p: p.outputs([H[0], H[1]], range=(None, 2)), "y2: a pair"),
+    "output ranges": (lambda p: p.outputs([H[0]], range=[(0, 1)] * 2), "2 entries for 1 symbols"),
     "outputs of casadi": (lambda p: p.outputs([ca.SX.sym("a")]), "from_casadi"),
     "check dynamics": (lambda p: p.check(), "no dynamics"),
     "sx without outputs": (lambda p: (p.dynamics([0, 0]), p.sx()), "no outputs"),

@@ -3,7 +3,9 @@
 import builtins
 import copy
 import json
+import math
 
+import numpy as np
 import pytest
 import sympy as sp
 from hypothesis import given, settings
@@ -29,7 +31,7 @@ def rich():
     plant.dynamics(
         [k * friction + u + w1, sp.sin(r * z) - c * sp.exp(-x) + sp.pi * sp.Symbol("fp")]
     )
-    plant.outputs([x + w2, z * 0.3], names="pos other", unit=["m", ""])
+    plant.outputs([x + w2, z * 0.3], names="pos other", unit=["m", ""], range=[(-1, 0.1), None])
     plant.sensor_faults("fs", of="pos")
     return plant
 
@@ -65,9 +67,27 @@ def test_json_round_trip_is_exact(name):
     assert again.exact_Ts == plant.exact_Ts
     assert again.output_names == plant.output_names
     assert again.output_units == plant.output_units
+    assert again.output_ranges.tolist() == plant.output_ranges.tolist()
     assert again.constant_values == plant.constant_values
     assert again.discretisation == plant.discretisation
     assert repr(again) == repr(plant)
+
+
+def test_a_file_without_ranges_of_outputs_declares_none():
+    """Mutants: an infinite end is written as a number; a missing one read as 0."""
+    stored = rich().to_dict()
+    assert [(item["lower"], item["upper"]) for item in stored["outputs"]] == [
+        (-1.0, 0.1),
+        (None, None),
+    ]
+    for item in stored["outputs"]:
+        del item["lower"], item["upper"]
+    assert not np.isfinite(Plant.from_dict(stored).output_ranges).any()
+    stored["outputs"][1]["upper"] = 3
+    np.testing.assert_array_equal(Plant.from_dict(stored).output_ranges[1], [-math.inf, 3.0])
+    stored["outputs"][1]["lower"] = 3
+    with pytest.raises(PlantError, match=r"output other: range \(3.0, 3.0\)"):
+        Plant.from_dict(stored)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

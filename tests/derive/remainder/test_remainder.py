@@ -388,6 +388,16 @@ def test_remainder_becomes_a_disturbance_per_state():
         )
 
 
+def test_the_disturbed_plant_keeps_the_ranges_of_its_sensors():
+    """Mutant: as_disturbance forgets the ranges."""
+    plant = Plant("decay")
+    plant.states("x", range=(0, 1))
+    plant.dynamics(["-x"])
+    plant.outputs(["x"], range=(-1, sp.oo))
+    model = discretisation_remainder(plant, "euler", sp.Rational(1, 10)).as_disturbance()
+    assert model.output_ranges.tolist() == [[-1.0, np.inf]]
+
+
 def test_continuous_plant_is_covered_by_the_disturbed_one():
     """One step of the discrete plant with some r in its range reaches the continuous solution."""
     found = certified("van der Pol", "rk4")
