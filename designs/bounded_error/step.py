@@ -255,8 +255,8 @@ def first_memory(
     return {"z": z, "fhat": fhat, "bound": first(design, box), "prediction": start.guess}
 
 
-def build_step(design: UioDesign) -> ca.Function:
-    """Build `Observer.step` of the bounded-error observer.
+def equations(design: UioDesign) -> ca.Function:
+    """(z, fhat, u, y) -> (xhat, innovation, next_state, z_next, fhat_next), y less W2 w_centre.
 
     Equations (10)-(12) with N = T A - K C and L = K - N E are, with the
     innovation nu_k = y_k - C xhat_k, the same as
@@ -268,6 +268,38 @@ def build_step(design: UioDesign) -> ca.Function:
     where f is the plant's own right-hand side without unknown input. This form
     needs neither the split nor N, G, L, so nothing is lost by rounding them.
     """
+    model, C = design.plant, ca.DM(design.C)
+    sizes = {"z": len(model.x), "fhat": len(model.f), "u": len(model.u), "y": C.shape[0]}
+    inputs = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    z, fhat, u, y = inputs.values()
+    xhat = z - ca.DM(design.E) @ y
+    innovation = y - C @ xhat
+    # Outside the box the dynamics may not be defined (a level below zero); the
+    # estimate is clipped there so that the recursion stays finite. Inside, where
+    # the guarantee holds, clipping does nothing.
+    next_state = model.function()(
+        clip(xhat, model.box("x")),
+        u,
+        ca.DM.zeros(len(model.d)),
+        fhat,
+        ca.DM(design.w_centre),
+        ca.DM.zeros(len(model.p)),
+        ca.DM.zeros(len(model.rho)),
+    )[0]
+    outputs = {
+        "xhat": xhat,
+        "innovation": innovation,
+        "next_state": next_state,
+        "z_next": ca.DM(design.T) @ next_state + ca.DM(design.K) @ innovation,
+        "fhat_next": fhat + ca.DM(design.F) @ innovation,
+    }
+    return ca.Function(
+        "equations", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs)
+    )
+
+
+def build_step(design: UioDesign) -> ca.Function:
+    """Build `Observer.step` of the bounded-error observer from its `equations`."""
     bound = running_bound(design)
     model, C, W2, w_centre = design.plant, design.C, design.W2, design.w_centre
     n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), C.shape[0]
@@ -285,8 +317,7 @@ def build_step(design: UioDesign) -> ca.Function:
     nominal = [0.0 if signal.nominal is None else float(signal.nominal) for signal in model.u]
     u_used = finite_or(u, nominal)
 
-    xhat = z - ca.DM(design.E) @ y_used
-    innovation = y_used - ca.DM(C) @ xhat
+    xhat, innovation, next_state, z_next, fhat_next = equations(design)(z, fhat, u_used, y_used)
     xhat_inside = inside(xhat, xhat, box)
     fhat_inside = inside(fhat, fhat, f_box)
     can_reset = ca.logic_and(xhat_inside, fhat_inside)
@@ -323,22 +354,6 @@ def build_step(design: UioDesign) -> ca.Function:
         }
     )
 
-    # Outside the box the dynamics may not be defined (a level below zero); the
-    # estimate is clipped there so that the recursion stays finite. Inside, where
-    # the guarantee holds, clipping does nothing.
-    rhs = model.function()
-    zeros = {"d": len(model.d), "p": len(model.p), "rho": len(model.rho)}
-    next_state = rhs(
-        clip(xhat, box),
-        u_used,
-        ca.DM.zeros(zeros["d"]),
-        fhat,
-        ca.DM(w_centre),
-        ca.DM.zeros(zeros["p"]),
-        ca.DM.zeros(zeros["rho"]),
-    )[0]
-    z_next = ca.DM(design.T) @ next_state + ca.DM(design.K) @ innovation
-    fhat_next = fhat + ca.DM(design.F) @ innovation
     s_next = ca.DM(bound.decay) * s_now + ca.DM(bound.offset)
     s_next = ca.vertcat(*(ca.if_else(u_finite, s_next[i], ca.inf) for i in range(n + n_f)))
     moved = ca.vertcat(z_next, fhat_next, s_next, next_state, 1)
