@@ -233,15 +233,11 @@ def _halves(
 
 
 def _hull(bounds: JacobianBounds) -> Hull:
-    """Vertices of the Jacobian family and what rounding adds; none where there are too many."""
+    """Vertices of the Jacobian family and their rounding; none where there are too many."""
     family = bounds.family
     if family.vertex_count > _MOST_VERTICES:
         return Hull(np.zeros((0, *bounds.min.shape)), np.zeros(bounds.min.shape))
-    vertices = bounds.vertices()
-    rounding = (
-        2.0 * (len(family.ranges) + 2) * UNIT_ROUNDOFF * np.abs(vertices).max(axis=0, initial=0.0)
-    )
-    return Hull(vertices, bounds.vertex_radius + rounding)
+    return Hull(bounds.vertices(), bounds.vertex_radius)
 
 
 def _smallest_ball(bounds: JacobianBounds, hull: Hull, pairs: MatrixEntries) -> float:

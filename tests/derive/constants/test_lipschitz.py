@@ -1,14 +1,16 @@
 """Lipschitz, one-sided Lipschitz and inner-boundedness constants: numbers, samples, mutants."""
 
 import dataclasses
+from fractions import Fraction
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from obsynth.derive import Status, UnboundedError, jacobian_bounds, split
+from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
-from obsynth.derive.constants.lipschitz import lipschitz
+from obsynth.derive.constants.lipschitz import _inner, lipschitz
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic import Plant, plants
 
@@ -206,6 +208,16 @@ def test_nothing_left_over_is_zero():
     found = lipschitz(split(plant, linear="terms"))
     assert found.norm.upper == 0.0
     assert found.one_sided.upper == 0.0
+
+
+def test_beta_is_not_below_the_ball_that_it_comes_from():
+    """ball^2 - shift^2 in exact numbers; mutant: the margin of its rounding left out."""
+    rng = np.random.default_rng(0)
+    for ball, shift in rng.uniform(0.0, 2.0, (200, 2)) * 10.0 ** rng.integers(-9, 9, (200, 2)):
+        beta = _inner(Maximum(ball, ball, {}, Status.EXACT, "given"), shift).beta
+        exact = Fraction(ball) ** 2 - Fraction(shift) ** 2
+        assert Fraction(beta.attained) <= exact <= Fraction(beta.upper)
+        assert beta.gap <= 2e-15 * (ball**2 + shift**2)
 
 
 # -- refusals and reading --------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Diagonal majorants of the H-infinity paper, and why its (11) fails."""
 
 import dataclasses
+from fractions import Fraction
 
 import casadi as ca
 import numpy as np
@@ -8,8 +9,14 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import Status, split
+from obsynth.derive.constants import majorant_parts
+from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.majorant import majorant
+from obsynth.derive.constants.majorant_parts import largest_together, scaled
 from obsynth.derive.errors import DerivationError, UnboundedError
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.rigour import UNIT_ROUNDOFF
+from obsynth.derive.rigour.interval import smallest_above
 from obsynth.symbolic import Plant, plants
 
 
@@ -290,3 +297,59 @@ def test_a_diagonal_for_rows_that_share_states_is_held_against_them_together():
     with pytest.raises(DerivationError, match="are too small for the rows of x, z") as refusal:
         majorant(parts, fixed={"x": 0.99 * gamma2, "z": 0.99 * gamma2})
     assert refusal.value.factor == pytest.approx(1 / 0.99, rel=1e-4)
+
+
+# -- rounding, in exact numbers --------------------------------------------------------------------
+
+
+def test_a_scaled_maximum_holds_the_exact_product():
+    """Mutant: without UP the product may round inwards."""
+    rng = np.random.default_rng(0)
+    for upper, share, factor in rng.uniform(0.1, 1.0, (300, 3)):
+        value = upper * share
+        found = scaled(Maximum(upper, value, {}, Status.CONVERGED, "given"), factor)
+        assert Fraction(found.upper) >= Fraction(upper) * Fraction(factor)
+        assert Fraction(found.attained) <= Fraction(value) * Fraction(factor)
+        assert found.upper <= 1.0
+
+
+def test_the_root_of_the_diagonal_is_not_lost(monkeypatch):
+    """(slope / root of d)^2 with the root rounded, against slope^2 / d.
+
+    Mutants: norm.upper^2 without UP, attained^2 without UP.
+    """
+
+    def tight(chosen, *_):
+        (value,) = chosen.exact.values()
+        norm = Fraction(*map(int, value.subs(x, 1).as_numer_denom()))
+        above = smallest_above(norm)
+        return Maximum(above, np.nextafter(above, 0.0), {}, Status.EXACT, "given")
+
+    plant = Plant("parabola")
+    (x,) = plant.states("x", range=(-1, 1))
+    plant.dynamics([x**2], Ts=1)
+    plant.outputs([x])
+    monkeypatch.setattr(majorant_parts, "matrix_maximum", tight)
+    for d in np.random.default_rng(0).uniform(0.5, 40.0, 100):
+        entries = matrix_entries({(0, 0): 2 * x}, plant)
+        found = largest_together(entries, np.full((1, 1), 2.0), (0,), np.array([d]), 1e-6, "fast")
+        assert Fraction(found.attained) <= 4 / Fraction(d) <= Fraction(found.upper)
+        assert found.gap <= 40 * UNIT_ROUNDOFF * found.upper
+
+
+def test_the_sum_over_the_diagonal_is_at_most_one_exactly():
+    """Mutant: UP = 1 - 2^-44."""
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        a, b = (sp.Rational(int(k), 7) for k in rng.integers(1, 99, 2))
+        r, s = (float(v) for v in rng.uniform(0.1, 5.0, 2))
+        plant = Plant("bowl")
+        x, y = plant.states("x y", range=[(-r, r), (-s, s)])
+        plant.dynamics([a * x**2 / 2 + b * y**2 / 2, sp.S(0)], Ts=1)
+        plant.outputs([x])
+        found = majorant(split(plant, linear="terms", at=((0, 0), ())))
+        R = [Fraction(d) for d in found.diagonal]
+        total = (Fraction(a.p, a.q) * Fraction(r)) ** 2 / R[0]
+        total += (Fraction(b.p, b.q) * Fraction(s)) ** 2 / R[1]
+        assert 1 - Fraction(1e-6) <= total <= 1
+        assert Fraction(found.groups[0][2].attained) <= total

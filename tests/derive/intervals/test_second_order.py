@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from obsynth.derive.intervals import ranges
 from obsynth.derive.intervals.ranges import Status, bound_ranges
 from obsynth.derive.intervals.search import branch, curvature, reduction
+from obsynth.derive.intervals.search.batch import RowRanges, Rows
 from obsynth.derive.intervals.search.curvature import Hessians, is_concave
 from obsynth.derive.intervals.search.reduction import SxGraph, reduce_variables
 
@@ -315,3 +316,31 @@ def test_the_spread_of_a_product_is_reached_at_a_corner():
         flat = np.zeros((2, 1))
         spread = curvature.taylor_spread(-radius, radius, flat, (flat, flat), hessians)
         assert c * radius.prod() <= spread[0] <= c * radius.prod() * (1.0 + 1e-12)
+
+
+def test_the_bound_of_a_concave_goal_starts_from_the_upper_end_at_the_top():
+    """c - (x - .3)^2 - (y + x)^2 with c in [0, 1] rises to 1, not to 0.
+
+    Mutant: found.lower for found.upper in concave_bounds.
+    """
+    offset = ca.SX.sym("c")
+
+    def evaluate(rows):
+        x, y = rows.lower
+        low = -((x - 0.3) ** 2) - (x + y) ** 2
+        slope = np.array([-2 * (x - 0.3) - 2 * (x + y), -2 * (x + y)])
+        return RowRanges(low, low + 1.0, slope, slope, np.zeros(len(x), dtype=bool))
+
+    box = np.array([[-1.0], [-1.0]]), np.array([[1.0], [1.0]])
+    rows = Rows(np.array([1]), *box, np.array([np.inf]))
+    bend = np.array([[[-4.0, -2.0], [-2.0, -2.0]]])
+    start = np.zeros((2, 1))
+    hessians = Hessians(bend, bend, np.array([True]))
+    slope = evaluate(Rows(rows.goal, start, start, rows.bound)).slope_lower
+    bound = curvature.concave_bounds(
+        rows, hessians, start, slope, evaluate, lambda r: r.bound > 1.0 + 1e-9
+    )
+    assert 1.0 <= bound[0] <= 1.0 + 1e-9
+    goal = offset - (X[0] - 0.3) ** 2 - (X[0] + X[1]) ** 2
+    found = bound_ranges(goal, X[:2], [(-1, 1), (-1, 1)], offset, [(0.0, 1.0)])
+    assert 1.0 <= found.upper[0] <= 1.0 + 1e-6

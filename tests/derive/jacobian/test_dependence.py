@@ -1,6 +1,8 @@
 """Affine dependences and families: found, proved, and never claimed without proof."""
 
 from dataclasses import replace
+from fractions import Fraction
+from itertools import product
 
 import numpy as np
 import pytest
@@ -95,6 +97,45 @@ def test_rounded_coefficients_are_paid_for_by_the_radius():
         exact = sp.Rational(s) * sp.sqrt(2) / 3 + sp.Rational(1, 10)
         error = abs(exact - sp.Rational(float(family.at([s])[0, 1])))
         assert error <= sp.Rational(float(family.radius[0, 1]))
+
+
+@pytest.mark.parametrize("terms", [0, 1, 2, 5])
+def test_the_radius_holds_rounded_coefficients_and_rounded_vertices(terms):
+    """In exact numbers at every vertex, many times.
+
+    Mutants: the rounding of the constant or of the sum left out; one rounding per term; terms that
+    do not count.
+    """
+    rng = np.random.default_rng(terms)
+    basis = [(0, k) for k in range(terms)]
+    for _ in range(60):
+        c = {e: sp.Rational(int(rng.integers(-99, 99)), 7) for e in basis}
+        ranges = {e: tuple(sorted(rng.normal(size=2) * 10.0 ** rng.integers(-3, 3))) for e in basis}
+        constant = sp.Rational(int(rng.integers(-99, 99)), 13)
+        last = AffineDependence((0, terms), c, constant, "given", ("x",))
+        family = build_family((1, terms + 1), basis, [last], ranges, dict.fromkeys(basis, ("x",)))
+        allowed = Fraction(family.radius[0, terms])
+        for corner, vertex in zip(product(*ranges.values()), family.vertices(), strict=True):
+            value = Fraction(constant.p, constant.q)
+            for v, s in zip(c.values(), corner, strict=True):
+                value += Fraction(v.p, v.q) * Fraction(s)
+            error = abs(value - Fraction(vertex[0, terms]))
+            assert error <= allowed
+
+
+def test_a_coefficient_between_two_doubles_is_paid_for_beside_product_and_sum():
+    """Coefficient, product and sum each lose almost half a unit to the same side.
+
+    Mutant: the distance of the coefficient from its double left out.
+    """
+    unit = sp.Rational(1, 2**52)
+    coefficient = 1 + sp.Rational(7, 2**28) + unit * sp.Rational(99, 200)
+    s, constant = 1.0 + 2.0**-28, unit * sp.Rational(125, 256)
+    last = AffineDependence((0, 1), {(0, 0): coefficient}, constant, "given", ("x",))
+    family = build_family((1, 2), [(0, 0)], [last], {(0, 0): (0.5 * s, s)}, {(0, 0): ("x",)})
+    exact = coefficient * sp.Rational(2**28 + 1, 2**28) + constant
+    error = Fraction(exact.p, exact.q) - Fraction(family.vertices()[1, 0, 1])
+    assert Fraction(1.4 * 2.0**-52) < error <= Fraction(family.radius[0, 1])
 
 
 def family_of(ranges, exact=True):
