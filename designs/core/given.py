@@ -277,15 +277,8 @@ class Start:
 
     @property
     def x(self) -> FloatArray:
-        """The box of the first state, by default the declared one, which has to be finite then."""
-        box = self.plant.box("x") if self.x_range is None else self.x_range
-        if not np.isfinite(box).all():
-            raise ObsynthError(
-                "x_range is needed: the states have no finite declared range, so the first set "
-                "has no bound",
-                option="x_range",
-            )
-        return box
+        """The box of the first state, by default the declared one."""
+        return self.plant.box("x") if self.x_range is None else self.x_range
 
     @property
     def f(self) -> FloatArray:

@@ -6,9 +6,9 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from inspect import signature
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -16,16 +16,21 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.core.given import PlantClass, Start, check_options
+from obsynth.designs.core.contractor import CUTS
+from obsynth.designs.core.core import Core
+from obsynth.designs.core.given import Number, PlantClass, Start, check_options
+from obsynth.designs.core.guard import YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import plain
-from obsynth.designs.core.stepping import fill, slices
+from obsynth.designs.core.step import Step
+from obsynth.designs.core.stepping import extended, fill, slices
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 D = TypeVar("D")
 
+CALLS = Number(at_least=1, at_most=10**9, because="it has to be a number of calls, at least one")
 FORMAT = "obsynth design"
 VERSION = 2
 
@@ -38,7 +43,7 @@ class Numbers:
     """
 
     gains: Mapping[str, FloatArray]
-    performance: Mapping[str, float]
+    performance: Mapping[str, Any]
     half_widths: FloatArray | None = None
     searched: tuple[str, ...] = ()
 
@@ -54,10 +59,12 @@ class Contract(Generic[D]):
     covers: proofs that the stored numbers speak of the stored plant, from what was read of it
     guarantee: what is promised, and under which assumptions
     numbers: gains, performance and half widths for people to read
-    memory: parts of the memory and their sizes, ``initialised`` the last
-    first: parts of the memory for a first set; further keywords are those of the method
-    step: `Observer.step`
-    ode: `Observer.ode` of methods in continuous time
+    memory: parts of the core's memory and their sizes
+    first: parts of it for a first set; further keywords are those of the method. In discrete time
+        the shared ones are enough, since a core begins from the first sets
+    core: what the method knows from call to call, see `guard`
+    shared: parts of the memory that estimates are made of
+    ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
     """
 
@@ -70,7 +77,9 @@ class Contract(Generic[D]):
     numbers: Callable[[D], Numbers]
     memory: Callable[[D], Mapping[str, int]]
     first: Callable[..., Mapping[str, ArrayLike]]
-    step: Callable[[D], ca.Function]
+    core: Callable[[D], Core] | None = None
+    step: Callable[[D], ca.Function] | None = None
+    shared: tuple[str, ...] = ()
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
@@ -96,26 +105,56 @@ class Contract(Generic[D]):
         """Return what runs, for a certificate in which every claim holds."""
         design: Any = certificate.require().design
         plant: Plant = design.plant
-        numbers = self.numbers(design)
+        numbers, guard = self.numbers(design), self.guard(design)
+        if self.core is None:
+            assert self.step is not None
+            step, half_widths, performance = (
+                self.step(design),
+                numbers.half_widths,
+                numbers.performance,
+            )
+            promised = self.guarantee(design)
+        else:
+            step = Step(guard, self.core(design)).build()
+            half_widths, performance = guard.widths(numbers.half_widths), dict(numbers.performance)
+            if numbers.half_widths is not None:
+                performance["core_half_widths"] = numbers.half_widths
+            promised = monitored(self.guarantee(design), guard)
+        ode = None if self.ode is None else self.ode(design)
+        if ode is not None and self.core is not None:
+            ode = extended(ode, self.memory(design), self.layout(design), YOUNG)
         return Observer(
             method=self.name,
             model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
-            step=self.step(design),
+            step=step,
             memory_layout=self.layout(design),
             gains=numbers.gains,
-            performance=numbers.performance,
-            half_widths=numbers.half_widths,
+            performance=performance,
+            half_widths=half_widths,
             certificate=certificate,
-            guarantee=self.guarantee(design),
+            guarantee=promised,
             fault_delay=self.fault_delay,
-            ode=None if self.ode is None else self.ode(design),
+            ode=ode,
             step_covered=self.step_covered,
             searched=numbers.searched,
         )
 
+    def guard(self, design: Any) -> Guard:
+        """Return what watches over the core of a design."""
+        plant: Plant = design.plant
+        return Guard(
+            plant,
+            self.memory(design),
+            Watch.of(design.options),
+            self.fault_delay,
+            plant.Ts if plant.Ts is not None else design.Ts,
+            getattr(design, "precision", "double"),
+            self.shared,
+        )
+
     def layout(self, design: Any) -> dict[str, slice]:
         """Return which entries of the memory hold what."""
-        return slices(self.memory(design))
+        return slices(self.memory(design)) if self.core is None else self.guard(design).layout()
 
     def start(
         self,
@@ -134,7 +173,10 @@ class Contract(Generic[D]):
                 f"memory0 of {self.name} takes {more}; it knows no {option!r}", option=option
             )
         given = Start.read(design.plant, guess, x_range, f_range, y0)
-        return fill(self.layout(design), self.first(design, given, **options))
+        parts = self.first(design, given, **options)
+        if self.core is not None:
+            parts = self.guard(design).first(parts, given)
+        return fill(self.layout(design), parts)
 
 
 CONTRACTS: dict[str, Contract[Any]] = {}
@@ -146,10 +188,21 @@ class Method:
     """Options of a method, a frozen dataclass, and its way from a plant to an observer.
 
     A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
+
+    horizon: N, number of calls after which a set that was begun anew takes over from an older one:
+        nothing that happened more than 2 N calls ago matters to what is returned
+    recovery: number of calls after a void one that the status marks as recovering
+    cuts: what the returned sets are cut with beside the method's own, of ``"strips"``,
+        ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()`` for the
+        method's own sets, as its paper has them
     """
 
     CLASS: ClassVar[PlantClass]
     CONTRACT: ClassVar[Contract[Any]]
+
+    horizon: Annotated[int, CALLS] = field(default=400, kw_only=True)
+    recovery: Annotated[int, CALLS] = field(default=10, kw_only=True)
+    cuts: tuple[str, ...] | None = field(default=None, kw_only=True)
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -157,6 +210,12 @@ class Method:
 
     def __post_init__(self) -> None:
         check_options(self)
+        named = CUTS if self.cuts is None else tuple(self.cuts)
+        if isinstance(self.cuts, str) or not set(named) <= set(CUTS):
+            raise ObsynthError(
+                f"cuts is {self.cuts!r}; it takes a tuple of {', '.join(CUTS)}", option="cuts"
+            )
+        object.__setattr__(self, "cuts", None if self.cuts is None else named)
         self.check()
 
     def check(self) -> None:

@@ -21,8 +21,10 @@ STATUS: Mapping[str, int] = {
     "not_initialised": 1,
     "non_finite_input": 2,
     "outside_domain": 4,
-    "inconsistent_measurement": 8,
+    "void": 8,
     "fault_not_valid": 16,
+    "measurement_left_out": 32,
+    "recovering": 64,
 }
 """Bits of the status that a step returns."""
 
@@ -80,7 +82,7 @@ class Observer:
     step: ca.Function
     memory_layout: Mapping[str, slice]
     gains: Mapping[str, FloatArray]
-    performance: Mapping[str, float]
+    performance: Mapping[str, Any]
     half_widths: FloatArray | None
     certificate: Certificate
     guarantee: Guarantee

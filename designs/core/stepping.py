@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,7 @@ from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-FINITE = 1e300
+FINITE = 1e90
 """What is larger counts as no number: CasADi folds ``y == y`` to 1, so size is what tells."""
 MOST_CORNERS = 14
 
@@ -119,6 +120,27 @@ def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float]) -> ca.SX:
 def select(condition: ca.SX, then: ca.SX, otherwise: ca.SX) -> ca.SX:
     """Return one of two vectors, entry by entry, without letting infinities of the other one in."""
     return ca.vertcat(*(ca.if_else(condition, then[i], otherwise[i]) for i in range(then.numel())))
+
+
+def extended(
+    ode: ca.Function, sizes: Mapping[str, int], layout: Mapping[str, slice], mark: str
+) -> ca.Function:
+    """Return a right-hand side for the guarded memory from one for the core's own.
+
+    Both copies of a part move alike, since they began alike; what is the guard's stands still.
+    """
+    names = ode.name_in()
+    ports = [ca.SX.sym(name, ode.numel_in(i)) for i, name in enumerate(names)]
+    ports[0] = memory = ca.SX.sym("memory", layout["initialised"].stop)
+    own = slices(sizes)
+    inner = [ca.vertcat(*(memory[layout[name]] for name in own)), *ports[1:]]
+    rates: Any = ode(*inner)
+    moved = []
+    for name, place in layout.items():
+        base = name.removesuffix(mark)
+        moving = base in own and base != "initialised"
+        moved.append(rates[own[base]] if moving else ca.SX(place.stop - place.start, 1))
+    return ca.Function("ode", ports, [ca.densify(ca.vertcat(*moved))], names, ["dmemory"])
 
 
 def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:

@@ -23,7 +23,7 @@ from obsynth.designs.hinf.claims import (
 from obsynth.designs.hinf.model import CLASS, HinfModel, read, read_again
 from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.sector import Multipliers, SectorForm
-from obsynth.designs.hinf.step import build_step, first_memory, memory_sizes
+from obsynth.designs.hinf.step import build_core, first_memory, memory_sizes
 from obsynth.designs.hinf.synthesis import (
     CAP,
     NOT_FOUND,
@@ -137,7 +137,8 @@ class HinfUIO(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
-        step=build_step,
+        core=build_core,
+        shared=("prediction", "innovation", "running"),
         fault_delay=1,
     )
 

@@ -317,12 +317,70 @@ def test_a_missing_measurement_is_told_and_survived(observer):
         y = given[1].copy()
         y[0] = bad
         told = outputs(observer, memory, held(observer, y))
-        assert int(told["status"][0]) & 2
+        assert int(told["status"][0]) & (2 | 8 | 32) == 32
         assert np.isfinite(told["xhat"]).all() and np.isfinite(told["fhat"]).all()
         after = outputs(observer, told["memory"], given)
         assert np.isfinite(after["xhat"]).all() and np.isfinite(after["fhat"]).all()
-        assert not int(after["status"][0]) & 2
+        assert not int(after["status"][0]) & (2 | 8 | 32)
         assert (after["x_lower"] <= after["x_upper"]).all()
+
+
+def test_a_missing_input_begins_the_sets_anew(observer):
+    given = held(observer)
+    if not given[0].size:
+        pytest.skip("no inputs")
+    memory = observer.memory0(guess(observer), y0=given[1])
+    for _ in range(3):
+        memory = outputs(observer, memory, given)["memory"]
+    told = outputs(observer, memory, [np.full_like(given[0], np.nan), *given[1:]])
+    assert int(told["status"][0]) & (2 | 8) == 2
+    assert told["memory"][observer.memory_layout["age"]] == 0
+    after = outputs(observer, told["memory"], given)
+    assert not int(after["status"][0]) & (2 | 8)
+    assert (after["x_lower"] <= after["x_upper"]).all()
+
+
+def test_an_impossible_reading_is_void_and_forgotten(entry, observer):
+    """Nothing of what came before a void instant enters the sets that follow it.
+
+    Mutants: the older copy not reset; status 64 left out.
+    """
+    given = held(observer)
+    memories = []
+    for moved in (0.0, 0.05):
+        box = observer.model.box("x")
+        other = np.clip(guess(observer) + moved * (box[:, 1] - guess(observer)), *box.T)
+        memory = observer.memory0(other, y0=given[1])
+        for _ in range(3):
+            memory = outputs(observer, memory, given)["memory"]
+        memories.append(memory)
+    y = given[1] + 1e20
+    told = [outputs(observer, memory, held(observer, y)) for memory in memories]
+    impossible = int(told[0]["status"][0])
+    if not impossible & 8:
+        pytest.skip("every reading is possible")
+    assert impossible & 32
+    assert not np.array_equal(memories[0], memories[1])
+    layout = observer.memory_layout
+    for one in told:
+        x_box = observer.model.box("x")
+        np.testing.assert_array_equal(one["x_lower"], x_box[:, 0])
+        np.testing.assert_array_equal(one["x_upper"], x_box[:, 1])
+        assert one["memory"][layout["age"]] == 0
+        assert one["memory"][layout["begin"]] == one["memory"][layout["begin_2"]] == 1
+    shared = observer.certificate.contract.shared
+    kept = np.ones(len(memories[0]), dtype=bool)
+    for part in shared:
+        kept[layout[part]] = False
+    follow = [one["memory"] for one in told]
+    recovery = entry.method.recovery
+    for k in range(recovery + 2):
+        after = [outputs(observer, memory, given) for memory in follow]
+        if not shared:
+            for bound in ("x_lower", "x_upper", "f_lower", "f_upper"):
+                np.testing.assert_array_equal(after[0][bound], after[1][bound])
+        assert bool(int(after[0]["status"][0]) & 64) == (k < recovery)
+        follow = [one["memory"] for one in after]
 
 
 def test_an_observer_pickles(observer):

@@ -1,0 +1,67 @@
+"""Boxes of code: columns of lower and upper ends."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.lifted import FAR
+from obsynth.symbolic.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """A box of code: lower and upper ends, columns."""
+
+    lower: ca.SX
+    upper: ca.SX
+
+    @classmethod
+    def of(cls, box: FloatArray) -> "Ends":
+        """Return a box of numbers, shape (n, 2)."""
+        near = np.clip(box, -FAR, FAR)
+        return cls(ca.SX(ca.DM(near[:, 0])), ca.SX(ca.DM(near[:, 1])))
+
+    @classmethod
+    def unbounded(cls, n: int) -> "Ends":
+        """Return a box that holds everything."""
+        return cls.of(np.full((n, 2), [-np.inf, np.inf]))
+
+    @property
+    def middle(self) -> ca.SX:
+        """The middle, rounded to any side; zero where there is no bound."""
+        middle = 0.5 * self.lower + 0.5 * self.upper
+        entries = [
+            ca.if_else(self.upper[i] - self.lower[i] < FAR, middle[i], 0.0)
+            for i in range(middle.numel())
+        ]
+        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+
+    def meet(self, other: "Ends") -> "Ends":
+        """Cut with another box; an end of it that is not a number cuts nothing."""
+        return Ends(_larger(self.lower, other.lower), _smaller(self.upper, other.upper))
+
+    def empty(self) -> ca.SX:
+        """Return 1 where some coordinate has nothing left, or is not a number."""
+        result = ca.SX(0)
+        for i in range(self.lower.numel()):
+            result = ca.logic_or(result, ca.logic_not(self.lower[i] <= self.upper[i]))
+        return result
+
+    def where(self, condition: ca.SX, other: "Ends") -> "Ends":
+        """Return this box where a condition holds, the other elsewhere."""
+        return Ends(
+            _choose(condition, self.lower, other.lower), _choose(condition, self.upper, other.upper)
+        )
+
+
+def _larger(a: ca.SX, b: ca.SX) -> ca.SX:
+    return ca.vertcat(*(ca.if_else(b[i] > a[i], b[i], a[i]) for i in range(a.numel())))
+
+
+def _smaller(a: ca.SX, b: ca.SX) -> ca.SX:
+    return ca.vertcat(*(ca.if_else(b[i] < a[i], b[i], a[i]) for i in range(a.numel())))
+
+
+def _choose(condition: ca.SX, a: ca.SX, b: ca.SX) -> ca.SX:
+    return ca.vertcat(*(ca.if_else(condition, a[i], b[i]) for i in range(a.numel())))

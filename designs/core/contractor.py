@@ -1,0 +1,258 @@
+"""What the data say whatever the method: strips, image, inversion for faults, rates and ranges.
+
+With X', F' the sets of the instant before and u' its input, for a discrete plant x+ = Phi(x, u, f,
+d, w) with y = C x + W2 w:
+
+- strips: ``x_j`` lies in ``(y_i - W2_i W - sum_{l != j} C_il X_l) / C_ij``;
+- image: ``x_i`` lies in ``Phi_i(X', u', F', W)``, taken at the corners that the proved signs of
+  the derivatives name; variables of open sign stay intervals, cut with the mean value form;
+- inversion: ``f'_j`` lies in ``(X_i - Phi_i(X', u', F' with f_j = 0, W)) / J_ij`` (mean value in
+  f_j alone) where zero is not in the range of J_ij;
+- rates: ``f_j`` lies in ``F'_j +- r_j``, and everything in its declared range.
+
+Each keeps every point that the plant's equations and ranges allow. A row with an unbounded unknown
+input or disturbance has no image and no inversion. A plant in continuous time has strips, ranges
+and rates alone. States are held to a range only if some derivative depends on them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.equations import Before, Equations
+from obsynth.designs.core.lifted import FAR, Lifted, Rounding
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
+
+Cut = Literal["strips", "image", "inversion", "rates"]
+CUTS: tuple[Cut, ...] = get_args(Cut)
+"""Parts of the contractor, for an option that names those that are used."""
+
+_SWEEPS = 2
+_PASSES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """An output ``C x + W2 w`` with constant numbers: its row of C and the range of W2 w."""
+
+    row: FloatArray
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Contractor:
+    """The cuts that a plant allows.
+
+    plant: in the time of the method
+    Ts: from one call to the next
+    cuts: parts that are used
+    precision: of the step
+    """
+
+    plant: Plant
+    Ts: float
+    cuts: tuple[Cut, ...] = CUTS
+    precision: str = "double"
+
+    @cached_property
+    def rounding(self) -> Rounding:
+        """How ends step outwards."""
+        return Rounding(self.precision)
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The rows of the plant with their derivatives."""
+        return Equations(self.plant)
+
+    @cached_property
+    def domain(self) -> FloatArray:
+        """Ranges of the states on which a derivative depends, infinite for others, (n, 2)."""
+        return np.where(self.equations.curved[:, None], self.plant.box("x"), [-np.inf, np.inf])
+
+    @cached_property
+    def rates(self) -> FloatArray:
+        """What every fault moves at most from one call to the next, shape (n_f,)."""
+        step = 1.0 if self.plant.Ts is not None else self.Ts
+        found = [np.inf if s.rate is None else float(s.rate) * step for s in self.plant.f]
+        still = [0.0 if s.constant else r for s, r in zip(self.plant.f, found, strict=True)]
+        return np.array(still)
+
+    @cached_property
+    def strips(self) -> tuple[Strip | None, ...]:
+        """Every output as a strip; None where it is not affine, or its noise has no bound."""
+        return _strips(self.plant)
+
+    def shown(self, box: FloatArray) -> FloatArray:
+        """Return the ranges of the outputs over a box of states, (m, 2), rounded outwards."""
+        rows = []
+        for strip in self.strips:
+            ends = np.full((1, 2), np.inf)
+            if strip is not None:
+                used = np.flatnonzero(strip.row)
+                ends = np.sort(strip.row[used, None] * box[used], axis=1)
+                ends = np.vstack([ends, [(strip.low, strip.high)]])
+            size = float(np.abs(ends).sum())
+            slack = 2.0**5 * self.rounding.step * size
+            low, high = ends.sum(axis=0)
+            rows.append((low - slack, high + slack) if np.isfinite(size) else (-np.inf, np.inf))
+        return np.array(rows).reshape(-1, 2)
+
+    def measure(self, X: Ends, y: ca.SX, used: Sequence[ca.SX]) -> Ends:
+        """Cut a box of states with the strips of the readings that are used."""
+        if "strips" not in self.cuts:
+            return X
+        low, high = ca.SX(X.lower), ca.SX(X.upper)
+        several = any(s is not None and np.count_nonzero(s.row) > 1 for s in self.strips)
+        for _ in range(_SWEEPS if several else 1):
+            for i, strip in enumerate(self.strips):
+                if strip is None:
+                    continue
+                for j in np.flatnonzero(strip.row).tolist():
+                    below, above = self._told(strip, j, y[i], low, high)
+                    higher = ca.logic_and(used[i], below > low[j])
+                    lower = ca.logic_and(used[i], above < high[j])
+                    low[j] = ca.if_else(higher, below, low[j])
+                    high[j] = ca.if_else(lower, above, high[j])
+        return Ends(low, high)
+
+    def _told(self, strip: Strip, j: int, y: ca.SX, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return what one reading says of a state, the others of its strip in their ends."""
+        r = self.rounding
+        below, above = r.down(y - strip.high), r.up(y - strip.low)
+        for k in np.flatnonzero(strip.row).tolist():
+            if k != j:
+                c = float(strip.row[k])
+                least, most = (low[k], high[k]) if c > 0 else (high[k], low[k])
+                below = r.down(below - r.up(c * most, tiny=True))
+                above = r.up(above - r.down(c * least, tiny=True))
+        c = float(strip.row[j])
+        if c == 1.0:
+            return below, above
+        ends = (below / c, above / c) if c > 0 else (above / c, below / c)
+        return r.down(ends[0], tiny=True), r.up(ends[1], tiny=True)
+
+    def image(self, before: Before) -> Ends:
+        """Return what the states can be one call later, unbounded where a row has no image."""
+        rows = [
+            self.equations.image(i, before, self.rounding)
+            if "image" in self.cuts and usable
+            else Lifted.number(-FAR, FAR)
+            for i, usable in enumerate(self.equations.usable.tolist())
+        ]
+        return Ends(ca.vertcat(*(r.lower for r in rows)), ca.vertcat(*(r.upper for r in rows)))
+
+    def invert(self, before: Before, X: Ends) -> Ends:
+        """Return the faults of the call before, cut with where the states are now."""
+        low, high = ca.SX(before.faults.lower), ca.SX(before.faults.upper)
+        for j, i in self.equations.invertible if "inversion" in self.cuts else ():
+            known = Before(before.states, Ends(low, high), before.known)
+            now = Lifted(X.lower[i], X.upper[i])
+            found = self.equations.invert(i, j, known, now, self.rounding)
+            low[j] = ca.if_else(found.lower > low[j], found.lower, low[j])
+            high[j] = ca.if_else(found.upper < high[j], found.upper, high[j])
+        return Ends(low, high)
+
+    def drift(self, F: Ends) -> Ends:
+        """Return where the faults can be one call later, by their rates."""
+        low, high = ca.SX(F.lower), ca.SX(F.upper)
+        for j, rate in enumerate(self.rates.tolist()):
+            if not np.isfinite(rate) or "rates" not in self.cuts:
+                low[j], high[j] = -FAR, FAR
+            elif rate > 0.0:
+                low[j] = self.rounding.down(low[j] - rate)
+                high[j] = self.rounding.up(high[j] + rate)
+        return Ends(low, high)
+
+    def half_widths(self, core: FloatArray, delay: int) -> FloatArray:
+        """Return half widths of the cut sets, states then faults, from those of the core.
+
+        In the steady state of the core, with all readings. Every pass holds for what the passes
+        before gave: strips, the image ``sum_j max|J_ij| h_j``, the inversion and the rates.
+        """
+        n, slopes = len(self.plant.x), np.abs(self.equations.slopes).max(axis=2)
+        up = 1.0 + 2.0**-30
+        fixed = 0.5 * np.diff(self.equations.box[n + len(self.plant.f) :], axis=1)[:, 0]
+        f_half = 0.5 * np.diff(self.plant.box("f").reshape(-1, 2), axis=1)[:, 0]
+        x = np.minimum(core[:n], 0.5 * np.diff(self.domain, axis=1)[:, 0])
+        # late: of the fault one call before, now: of the fault at this one
+        late, now = f_half.copy(), f_half.copy()
+        (late if delay else now)[:] = np.minimum(f_half, core[n:])
+        for _ in range(_PASSES):
+            was = np.concatenate([x, late, now])
+            for strip in filter(None, self.strips if "strips" in self.cuts else ()):
+                for j in np.flatnonzero(strip.row).tolist():
+                    others = np.abs(np.delete(strip.row, j)) @ _finite(
+                        np.delete(x, j), strip.row, j
+                    )
+                    told = 0.5 * (strip.high - strip.low) + others
+                    x[j] = min(x[j], told / abs(strip.row[j]) * up)
+            late = np.minimum(late, now)
+            for i in np.flatnonzero(self.equations.usable).tolist():
+                halves = np.concatenate([x, late, fixed])
+                size = slopes[i]
+                for j, row in self.equations.invertible if "inversion" in self.cuts else ():
+                    low, high = self.equations.slopes[i, n + j].tolist()
+                    if row == i and high - low <= 1e-9 * abs(high):
+                        rest = np.where(np.arange(size.size) == n + j, 0.0, size)
+                        told = (x[i] + _times(rest, halves)) / min(abs(low), abs(high))
+                        late[j] = min(late[j], told * up)
+                if "image" in self.cuts:
+                    x[i] = min(x[i], _times(size, np.concatenate([x, late, fixed])) * up)
+            if "rates" in self.cuts:
+                now = np.minimum(now, late + self.rates)
+            if np.all(np.concatenate([x, late, now]) >= was * (1.0 - 1e-9)):
+                break
+        size = np.concatenate(
+            [np.abs(self.plant.box("x")), np.abs(self.plant.box("f")).reshape(-1, 2)]
+        )
+        slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
+        found: FloatArray = np.concatenate([x, late if delay else now]) + slack
+        return found
+
+
+def _finite(halves: FloatArray, row: FloatArray, j: int) -> FloatArray:
+    """Return half widths with zero where the row does not ask for them."""
+    return np.where(np.delete(row, j) != 0.0, halves, 0.0)
+
+
+def _times(size: FloatArray, halves: FloatArray) -> float:
+    return float(np.where(size > 0.0, size * np.where(size > 0.0, halves, 0.0), 0.0).sum())
+
+
+def _strips(plant: Plant) -> tuple[Strip | None, ...]:
+    """Read every output as a strip: constant slopes in states and disturbances, nothing else."""
+    kinds = ("x", "u", "d", "f", "w", "p", "rho")
+    s = {kind: ca.SX.sym(kind, len(plant.names(kind))) for kind in kinds}
+    y = ca.densify(plant.function()(*(s[kind] for kind in kinds))[1])
+    found: list[Strip | None] = []
+    for i in range(y.numel()):
+        given = ca.vertcat(*s.values())
+        slopes = ca.jacobian(y[i], given)
+        origin = ca.Function("y", list(s.values()), [y[i]])(
+            *(ca.DM.zeros(v.numel()) for v in s.values())
+        )
+        others = ca.vertcat(*(s[kind] for kind in kinds if kind not in ("x", "w")))
+        if ca.depends_on(slopes, given) or ca.depends_on(y[i], others) or float(origin) != 0.0:
+            found.append(None)
+            continue
+        numbers = np.array(ca.DM(slopes)).ravel()
+        n, start = len(plant.x), sum(s[kind].numel() for kind in kinds[:4])
+        found.append(_strip(numbers[:n], numbers[start : start + len(plant.w)], plant.box("w")))
+    return tuple(found)
+
+
+def _strip(row: FloatArray, noise: FloatArray, box: FloatArray) -> Strip | None:
+    used = np.flatnonzero(noise)
+    if not np.isfinite(box[used]).all():
+        return None
+    ends = np.sort(noise[used, None] * box[used], axis=1)
+    low, high = ends.sum(axis=0) if used.size else np.zeros(2)
+    slack = 2.0**-50 * (used.size + 1) * float(np.abs(ends).sum())
+    return Strip(row, low - slack, high + slack)

@@ -1,0 +1,161 @@
+"""The step of every method: ``guard(core cut with contractor)``.
+
+A method gives a `Core`: how its memory moves, and how it begins anew from a box of states and
+faults. Everything else that a step does is here, once: which readings are used, what is void, where
+sets start again, how long anything is remembered, and the status word.
+
+**Guarantee.** If the equations, ranges and rates held at all instants after the last void one (or
+the first), up to k, and between them, the returned set holds x_k and f_k. By induction from the
+declared ranges: every cut keeps each point that the assumptions allow, and a core is begun from
+a set that holds the truth.
+
+**Void.** A set that is empty, or a reading that the declared ranges exclude, shows that an
+assumption failed since the last void instant. The declared ranges are returned, and no reading or
+input up to k enters the sets that follow.
+
+**Finite memory.** Two copies of sets and bounds are carried: the older is given up at the age of
+2 N calls, the younger takes its place at the age N and a new one begins from the declared ranges.
+Whatever happened up to an instant v, noticed or not, the returned sets are right after v + 2 N if
+the assumptions hold after v. Until then a violation that contradicts nothing may go unnoticed.
+
+Estimates need no second copy: a core is begun around whatever its estimate is.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.designs.core.certificate import Guarantee
+from obsynth.designs.core.contractor import CUTS, Contractor, Cut
+from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.given import Start
+from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.stepping import slices
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
+
+YOUNG = "_2"
+"""What the names of the younger copy's parts of the memory end with."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Options of the guard, the same for every method.
+
+    horizon: N, calls after which a copy of sets and bounds takes over from an older one
+    recovery: N_rec, calls for which the status says that the sets are recovering
+    cuts: parts of the contractor that are used
+    """
+
+    horizon: int
+    recovery: int
+    cuts: tuple[Cut, ...]
+
+    @classmethod
+    def of(cls, options: Mapping[str, object]) -> "Watch":
+        """Read what a design stores, or refuse it."""
+        horizon, recovery, cuts = (options.get(name) for name in ("horizon", "recovery", "cuts"))
+        named: Any = CUTS if cuts is None else cuts
+        known = isinstance(named, list | tuple) and all(name in CUTS for name in named)
+        counts = [n for n in (horizon, recovery) if isinstance(n, int) and 1 <= n <= 10**9]
+        if not known or len(counts) < 2:
+            raise CertificateError(
+                f"the stored design cannot be read: horizon {horizon!r}, recovery {recovery!r} and "
+                f"cuts {cuts!r} are no options of the guard"
+            )
+        return cls(counts[0], counts[1], tuple(c for c in CUTS if c in named))
+
+
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """Builds the step of a method.
+
+    plant: in the time of the method
+    sizes: parts of the core's memory
+    delay: of the fault interval, 0 or 1
+    Ts: from one call to the next
+    shared: parts of the memory that estimates are made of, which both copies have in common
+    """
+
+    plant: Plant
+    sizes: Mapping[str, int]
+    watch: Watch
+    delay: int
+    Ts: float
+    precision: str = "double"
+    shared: tuple[str, ...] = ()
+
+    @property
+    def discrete(self) -> bool:
+        """Whether sets are carried from call to call."""
+        return self.plant.Ts is not None
+
+    def layout(self) -> dict[str, slice]:
+        """Return where the parts of the memory are; the older copy has the core's own names."""
+        n, n_f = len(self.plant.x), len(self.plant.f)
+        known = len(self.plant.u) + sum(s.measured for s in self.plant.rho)
+        boxes = {"x_lower": n, "x_upper": n} if self.discrete else {}
+        boxes |= {"f_lower": n_f, "f_upper": n_f}
+        single = {name: size for name, size in self.sizes.items() if name != "initialised"}
+        twice = {k: s for k, s in single.items() if k not in self.shared} | boxes | {"begin": 1}
+        young = {name + YOUNG: size for name, size in twice.items()}
+        before = {"before": known} if self.discrete else {}
+        ends = {"age": 1, "since": 1, "initialised": 1}
+        return slices({k: s for k, s in (single | twice | young | before | ends).items() if s})
+
+    def first(self, parts: Mapping[str, ArrayLike], start: Start) -> dict[str, ArrayLike]:
+        """Return the first memory: the core's own first parts, and boxes of the first instant.
+
+        A discrete core begins at the first call from the boxes, cut with the first readings.
+        """
+        boxes = {"x": start.x, "f": start.f} if self.discrete else {"f": self.plant.box("f")}
+        ends: dict[str, ArrayLike] = {}
+        for name, box in boxes.items():
+            near = np.clip(box, -FAR, FAR)
+            ends |= {f"{name}_lower": near[:, 0], f"{name}_upper": near[:, 1]}
+        own = {**parts, **ends, "begin": np.array([float(self.discrete)])}
+        both = own | {k + YOUNG: v for k, v in own.items() if k not in self.shared}
+        both["since"] = np.array([float(self.watch.recovery)])
+        return {k: v for k, v in both.items() if k in self.layout()}
+
+    @cached_property
+    def contractor(self) -> Contractor:
+        """What the data say by themselves."""
+        return Contractor(self.plant, self.Ts, self.watch.cuts, self.precision)
+
+    def widths(self, core: FloatArray | None) -> FloatArray | None:
+        """Return steady half widths of the returned sets from the core's; None without any."""
+        n, n_f = len(self.plant.x), len(self.plant.f)
+        own = np.full(n + n_f, np.inf) if core is None else core
+        found = self.contractor.half_widths(own, self.delay)
+        return found if np.isfinite(found).any() else None
+
+
+def monitored(guarantee: Guarantee, guard: Guard) -> Guarantee:
+    """Add what the guard makes of a method's guarantee, and where it ends."""
+    plant, N = guard.plant, guard.watch.horizon
+    claims = [
+        "the returned sets hold the state and the faults at every instant k for which the "
+        "assumptions held at all instants after the last void one (status bit 8), or from the "
+        "first call on if there was none, up to k",
+        f"whatever happened up to an instant v, noticed or not: the returned sets hold them after "
+        f"v + {2 * N} calls if the assumptions hold after v",
+    ]
+    loose = [s for s in plant.x if not s.bounded]
+    assumptions = [
+        "a violation of an assumption that contradicts neither the readings nor the sets is not "
+        f"noticed, and sets may then be wrong at status 0 for at most {2 * N} calls after its end",
+        "a reading outside its declared range is left out (status bit 32); one that the declared "
+        "ranges exclude, or an empty set, is void (bit 8): the declared ranges are returned, and "
+        "sets begin anew from them",
+    ]
+    if loose:
+        assumptions.append(
+            f"{', '.join(s.name for s in loose)} has no declared range: after a void instant it is "
+            "unbounded until a reading or the equations bound it"
+        )
+    return Guarantee((*guarantee.claims, *claims), (*guarantee.assumptions, *assumptions))

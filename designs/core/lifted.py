@@ -1,0 +1,429 @@
+"""Interval arithmetic lifted into CasADi: ends are SX, every rounded operation steps outwards.
+
+A program of interval operations (`obsynth.derive.intervals`) is evaluated with symbols for ends, so
+that what comes out is code that encloses the range of the program for any ends it is given. Beside
+its symbols every interval carries the numbers between which they can lie, evaluated by the rules
+of the derivations; where these know a sign the formula is the short one, and an operation that
+has no lifted form is enclosed by these numbers alone.
+
+One rounded operation is exact up to half a unit in the last place, so ``l - 2 u |l|``, u the unit
+roundoff, is below the exact result: l minus one unit is a number of the format and not above it.
+Products and quotients may underflow as well, which `tiny` covers. What the mathematics library
+returns is stepped by `ULPS` units. There are no infinities: `FAR` stands for them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import casadi as ca
+import numpy as np
+
+from obsynth.derive.intervals.functions import ULPS
+from obsynth.derive.intervals.graph import Node
+from obsynth.derive.intervals.program import Program
+from obsynth.derive.intervals.rules import PARTIAL, RULES
+from obsynth.derive.rigour.interval import UNIT
+
+FAR = 1e100
+"""Ends from which on a signal is not bounded at all."""
+_TINY = {"double": 2.0**-1021, "single": 2.0**-125}
+_TWO_PI = 2.0 * np.pi
+_LARGE_ANGLE = 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted:
+    """An interval of code: lower and upper end, and the numbers low and high that hold both."""
+
+    lower: ca.SX
+    upper: ca.SX
+    low: float = -FAR
+    high: float = FAR
+
+    @classmethod
+    def number(cls, low: float, high: float | None = None) -> "Lifted":
+        """Return a constant interval."""
+        high = low if high is None else high
+        return cls(ca.SX(low), ca.SX(high), low, high)
+
+    @classmethod
+    def point(cls, value: ca.SX, low: float = -FAR, high: float = FAR) -> "Lifted":
+        """Return the interval of one value."""
+        return cls(value, value, low, high)
+
+    @property
+    def magnitude(self) -> ca.SX:
+        """The largest absolute value."""
+        if self.low >= 0.0:
+            return self.upper
+        return -self.lower if self.high <= 0.0 else ca.fmax(-self.lower, self.upper)
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How results step outwards in a precision."""
+
+    precision: str = "double"
+
+    @property
+    def step(self) -> float:
+        """Relative step over one rounding, 2 u."""
+        return 2.0 * UNIT[self.precision]
+
+    @property
+    def tiny(self) -> float:
+        """Above what underflow takes."""
+        return _TINY[self.precision]
+
+    def down(self, value: ca.SX, units: float = 1.0, tiny: bool = False) -> ca.SX:
+        """Return a number below a value whose rounding error is at most that many half units."""
+        stepped = value - (units * self.step) * ca.fabs(value)
+        return stepped - self.tiny if tiny else stepped
+
+    def up(self, value: ca.SX, units: float = 1.0, tiny: bool = False) -> ca.SX:
+        """Return a number above such a value."""
+        stepped = value + (units * self.step) * ca.fabs(value)
+        return stepped + self.tiny if tiny else stepped
+
+    def interval(
+        self,
+        lower: ca.SX,
+        upper: ca.SX,
+        low: float,
+        high: float,
+        units: float = 1.0,
+        tiny: bool = True,
+    ) -> Lifted:
+        """Return the interval around rounded ends; ends below zero by rounding alone are zero."""
+        below, above = self.down(lower, units, tiny), self.up(upper, units, tiny)
+        if low == 0.0:
+            below = ca.fmax(below, 0.0)
+        if high == 0.0:
+            above = ca.fmin(above, 0.0)
+        return Lifted(below, above, low, high)
+
+
+def lift(
+    program: Program,
+    nodes: Sequence[int],
+    variables: Sequence[Lifted],
+    rounding: Rounding | None = None,
+) -> list[Lifted]:
+    """Return what nodes of a program enclose for variables between lifted ends."""
+    arithmetic = _Arithmetic(Rounding() if rounding is None else rounding)
+    found: dict[int, Lifted] = {}
+    for index in _needed(program, nodes):
+        node = program.nodes[index]
+        if index in program.constants:
+            low, high = (float(end[0]) for end in program.constants[index])
+            found[index] = Lifted.number(*_within(low, high))
+        elif node.op == "input":
+            found[index] = variables[node.number]
+        else:
+            found[index] = arithmetic.apply(node, [found[a] for a in node.args])
+    return [found[index] for index in nodes]
+
+
+def combine(op: str, *args: Lifted, rounding: Rounding) -> Lifted:
+    """Return one operation of the rules, ``add``, ``subtract``, ``multiply`` or ``divide``."""
+    return _Arithmetic(rounding).apply(Node(op), list(args))
+
+
+def _needed(program: Program, nodes: Sequence[int]) -> list[int]:
+    needed: set[int] = set()
+    stack = list(nodes)
+    while stack:
+        index = stack.pop()
+        if index not in needed:
+            needed.add(index)
+            stack.extend(() if index in program.constants else program.nodes[index].args)
+    return sorted(needed)
+
+
+def _within(low: float, high: float) -> tuple[float, float]:
+    """Return numbers with `FAR` in place of what is beyond, or unknown."""
+    known = not (np.isnan(low) or np.isnan(high))
+    return (max(low, -FAR), min(high, FAR)) if known else (-FAR, FAR)
+
+
+@dataclass(frozen=True, eq=False)
+class _Arithmetic:
+    rounding: Rounding
+
+    def apply(self, node: Node, args: list[Lifted]) -> Lifted:
+        """Return one operation, by its lifted form or by its numbers."""
+        extra = (node.number,) if node.op == "power_int" else ()
+        ends = [(np.array([a.low]), np.array([a.high])) for a in args]
+        with np.errstate(all="ignore"):
+            low, high = (float(end[0]) for end in RULES[node.op](*ends, *extra))
+        nowhere = bool(np.isnan([low, high]).any())
+        low, high = _within(low, high)
+        form = _FORMS.get(node.op)
+        if form is None or (nowhere and node.op != "divide"):
+            return Lifted.number(low, high)
+        lifted = form(
+            self, [_clamped(a) for a in args] if node.op in PARTIAL else args, low, high, *extra
+        )
+        return Lifted.number(low, high) if lifted is None else lifted
+
+    def add(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        if _zero(a) or _zero(b):
+            return b if _zero(a) else a
+        return self.rounding.interval(a.lower + b.lower, a.upper + b.upper, low, high, tiny=False)
+
+    def subtract(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        if _zero(a) or _zero(b):
+            return self.negate([b], low, high) if _zero(a) else a
+        return self.rounding.interval(a.lower - b.upper, a.upper - b.lower, low, high, tiny=False)
+
+    def negate(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return Lifted(-args[0].upper, -args[0].lower, low, high)
+
+    def twice(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return Lifted(2.0 * args[0].lower, 2.0 * args[0].upper, low, high)
+
+    def multiply(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        if any(map(_zero, args)):
+            return Lifted.number(0.0)
+        return self.rounding.interval(*_product(*args), low, high)
+
+    def divide(self, args: list[Lifted], low: float, high: float) -> Lifted | None:
+        a, b = args
+        if not (b.low > 0.0 or b.high < 0.0):
+            return self._divide_open(a, b)
+        pairs = [(p, q) for p in _ends(a) for q in _ends(b)]
+        if a.low >= 0.0 or a.high <= 0.0:
+            # signs known: the ends that make the quotient smallest and largest
+            top, bottom = (a.lower, a.upper), (b.lower, b.upper)
+            if b.high < 0.0:
+                top, bottom = (-a.upper, -a.lower), (-b.upper, -b.lower)
+            nonnegative = (a.low >= 0.0) == (b.low > 0.0)
+            order = (1, 0) if nonnegative else (0, 1)
+            lower, upper = top[0] / bottom[order[0]], top[1] / bottom[order[1]]
+        else:
+            quotients = [p / q for p, q in pairs]
+            lower, upper = reduce(ca.fmin, quotients), reduce(ca.fmax, quotients)
+        return self.rounding.interval(lower, upper, low, high)
+
+    def _divide_open(self, a: Lifted, b: Lifted) -> Lifted:
+        """Divide by what may be zero: nothing where it may."""
+        apart = ca.logic_or(b.lower > 0.0, b.upper < 0.0)
+        safe = [ca.if_else(apart, end, 1.0) for end in _ends(b)]
+        quotients = [p / q for p in _ends(a) for q in safe]
+        found = self.rounding.interval(
+            reduce(ca.fmin, quotients), reduce(ca.fmax, quotients), -FAR, FAR
+        )
+        return Lifted(ca.if_else(apart, found.lower, -FAR), ca.if_else(apart, found.upper, FAR))
+
+    def power_int(self, args: list[Lifted], low: float, high: float, n: int) -> Lifted:
+        (a,) = args
+        units = 1.0 if n == 2 else 2.0 * ULPS
+        lower, upper = (_to(end, n) for end in (a.lower, a.upper))
+        if n % 2 == 0 and a.low < 0.0:
+            if a.high <= 0.0:
+                lower, upper = upper, lower
+            else:
+                inside = ca.logic_and(a.lower <= 0.0, a.upper >= 0.0)
+                lower, upper = (
+                    ca.if_else(inside, 0.0, ca.fmin(lower, upper)),
+                    ca.fmax(lower, upper),
+                )
+        return self.rounding.interval(lower, upper, low, high, units)
+
+    def sqrt(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        (a,) = args
+        return self.rounding.interval(ca.sqrt(a.lower), ca.sqrt(a.upper), low, high, tiny=False)
+
+    def nonnegative(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return args[0]
+
+    def absolute(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        (a,) = args
+        if a.low >= 0.0:
+            return a
+        if a.high <= 0.0:
+            return Lifted(-a.upper, -a.lower, low, high)
+        return Lifted(
+            ca.fmax(ca.fmax(a.lower, -a.upper), 0.0), ca.fmax(-a.lower, a.upper), low, high
+        )
+
+    def minimum(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(ca.fmin(a.lower, b.lower), ca.fmin(a.upper, b.upper), low, high)
+
+    def maximum(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(ca.fmax(a.lower, b.lower), ca.fmax(a.upper, b.upper), low, high)
+
+    def meet(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(ca.fmax(a.lower, b.lower), ca.fmin(a.upper, b.upper), low, high)
+
+    def with_zero(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return Lifted(ca.fmin(args[0].lower, 0.0), ca.fmax(args[0].upper, 0.0), low, high)
+
+    def power_const(self, args: list[Lifted], low: float, high: float) -> Lifted | None:
+        a, p = args
+        if p.low != p.high:
+            return None
+        ends = [a.lower**p.low, a.upper**p.low]
+        lower, upper = ends if p.low >= 0.0 else ends[::-1]
+        return self.rounding.interval(lower, upper, low, high, 2.0 * ULPS)
+
+    def corners(
+        self, function: Callable[..., ca.SX], args: list[Lifted], low: float, high: float
+    ) -> Lifted:
+        """Enclose a function of two variables that is monotone in each of them."""
+        values = [function(p, q) for p in _ends(args[0]) for q in _ends(args[1])]
+        lower, upper = reduce(ca.fmin, values), reduce(ca.fmax, values)
+        return self.rounding.interval(lower, upper, low, high, 2.0 * ULPS)
+
+    def arctangent2(self, args: list[Lifted], low: float, high: float) -> Lifted | None:
+        y, x = args
+        whole = x.low > 0.0 or y.low > 0.0 or y.high < 0.0
+        return self.corners(ca.atan2, args, low, high) if whole else None
+
+    def hypotenuse(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return self.corners(ca.hypot, [self.absolute([a], 0.0, FAR) for a in args], low, high)
+
+    def cosh(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return _increasing(ca.cosh)(self, [self.absolute(args, 0.0, FAR)], low, high)
+
+    def wave(
+        self,
+        function: Callable[[ca.SX], ca.SX],
+        crest: float,
+        args: list[Lifted],
+        low: float,
+        high: float,
+    ) -> Lifted:
+        """Enclose a sine or cosine: its crest at a phase, its trough half a period on."""
+        (a,) = args
+        left, right = function(a.lower), function(a.upper)
+        found = self.rounding.interval(
+            ca.fmin(left, right), ca.fmax(left, right), -1.0, 1.0, 2.0 * ULPS
+        )
+        unknown = ca.logic_not(ca.fmax(ca.fabs(a.lower), ca.fabs(a.upper)) < _LARGE_ANGLE)
+        lower, upper = ca.fmax(found.lower, -1.0), ca.fmin(found.upper, 1.0)
+        if self._may_cross(a, crest):
+            top = ca.logic_or(self._crosses(a, crest), unknown)
+            upper = ca.if_else(top, 1.0, upper)
+        if self._may_cross(a, crest + np.pi):
+            bottom = ca.logic_or(self._crosses(a, crest + np.pi), unknown)
+            lower = ca.if_else(bottom, -1.0, lower)
+        return Lifted(lower, upper, low, high)
+
+    def _margin(self) -> float:
+        return 16.0 * self.rounding.step
+
+    def _may_cross(self, a: Lifted, phase: float) -> bool:
+        """Whether an extremum can lie between the numbers at all."""
+        if max(abs(a.low), abs(a.high)) >= _LARGE_ANGLE:
+            return True
+        margin = self._margin() * (abs(a.low) + abs(a.high) + 4.0)
+        first = np.ceil((a.low - phase - margin) / _TWO_PI)
+        return bool(first * _TWO_PI <= a.high - phase + margin)
+
+    def _crosses(self, a: Lifted, phase: float) -> ca.SX:
+        margin = self._margin() * (ca.fabs(a.lower) + ca.fabs(a.upper) + 4.0)
+        first = ca.ceil((a.lower - phase - margin) / _TWO_PI)
+        return first * _TWO_PI <= a.upper - phase + margin
+
+    def select(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        condition, a, b = args
+        true, false = condition.lower > 0.0, condition.upper <= 0.0
+        lower = ca.if_else(true, a.lower, ca.if_else(false, b.lower, ca.fmin(a.lower, b.lower)))
+        upper = ca.if_else(true, a.upper, ca.if_else(false, b.upper, ca.fmax(a.upper, b.upper)))
+        return Lifted(lower, upper, low, high)
+
+    def if_else_zero(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return self.select([*args, Lifted.number(0.0)], low, high)
+
+    def less(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(a.upper < b.lower, a.lower < b.upper, low, high)
+
+    def less_equal(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(a.upper <= b.lower, a.lower <= b.upper, low, high)
+
+    def boundary_weight(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        a, b = args
+        return Lifted(a.upper < b.lower, a.lower <= b.upper, low, high)
+
+    def logical_not(self, args: list[Lifted], low: float, high: float) -> Lifted:
+        return Lifted(args[0].upper <= 0.0, args[0].lower <= 0.0, low, high)
+
+
+def _clamped(a: Lifted) -> Lifted:
+    """Keep the ends between the numbers, where an operation is not defined beyond them."""
+    if ca.SX(a.lower).is_constant() and ca.SX(a.upper).is_constant():
+        return a
+    return Lifted(ca.fmax(a.lower, a.low), ca.fmin(a.upper, a.high), a.low, a.high)
+
+
+def _ends(a: Lifted) -> tuple[ca.SX, ...]:
+    return (a.lower,) if ca.is_equal(a.lower, a.upper, 2) else (a.lower, a.upper)
+
+
+def _product(a: Lifted, b: Lifted) -> tuple[ca.SX, ca.SX]:
+    """Multiply with as few products as the known signs allow; rounded ends."""
+    if a.low < 0.0 < a.high and not b.low < 0.0 < b.high:
+        a, b = b, a
+    if a.high <= 0.0 and a.low < 0.0:
+        lower, upper = _product(Lifted(-a.upper, -a.lower, -a.high, -a.low), b)
+        return -upper, -lower
+    if a.low >= 0.0:
+        least = (a.upper if b.high <= 0.0 else a.lower) if _signed(b) else None
+        most = (a.lower if b.high <= 0.0 else a.upper) if _signed(b) else None
+        if least is not None and most is not None:
+            return least * b.lower, most * b.upper
+        if len(_ends(a)) == 1:
+            return a.lower * b.lower, a.lower * b.upper
+        return (
+            ca.fmin(a.lower * b.lower, a.upper * b.lower),
+            ca.fmax(a.lower * b.upper, a.upper * b.upper),
+        )
+    products = [p * q for p in _ends(a) for q in _ends(b)]
+    return reduce(ca.fmin, products), reduce(ca.fmax, products)
+
+
+def _zero(a: Lifted) -> bool:
+    return a.low == 0.0 == a.high
+
+
+def _signed(a: Lifted) -> bool:
+    return a.low >= 0.0 or a.high <= 0.0
+
+
+def _to(value: ca.SX, n: int) -> ca.SX:
+    return value * value if n == 2 else value**n
+
+
+def _increasing(function: Callable[[ca.SX], ca.SX]) -> Callable[..., Lifted]:
+    def form(arithmetic: _Arithmetic, args: list[Lifted], low: float, high: float) -> Lifted:
+        found = arithmetic.rounding.interval(
+            function(args[0].lower), function(args[0].upper), low, high, 2.0 * ULPS
+        )
+        return Lifted(ca.fmax(found.lower, low), ca.fmin(found.upper, high), low, high)
+
+    return form
+
+
+_OWN = """add subtract negate twice multiply divide power_int sqrt nonnegative absolute minimum
+maximum meet with_zero power_const select if_else_zero less less_equal boundary_weight logical_not
+arctangent2 hypotenuse cosh"""
+_INCREASING = "exp expm1 log log1p sinh tanh asinh acosh atanh asin atan erf"
+_FORMS: Mapping[str, Callable[..., Lifted | None]] = {
+    **{name: getattr(_Arithmetic, name) for name in _OWN.split()},
+    **{name: _increasing(getattr(ca, name)) for name in _INCREASING.split()},
+    "tangent": _increasing(ca.tan),
+    "power": lambda self, *given: self.corners(lambda a, b: a**b, *given),
+    "conjunction": _Arithmetic.minimum,
+    "disjunction": _Arithmetic.maximum,
+    "sine": lambda self, *given: self.wave(ca.sin, 0.5 * np.pi, *given),
+    "cosine": lambda self, *given: self.wave(ca.cos, 0.0, *given),
+}

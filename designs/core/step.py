@@ -1,0 +1,277 @@
+"""The assembled step: readings, two copies of the sets, what is returned and what is remembered."""
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
+from obsynth.designs.core.equations import Before, covered_inputs
+from obsynth.designs.core.guard import YOUNG, Guard
+from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.stepping import (
+    FINITE,
+    all_finite,
+    finite_or,
+    make_step,
+    select,
+    status_word,
+)
+
+HUGE = 1e50
+"""Widths of a core's set from which on it knows nothing."""
+
+
+class _Copy:
+    """What one of the two copies of sets and bounds holds at an instant."""
+
+    def __init__(
+        self, X: Ends, now: Ends, late: Ends, shown: Ends, known: Known, again: ca.SX, told: ca.SX
+    ) -> None:
+        self.X, self.now, self.late, self.shown, self.known = X, now, late, shown, known
+        self.again = again
+        self.empty = ca.logic_and(told, known.empty)
+        for box in (X, now, late, shown):
+            self.empty = ca.logic_or(self.empty, box.empty())
+
+
+class Step:
+    """The symbols of one step and what is made of them."""
+
+    def __init__(self, guard: Guard, core: Core) -> None:
+        plant = guard.plant
+        self.guard, self.core, self.plant = guard, core, plant
+        self.contractor = guard.contractor
+        x_box, f_box = plant.box("x"), plant.box("f").reshape(-1, 2)
+        own = self.contractor.domain if core.domain is None else core.domain
+        self.domain = np.column_stack(
+            [
+                np.maximum(self.contractor.domain[:, 0], own[:, 0]),
+                np.minimum(self.contractor.domain[:, 1], own[:, 1]),
+            ]
+        )
+        self.reset = Ends.of(x_box), Ends.of(f_box)
+        self.layout = guard.layout()
+        self.memory = ca.SX.sym("memory", self.layout["initialised"].stop)
+        self.u, self.y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output_names))
+        self.theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
+        empty = ca.SX(0, 1)
+        self.part = {name: self.memory[place] for name, place in self.layout.items()}
+        for name in (*guard.sizes, "f_lower", "f_upper", "before"):
+            for key in (name, name + YOUNG):
+                self.part.setdefault(key, empty)
+        self.finite = ca.logic_and(all_finite(self.u), all_finite(self.theta))
+        self.u_used, self.theta_used, self.covered = self._signals()
+        self.used, self.left_out, self.impossible = self._readings()
+
+    def _signals(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Make inputs and scheduling finite, and tell whether they are covered.
+
+        Covered are measured scheduling variables inside of their ranges, and inputs inside of
+        theirs where they do not enter with constant factors: elsewhere their size does not matter
+        to what was derived.
+        """
+        plant = self.plant
+        measured = [s for s in plant.rho if s.measured]
+        nominal = [0.0 if s.nominal is None else float(s.nominal) for s in plant.u]
+        middle = [0.5 * (s.lower + s.upper) if s.bounded else 0.0 for s in measured]
+        u, theta = finite_or(self.u, nominal), finite_or(self.theta, middle)
+        matters = covered_inputs(plant).tolist()
+        held = [(u[i], s) for i, s in enumerate(plant.u) if matters[i]]
+        covered = ca.SX(1)
+        for value, signal in [(theta[i], s) for i, s in enumerate(measured)] + held:
+            fits = ca.logic_and(value >= signal.lower, value <= signal.upper)
+            covered = ca.logic_and(covered, fits)
+        return u, theta, covered
+
+    def _readings(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
+        """Tell which readings are used, whether one is not, and whether one is impossible."""
+        declared, shown = self.plant.output_ranges, self.contractor.shown(self.domain)
+        used, left_out, impossible = [], ca.SX(0), ca.SX(0)
+        for i in range(self.y.numel()):
+            finite = ca.fabs(self.y[i]) <= FINITE
+            own = bool(np.isfinite(declared[i]).any())
+            low, high = declared[i] if own else shown[i]
+            fits = ca.logic_and(self.y[i] >= low, self.y[i] <= high)
+            used.append(ca.logic_and(finite, fits))
+            left_out = ca.logic_or(left_out, ca.logic_not(used[-1]))
+            if not own:
+                impossible = ca.logic_or(impossible, ca.logic_and(finite, ca.logic_not(fits)))
+        return used, left_out, impossible
+
+    def _kept(self, copies: tuple[ca.SX, ca.SX], boxes: tuple[Ends, Ends]) -> dict[str, ca.SX]:
+        """Return the estimates, placed anew where both copies begin and they are of no use."""
+        kept = {name: self.part[name] for name in self.guard.shared}
+        if self.core.place is None:
+            return kept
+        placed = self.core.place(*boxes, kept)
+        both = ca.logic_and(*copies)
+        return {name: select(both, placed[name], kept[name]) for name in kept}
+
+    def _sets(self, end: str, have: ca.SX) -> tuple[Ends, Ends, Before]:
+        """Return the sets of states and faults before the core is asked."""
+        contractor, part = self.contractor, self.part
+        F = Ends(part["f_lower" + end], part["f_upper" + end])
+        stored, image = self.reset[0], None
+        if self.guard.discrete:
+            stored = Ends(part["x_lower" + end], part["x_upper" + end])
+        before = Before(stored, F, part["before"])
+        X = Ends.of(self.domain)
+        if self.guard.discrete and "image" in contractor.cuts:
+            image = contractor.image(before)
+            X = X.meet(image)
+        X = contractor.measure(X.where(have, stored), self.y, self.used)
+        now = contractor.drift(F).meet(self.reset[1]).where(have, F)
+        return X, now, before
+
+    def _copy(self, end: str, have: ca.SX, sets: tuple[Ends, Ends, Before], kept: Parts) -> _Copy:
+        """Run the core of one copy on its sets."""
+        core, contractor, delay = self.core, self.contractor, self.guard.delay
+        X, now, before = sets
+        names = [k for k in self.guard.sizes if k not in (*self.guard.shared, "initialised")]
+        own = {name: self.part[name + end] for name in names}
+        begun = core.begin(X, now, kept)
+        begins = self.part["begin" + end] > 0.5
+        own = {name: select(begins, begun[name], own[name]) for name in names}
+        seen = Seen({**kept, **own}, self.u_used, self.theta_used, self.y_clean, self.used)
+        known = core.run(seen)
+        told = ca.SX(1) if core.bridges else seen.all_used
+        huge = ca.SX(0)
+        if known.x is not None:
+            for i in range(known.x.lower.numel()):
+                near = known.x.upper[i] - known.x.lower[i] < HUGE
+                huge = ca.logic_or(huge, ca.logic_not(near))
+            X = X.meet(known.x).where(told, X)
+        late = before.faults
+        if self.guard.discrete:
+            late = contractor.invert(before, X).where(have, late)
+        if known.f is not None and delay:
+            late = late.meet(known.f).where(told, late)
+        now = contractor.drift(late).meet(self.reset[1]).where(have, before.faults)
+        shown = late if delay else now
+        if known.f is not None and not delay:
+            shown = now.meet(known.f).where(told, now)
+            now = now if core.mean_fault else shown
+        again = ca.logic_or(ca.logic_not(ca.logic_and(told, known.sound)), huge)
+        return _Copy(X, now, late, shown, known, again, told)
+
+    @property
+    def y_clean(self) -> ca.SX:
+        """The readings, zero where they are not used."""
+        return ca.vertcat(*(ca.if_else(bit, self.y[i], 0.0) for i, bit in enumerate(self.used)))
+
+    def build(self) -> ca.Function:
+        """Assemble the function."""
+        N, age = float(self.guard.watch.horizon), self.part["age"]
+        have = age > 0.5
+        both = have, ca.logic_and(have, ca.fabs(age - N) > 0.5)
+        sets = [self._sets(end, one) for end, one in zip(("", YOUNG), both, strict=True)]
+        begins = self.part["begin"] > 0.5, self.part["begin" + YOUNG] > 0.5
+        kept = self._kept(begins, (sets[0][0], sets[0][1]))
+        old, young = (
+            self._copy(end, one, found, kept)
+            for end, one, found in zip(("", YOUNG), both, sets, strict=True)
+        )
+        X, shown = old.X.meet(young.X), old.shown.meet(young.shown)
+        empty = ca.logic_or(
+            ca.logic_or(old.empty, young.empty), ca.logic_or(X.empty(), shown.empty())
+        )
+        initialised = self.part["initialised"] > 0.5
+        void = ca.logic_and(initialised, ca.logic_or(empty, self.impossible))
+        F = shown.where(have, self.reset[1]) if self.guard.delay else shown
+        X, F = self._returned(X, 0, void, initialised), self._returned(F, 1, void, initialised)
+        moved = self._moved(old, young, void)
+        memory = ca.vertcat(*(moved[name] for name in self.layout))
+        inputs = {"memory": self.memory, "u": self.u, "y": self.y}
+        if self.theta.numel():
+            inputs["theta"] = self.theta
+        outputs = {
+            "memory": select(initialised, memory, self.memory),
+            "xhat": _inside(old.known.xhat, X),
+            "fhat": _inside(old.known.fhat, F),
+            "x_lower": _open(X.lower, -1.0),
+            "x_upper": _open(X.upper, 1.0),
+            "f_lower": _open(F.lower, -1.0),
+            "f_upper": _open(F.upper, 1.0),
+            "status": self._status(initialised, void, have, F, old.known),
+        }
+        return make_step(inputs, outputs)
+
+    def _returned(self, box: Ends, kind: int, void: ca.SX, initialised: ca.SX) -> Ends:
+        """Return a set, the declared ranges where it is void, everything before the first call."""
+        everything = Ends.unbounded(box.lower.numel())
+        return self.reset[kind].where(void, box).where(initialised, everything)
+
+    def _moved(self, old: _Copy, young: _Copy, void: ca.SX) -> dict[str, ca.SX]:
+        """Return the parts of the next memory."""
+        N, age = float(self.guard.watch.horizon), self.part["age"] + 1.0
+        going = ca.logic_and(ca.logic_not(void), ca.logic_and(self.finite, self.covered))
+        over = age >= 2.0 * N - 0.5
+        turn = ca.logic_or(over, ca.fabs(age - N) < 0.5)
+        moved: dict[str, ca.SX] = {}
+        for name in self.guard.sizes:
+            if name == "initialised":
+                continue
+            mine, other = old.known.moved[name], young.known.moved[name]
+            moved[name] = mine if name in self.guard.shared else select(over, other, mine)
+            moved[name + YOUNG] = other
+        carried = {"f": (old.now, young.now, self.reset[1])}
+        if self.guard.discrete:
+            carried["x"] = (old.X, young.X, self.reset[0])
+        for name, (first, second, reset) in carried.items():
+            fresh = second.where(ca.logic_and(going, ca.logic_not(turn)), reset)
+            kept = second.where(over, first).where(going, reset)
+            for end, box in (("", kept), (YOUNG, fresh)):
+                moved[f"{name}_lower{end}"], moved[f"{name}_upper{end}"] = box.lower, box.upper
+        stopped = ca.logic_not(going)
+        moved["begin"] = ca.logic_or(stopped, ca.if_else(over, young.again, old.again))
+        moved["begin" + YOUNG] = ca.logic_or(stopped, ca.logic_or(turn, young.again))
+        moved["before"] = ca.vertcat(self.u_used, self.theta_used)
+        moved["age"] = ca.if_else(going, ca.if_else(over, N, age), 0.0)
+        recovery = float(self.guard.watch.recovery)
+        since = ca.fmin(self.part["since"] + 1.0, recovery)
+        moved["since"] = ca.if_else(void, 0.0, since)
+        moved["initialised"] = ca.SX(1)
+        return moved
+
+    def _status(self, initialised: ca.SX, void: ca.SX, have: ca.SX, F: Ends, known: Known) -> ca.SX:
+        """Return the status word."""
+        unknown = ca.logic_not(known.valid)
+        if self.guard.delay:
+            unknown = ca.logic_or(unknown, ca.logic_not(have))
+        for j in range(F.lower.numel() if known.f is not None else 0):
+            unknown = ca.logic_or(unknown, F.lower[j] < -0.5 * FAR)
+            unknown = ca.logic_or(unknown, F.upper[j] > 0.5 * FAR)
+        recovering = self.part["since"] < self.guard.watch.recovery - 0.5
+        out = ca.logic_or(
+            ca.logic_not(self.covered), ca.logic_and(known.outside, ca.logic_not(void))
+        )
+        return status_word(
+            {
+                "not_initialised": ca.logic_not(initialised),
+                "non_finite_input": ca.logic_not(self.finite),
+                "outside_domain": out,
+                "void": void,
+                "fault_not_valid": unknown if F.lower.numel() else ca.SX(0),
+                "measurement_left_out": self.left_out,
+                "recovering": ca.logic_and(
+                    initialised, ca.logic_and(ca.logic_not(void), recovering)
+                ),
+            }
+        )
+
+
+def _inside(value: ca.SX, box: Ends) -> ca.SX:
+    """Return the nearest point of a box; its middle for what is not a number."""
+    entries = []
+    for i in range(value.numel()):
+        number = ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0)
+        entries.append(ca.fmin(ca.fmax(number, box.lower[i]), box.upper[i]))
+    return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+
+
+def _open(ends: ca.SX, sign: float) -> ca.SX:
+    """Write infinity for ends that are none."""
+    entries = [
+        ca.if_else(sign * ends[i] > 0.5 * FAR, sign * ca.inf, ends[i]) for i in range(ends.numel())
+    ]
+    return ca.vertcat(*entries) if entries else ca.SX(0, 1)
