@@ -17,10 +17,14 @@ from obsynth.symbolic.arrays import FloatArray
 
 _MEANINGS = {
     "not_initialised": "the state has not been initialised; nothing else is of use",
-    "non_finite_input": "an input or a measurement is NaN, infinite or absurdly large",
-    "outside_domain": "the returned set is not inside the domain where the guarantee holds",
-    "inconsistent_measurement": "the measurement contradicts the set: an assumption is violated",
+    "non_finite_input": "an input is NaN, infinite or absurdly large: the sets begin anew",
+    "outside_domain": "the returned set, or a scheduling signal, is outside of the domain where "
+    "the guarantee holds",
+    "void": "a set is empty or a reading impossible: an assumption failed since the last void "
+    "step; the declared ranges are returned",
     "fault_not_valid": "the fault estimate and its bounds are not valid",
+    "measurement_left_out": "a reading is missing or outside of its range, and left out",
+    "recovering": "fewer steps than the recovery since a void one",
 }
 
 _ARGUMENTS = {

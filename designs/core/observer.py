@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
+import numpy as np
 
 from obsynth.designs.core.certificate import Certificate, Guarantee
 from obsynth.symbolic.arrays import FloatArray
@@ -63,7 +64,8 @@ class Observer:
     gains : mapping of str to ndarray
     performance : mapping of str to float
     half_widths : ndarray of shape (n + n_f,) or None
-        Guaranteed steady half widths, states then faults.
+        Guaranteed steady half widths of the returned sets, states then faults; those of the
+        method alone are ``performance["core_half_widths"]``.
     certificate : Certificate
     guarantee : Guarantee
     fault_delay : int
@@ -93,9 +95,26 @@ class Observer:
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """The performance as it is shown: what no claim proves says so."""
+        """The numbers of the performance as they are shown: what no claim proves says so."""
         marks = dict.fromkeys(self.searched, " (searched, not proved)")
-        return {key + marks.get(key, ""): value for key, value in self.performance.items()}
+        return {
+            key + marks.get(key, ""): value
+            for key, value in self.performance.items()
+            if isinstance(value, int | float)
+        }
+
+    @property
+    def widths(self) -> Mapping[str, str]:
+        """The half widths in words, by the names of states and faults; vacuous ones say so."""
+        if self.half_widths is None:
+            return {}
+        boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
+        declared = 0.5 * np.diff(boxes, axis=1)[:, 0]
+        names = (*self.model.names("x"), *self.model.names("f"))
+        return {
+            name: f"+-{width:.4g}" + (", no more than is declared" if width >= limit else "")
+            for name, width, limit in zip(names, self.half_widths, declared, strict=True)
+        }
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -162,24 +181,20 @@ class Observer:
         save(self, path)
 
     def __str__(self) -> str:
-        names = (*self.model.names("x"), *self.model.names("f"))
         lines = [f"{self.method} for {self.model.name}"]
-        if self.half_widths is not None:
-            pairs = zip(names, self.half_widths, strict=True)
-            lines.append("  " + ", ".join(f"{name} +-{width:.4g}" for name, width in pairs))
+        if self.widths:
+            lines.append("  " + ", ".join(f"{name} {word}" for name, word in self.widths.items()))
         lines += [f"  {key} = {value:.6g}" for key, value in self.figures.items()]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         from html import escape
 
-        names = (*self.model.names("x"), *self.model.names("f"))
-        rows, left = "", "style='text-align:left'"
-        if self.half_widths is not None:
-            rows = "".join(
-                f"<tr><td {left}>{escape(name)}</td><td>&plusmn;{width:.4g}</td></tr>"
-                for name, width in zip(names, self.half_widths, strict=True)
-            )
+        left = "style='text-align:left'"
+        rows = "".join(
+            f"<tr><td {left}>{escape(name)}</td><td>{escape(word)}</td></tr>"
+            for name, word in self.widths.items()
+        )
         facts = "".join(
             f"<tr><td {left}>{escape(key)}</td><td>{value:.6g}</td></tr>"
             for key, value in self.figures.items()
