@@ -23,6 +23,7 @@ from typing import Literal, get_args
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.intervals.program import CONSTANT_ULPS, constant_interval
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.equations import Before, Equations
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding
@@ -79,7 +80,7 @@ class Contractor:
     @cached_property
     def rates(self) -> FloatArray:
         """What every fault moves at most from one call to the next, shape (n_f,)."""
-        step = 1.0 if self.plant.Ts is not None else self.Ts
+        step = 1.0 if self.plant.Ts is not None else self.Ts * (1.0 + 2.0**-50)
         found = [np.inf if s.rate is None else float(s.rate) * step for s in self.plant.f]
         still = [0.0 if s.constant else r for s, r in zip(self.plant.f, found, strict=True)]
         return np.array(still)
@@ -128,15 +129,15 @@ class Contractor:
         below, above = r.down(y - strip.high), r.up(y - strip.low)
         for k in np.flatnonzero(strip.row).tolist():
             if k != j:
-                c = float(strip.row[k])
+                c, units = float(strip.row[k]), _units(strip.row[k])
                 least, most = (low[k], high[k]) if c > 0 else (high[k], low[k])
-                below = r.down(below - r.up(c * most, tiny=True))
-                above = r.up(above - r.down(c * least, tiny=True))
-        c = float(strip.row[j])
+                below = r.down(below - r.up(c * most, units, tiny=True))
+                above = r.up(above - r.down(c * least, units, tiny=True))
+        c, units = float(strip.row[j]), _units(strip.row[j])
         if c == 1.0:
             return below, above
         ends = (below / c, above / c) if c > 0 else (above / c, below / c)
-        return r.down(ends[0], tiny=True), r.up(ends[1], tiny=True)
+        return r.down(ends[0], units, tiny=True), r.up(ends[1], units, tiny=True)
 
     def image(self, before: Before) -> Ends:
         """Return what the states can be one call later, unbounded where a row has no image."""
@@ -215,6 +216,12 @@ class Contractor:
         slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
         found: FloatArray = np.concatenate([x, late if delay else now]) + slack
         return found
+
+
+def _units(coefficient: float) -> float:
+    """Return how many roundings a product takes: the coefficient may stand for a number near it."""
+    low, high = constant_interval(float(coefficient))
+    return 1.0 if low == high else 2.0 + CONSTANT_ULPS
 
 
 def _finite(halves: FloatArray, row: FloatArray, j: int) -> FloatArray:

@@ -111,15 +111,15 @@ class Step:
         """Return the sets of states and faults before the core is asked."""
         contractor, part = self.contractor, self.part
         F = Ends(part["f_lower" + end], part["f_upper" + end])
-        stored, image = self.reset[0], None
+        stored = self.reset[0]
         if self.guard.discrete:
             stored = Ends(part["x_lower" + end], part["x_upper" + end])
         before = Before(stored, F, part["before"])
         X = Ends.of(self.domain)
         if self.guard.discrete and "image" in contractor.cuts:
-            image = contractor.image(before)
-            X = X.meet(image)
-        X = contractor.measure(X.where(have, stored), self.y, self.used)
+            X = X.meet(contractor.image(before))
+        X = X.where(have, Ends.of(self.domain).meet(stored))
+        X = contractor.measure(X, self.y, self.used)
         now = contractor.drift(F).meet(self.reset[1]).where(have, F)
         return X, now, before
 

@@ -154,10 +154,13 @@ def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:
 def make_step(inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) -> ca.Function:
     """Return `Observer.step` with its inputs (memory, u, y[, theta]) and outputs in their order."""
     names = [name for name in ("memory", "u", "y", "theta") if name in inputs]
+    # what the two copies have in common is evaluated once
+    sizes = np.cumsum([0, *(outputs[name].numel() for name in STEP_OUTPUTS)])
+    together = ca.cse(ca.vertcat(*(ca.densify(outputs[name]) for name in STEP_OUTPUTS)))
     return ca.Function(
         "step",
         [inputs[name] for name in names],
-        [ca.densify(outputs[name]) for name in STEP_OUTPUTS],
+        [together[a:b] for a, b in itertools.pairwise(sizes.tolist())],
         names,
         list(STEP_OUTPUTS),
         {"allow_duplicate_io_names": True},
