@@ -128,6 +128,7 @@ class BoundedErrorUIO(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
+        quiet=True,
         step=build_step,
     )
 

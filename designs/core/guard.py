@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.given import Start
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.stepping import slices
 from obsynth.symbolic import Plant
@@ -107,12 +106,14 @@ class Guard:
         ends = {"age": 1, "since": 1, "initialised": 1}
         return slices({k: s for k, s in (single | twice | young | before | ends).items() if s})
 
-    def first(self, parts: Mapping[str, ArrayLike], start: Start) -> dict[str, ArrayLike]:
+    def first(
+        self, parts: Mapping[str, ArrayLike], x: FloatArray, f: FloatArray
+    ) -> dict[str, ArrayLike]:
         """Return the first memory: the core's own first parts, and boxes of the first instant.
 
         A discrete core begins at the first call from the boxes, cut with the first readings.
         """
-        boxes = {"x": start.x, "f": start.f} if self.discrete else {"f": self.plant.box("f")}
+        boxes = {"x": x, "f": f} if self.discrete else {"f": self.plant.box("f")}
         ends: dict[str, ArrayLike] = {}
         for name, box in boxes.items():
             near = np.clip(box, -FAR, FAR)

@@ -66,6 +66,8 @@ class Contract(Generic[D]):
     shared: parts of the memory that estimates are made of
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
+    quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
+        without, the declared ranges hold
     """
 
     name: str
@@ -83,6 +85,7 @@ class Contract(Generic[D]):
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
+    quiet: bool = False
 
     def to_record(self, design: Any) -> dict[str, Any]:
         """Return a design as JSON-able data with the header that `load` reads."""
@@ -175,7 +178,8 @@ class Contract(Generic[D]):
         given = Start.read(design.plant, guess, x_range, f_range, y0)
         parts = self.first(design, given, **options)
         if self.core is not None:
-            parts = self.guard(design).first(parts, given)
+            f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
+            parts = self.guard(design).first(parts, given.x, f_box)
         return fill(self.layout(design), parts)
 
 

@@ -154,7 +154,8 @@ class Observer:
         x_range : array_like of shape (n, 2), optional
             Box that holds the first state; the declared ranges by default.
         f_range : array_like of shape (n_f, 2), optional
-            Box that holds the first faults; zero (no fault at the start) by default.
+            Box that holds the first faults. By default zero (no fault at the start) for
+            BoundedErrorUIO and QPVObserver, the declared ranges for the others.
         y0 : array_like of shape (m,), optional
             The first measurement, for methods that start from it.
         **options

@@ -142,6 +142,7 @@ class QPVObserver(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
+        quiet=True,
         step=build_step,
         ode=build_ode,
     )
