@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.evaluate.domain import outside_box
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
@@ -127,17 +128,18 @@ def finite(values: FloatArray, names: tuple[str, ...]) -> None:
 
 
 def broken_assumptions(
-    model: Plant, scenario: Scenario, fields: Mapping[str, FloatArray]
+    model: Plant, scenario: Scenario, truths: Mapping[str, FloatArray]
 ) -> tuple[str, ...]:
-    """Say which bounds of the observer's discrete model the scenario does not keep.
+    """Say which bounds of the observer's discrete model a run did not keep.
 
-    Rates are per step there. A rate is compared with a relative slack of 1e-9,
-    because differences of sampled ramps carry rounding errors.
+    truths: every group of signals, (N + 1, n) each. Rates are per step, with a relative slack of
+    1e-9, because differences of sampled ramps carry rounding errors.
     """
     said: list[str] = []
-    for group in ("w", "d", "u", "f", "rho"):
-        said += _outside_box(fields[group], model.box(group), model.names(group), "range")
-    faults = fields["f"]
+    for group in ("x", "w", "d", "u", "f", "rho"):
+        said += outside_box(truths[group], model.box(group), model.names(group), "range")
+    said += outside_box(truths["y"], model.output_ranges, model.output_names, "sensor's range")
+    faults = truths["f"]
     for i, signal in enumerate(model.f):
         steps = np.abs(np.diff(faults[:, i]))
         limit = np.inf if signal.rate is None else signal.rate * (1 + 1e-9)
@@ -146,29 +148,15 @@ def broken_assumptions(
             k = int(fast[0])
             said.append(
                 f"{signal.name} moves by {steps[k]:.6g} from k = {k} to {k + 1}; its declared "
-                f"rate is {signal.rate:g} per step"
+                f"rate is {signal.rate:g} per step, exceeded {fast.size} times, by at most "
+                f"{steps.max() - signal.rate:.4g}"
             )
     start = np.zeros((len(model.f), 2)) if scenario.f_range is None else scenario.f_range
-    said += _outside_box(faults[:1], start, model.names("f"), "assumed initial range")
+    said += outside_box(faults[:1], start, model.names("f"), "assumed initial range")
     if scenario.x_range is not None:
         x0 = np.asarray(scenario.x0, dtype=float).reshape(1, -1)
-        said += _outside_box(x0, scenario.x_range, model.names("x"), "assumed initial range")
+        said += outside_box(x0, scenario.x_range, model.names("x"), "assumed initial range")
     return tuple(said)
-
-
-def _outside_box(
-    values: FloatArray, box: FloatArray, names: tuple[str, ...], word: str
-) -> list[str]:
-    said = []
-    for i, name in enumerate(names):
-        out = np.flatnonzero((values[:, i] < box[i, 0]) | (values[:, i] > box[i, 1]))
-        if out.size:
-            k = int(out[0])
-            said.append(
-                f"{name} is outside its {word} [{box[i, 0]:g}, {box[i, 1]:g}] at {out.size} "
-                f"instants, first k = {k}: {values[k, i]:.6g}"
-            )
-    return said
 
 
 def step_function(observer: Observer | FaultDetector, model: Plant) -> ca.Function:

@@ -1,19 +1,27 @@
 """Was the run inside the domain of the guarantee, and what did the observer say about itself?"""
 
 import html
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import STATUS
+from obsynth.designs.detection.comparison import stretches
+from obsynth.symbolic.arrays import FloatArray
 
+VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
+_LISTED = 5
 _WORDS = {
-    "not_initialised": "not initialised: no measurement has been processed yet",
-    "non_finite_input": "a measurement was not finite; the step predicted without it",
-    "outside_domain": "the returned set is not inside the box of the guarantee",
-    "inconsistent_measurement": "the measurement contradicts the set: an assumption is broken",
-    "fault_not_valid": "the fault interval is not valid at this instant",
+    1: "not initialised: no measurement has been processed yet",
+    2: "an input or scheduling variable was not finite: the sets start anew",
+    4: "the returned set is not inside the domain of the guarantee",
+    VOID: "void: a set is empty or a measurement impossible, so an assumption has failed since the "
+    "last void or the start; the sets start anew",
+    16: "the fault interval is not valid at this instant",
+    32: "a measurement was missing or outside its declared range, and left out",
+    RECOVERING: "recovering: soon after a void",
 }
 
 
@@ -30,6 +38,24 @@ class StatusCount:
         return f"status {self.bit} at {self.count} instants, first k = {self.first}: {self.meaning}"
 
 
+@dataclass(frozen=True)
+class Void:
+    """Instants from a void until the step has recovered.
+
+    first, last: the first and the last void; count: how many; until: the last recovering instant
+    """
+
+    first: int
+    last: int
+    count: int
+    until: int
+
+    def __str__(self) -> str:
+        at = f"k = {self.first}" + (f" to {self.last}" if self.last > self.first else "")
+        after = f", recovering until k = {self.until}" if self.until > self.last else ""
+        return f"void at {self.count} instant{'s' if self.count > 1 else ''}, {at}{after}"
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """Where truth and estimate stood relative to the box of the guarantee.
@@ -39,15 +65,18 @@ class Domain:
     x_inside, xhat_inside : (N + 1,) bool arrays
         True where every state is inside its range.
     left : tuple of str
-        One sentence for each state that left, with the first instant.
+        One sentence for each state that left, with the first instant and how far.
     status : tuple of StatusCount
         Bits of the status that occurred.
+    voids : tuple of Void
+        Stretches of void and recovering instants.
     """
 
     x_inside: NDArray[np.bool_]
     xhat_inside: NDArray[np.bool_]
     left: tuple[str, ...]
     status: tuple[StatusCount, ...]
+    voids: tuple[Void, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -64,20 +93,10 @@ class Domain:
         names: tuple[str, ...],
     ) -> "Domain":
         """Compare trajectories with the box, and count the bits of the status."""
-        left: list[str] = []
-        inside = []
-        for word, values in (("", x), ("the estimate of ", xhat)):
-            within = np.asarray((values >= box[:, 0]) & (values <= box[:, 1]))
-            inside.append(np.asarray(within.all(axis=1)))
-            for i, name in enumerate(names):
-                outside = np.flatnonzero(~within[:, i])
-                if outside.size:
-                    k = int(outside[0])
-                    left.append(
-                        f"{word}{name} is outside [{box[i, 0]:g}, {box[i, 1]:g}] at "
-                        f"{outside.size} instants, first k = {k}: {values[k, i]:.6g}"
-                    )
-        return cls(inside[0], inside[1], tuple(left), count_status(status))
+        inside = [np.asarray(((v >= box[:, 0]) & (v <= box[:, 1])).all(axis=1)) for v in (x, xhat)]
+        left = outside_box(x, box, names, "range")
+        left += outside_box(xhat, box, [f"the estimate of {name}" for name in names], "range")
+        return cls(inside[0], inside[1], tuple(left), count_status(status), find_voids(status))
 
     def __str__(self) -> str:
         n = len(self.x_inside)
@@ -87,7 +106,9 @@ class Domain:
             else f"x is inside the box at {int(self.x_inside.sum())} of {n} instants, "
             f"xhat at {int(self.xhat_inside.sum())}"
         )
-        return "\n".join([head, *self.left, *(str(count) for count in self.status)])
+        more = len(self.voids) - _LISTED
+        voids = [*map(str, self.voids[:_LISTED]), *([f"{more} more such stretches"] * (more > 0))]
+        return "\n".join([head, *self.left, *map(str, self.status), *voids])
 
     def _repr_html_(self) -> str:
         first, *rest = (html.escape(line) for line in str(self).splitlines())
@@ -97,12 +118,36 @@ class Domain:
 
 def count_status(status: NDArray[np.int64]) -> tuple[StatusCount, ...]:
     """Count each bit that occurs; bits without a meaning are named as such."""
-    meanings = {bit: _WORDS.get(name, name) for name, bit in STATUS.items()}
     counts = []
     seen = int(np.bitwise_or.reduce(status)) if status.size else 0
     for bit in (1 << i for i in range(seen.bit_length())):
         at = np.flatnonzero(status & bit)
         if at.size:
-            meaning = meanings.get(bit, "a bit that this version does not know")
+            meaning = _WORDS.get(bit, "a bit that this version does not know")
             counts.append(StatusCount(bit, int(at.size), int(at[0]), meaning))
     return tuple(counts)
+
+
+def find_voids(status: NDArray[np.int64]) -> tuple[Void, ...]:
+    """Return the stretches in which the status is void or recovering."""
+    found = []
+    for first, until in stretches((status & (VOID | RECOVERING)) != 0):
+        at = first + np.flatnonzero(status[first : until + 1] & VOID)
+        if at.size:
+            found.append(Void(int(at[0]), int(at[-1]), int(at.size), until))
+    return tuple(found)
+
+
+def outside_box(values: FloatArray, box: FloatArray, names: Sequence[str], word: str) -> list[str]:
+    """Say which signals leave their box, (N + 1, n) and (n, 2): when, how often and how far."""
+    said = []
+    for i, name in enumerate(names):
+        beyond = np.maximum(box[i, 0] - values[:, i], values[:, i] - box[i, 1])
+        out = np.flatnonzero(~(beyond <= 0))
+        if out.size:
+            k = int(out[0])
+            said.append(
+                f"{name} is outside its {word} [{box[i, 0]:g}, {box[i, 1]:g}] at {out.size} "
+                f"instants, first k = {k}: {values[k, i]:.6g}; at most {beyond.max():.4g} beyond"
+            )
+    return said

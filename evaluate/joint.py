@@ -66,7 +66,8 @@ def joint(
     y = np.concatenate([_mapped(system.output, part)[0] for part in _parts(z, _samples(fields))])
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
-    broken = broken_assumptions(observer.model, scenario, fields)
+    truths = {"x": x, "y": y, **fields}
+    broken = broken_assumptions(observer.model, scenario, truths)
     return Run.collect(
         model=model,
         observer=observer,
@@ -75,7 +76,7 @@ def joint(
         truth=system.describe(scenario),
         outside=(*system.outside, *broken),
         t=np.arange(scenario.steps + 1, dtype=np.float64) * np.float64(system.Ts),
-        truths={"x": x, "y": y, **fields},
+        truths=truths,
         claims=_claims(step_function(observer, model), model, memory, y, fields),
     )
 

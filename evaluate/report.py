@@ -273,6 +273,7 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
         for j, (label, run) in enumerate(first.items()):
             shown = ["truth", "estimate", *(["interval"] if run.bounded else [])]
             shown += ["alarms"] if run.alarm is not None else []
+            shown += ["void instants"] if run.domain.voids else []
             words = f"{', '.join(shown[:-1])} and {shown[-1]}"
             caption = f"{scenario}, {label}, seed {run.seed}: {words}"
             say(caption)
@@ -292,7 +293,7 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
 
 
 def _facts(run: Run) -> str:
-    lines = [f"truth: {run.truth}", *(f"outside the guarantee: {line}" for line in run.outside)]
+    lines = [f"truth: {run.truth}", *(f"outside the guarantee: {line}" for line in run.reasons)]
     lines += str(run.domain).splitlines() + [str(v) for v in run.violations]
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
 

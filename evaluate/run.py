@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -49,8 +49,9 @@ class Run:
     scenario, seed, model, method, truth : str and int
         Where the run came from.
     outside : tuple of str
-        Why the guarantee does not cover this run: another truth, or a declared
-        bound that the scenario does not keep; empty when it does.
+        Why the guarantee does not cover this run: another truth, or a declared range or rate
+        that a signal did not keep, with the first instant, how often and how far; empty when
+        it does.
     """
 
     t: FloatArray
@@ -145,13 +146,15 @@ class Run:
         true: FloatArray = getattr(self, group)[:, i]
         if group == "x":
             claims = (self.xhat[:, i], self.x_lower[:, i], self.x_upper[:, i])
-            return Trace(name, unit, self.t, true, *claims)
+            return Trace(name, unit, self.t, true, *claims, status=self.status)
         if group == "f":
             late = self.fault_delay
             until = len(self.t) - late
             claims = (self.fhat[late:, i], self.f_lower[late:, i], self.f_upper[late:, i])
             alarm = None if self.alarm is None else self.alarm[:until, i]
-            return Trace(name, unit, self.t[:until], true[:until], *claims, alarm)
+            return Trace(
+                name, unit, self.t[:until], true[:until], *claims, alarm, self.status[late:]
+            )
         return Trace(name, unit, self.t, true)
 
     @cached_property
@@ -193,6 +196,11 @@ class Run:
                 )
         return tuple(found)
 
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What :attr:`outside` says and :attr:`domain` does not."""
+        return tuple(reason for reason in self.outside if reason not in self.domain.left)
+
     def rms(self, from_step: int = 0) -> dict[str, float]:
         """Root mean square of truth minus estimate, from instant `from_step` on.
 
@@ -222,7 +230,8 @@ class Run:
     def summary(self, from_step: int = 0) -> Table:
         """Coverage, rms error and half widths of every estimated signal; first alarms.
 
-        Coverage of a signal without bounds is ``n/a``.
+        Coverage of a signal without bounds is ``n/a``. Below stands what left its range, where
+        the observer was void, and which signals were outside their intervals.
         """
         rms = self.rms(from_step)
         rows: list[list[Any]] = []
@@ -238,7 +247,9 @@ class Run:
         title = f"{self.scenario}, seed {self.seed}, {len(self.t)} instants{since}"
         columns = ["signal", "inside", "rms error", "half width at k = 0", "at the end"]
         columns += [] if self.alarm is None else ["first alarm [s]"]
-        return Table(title, columns, rows, note="; ".join(str(v) for v in self.violations))
+        said = (*self.outside, *self.domain.voids[:LISTED], *self.violations)
+        note = "; ".join(map(str, said))
+        return Table(title, columns, rows, note=note)
 
     def to_xarray(self) -> Any:
         """Return an ``xarray.Dataset`` with labelled dimensions and units.
@@ -290,10 +301,12 @@ class Run:
         )
 
     def _repr_html_(self) -> str:
-        reasons = "".join(f"<li>{html.escape(reason)}</li>" for reason in self.outside)
+        reasons = "".join(f"<li>{html.escape(reason)}</li>" for reason in self.reasons)
         outside = f"<p>Outside the guarantee:</p><ul>{reasons}</ul>" if reasons else ""
+        # What the note of the table says of ranges and voids stands in the lists below it.
+        table = replace(self.summary(), note="; ".join(map(str, self.violations)))
         return (
-            f"{self.summary()._repr_html_()}<p>Truth: {html.escape(self.truth)}.</p>{outside}"
+            f"{table._repr_html_()}<p>Truth: {html.escape(self.truth)}.</p>{outside}"
             f"{self.domain._repr_html_()}"
         )
 

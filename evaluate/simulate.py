@@ -151,14 +151,15 @@ def _loop(
         plant_x[:] = plant.results[0]
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
+    truths = {"x": x, "y": y, **fields}
     return Run.collect(
         model=model,
         observer=observer,
         scenario=scenario.name,
         seed=int(seed),
         truth=truth.description,
-        outside=(*truth.outside, *broken_assumptions(observer.model, scenario, fields)),
+        outside=(*truth.outside, *broken_assumptions(observer.model, scenario, truths)),
         t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
-        truths={"x": x, "y": y, **fields},
+        truths=truths,
         claims=dict(zip(function.name_out()[1:], logs, strict=True)),
     )

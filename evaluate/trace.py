@@ -16,7 +16,8 @@ class Trace:
     Signals without an estimate (inputs, outputs, disturbances) have None there.
     With ``fault_delay = 1`` a fault's trace ends one sample before the run, as
     its claims arrive one sample late. ``alarm`` is what a fault detector said at
-    these instants, which is about the instant ``fault_delay`` earlier.
+    these instants, which is about the instant ``fault_delay`` earlier. ``status`` came with the
+    interval.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Trace:
     lower: FloatArray | None = None
     upper: FloatArray | None = None
     alarm: NDArray[np.bool_] | None = None
+    status: NDArray[np.int64] | None = None
 
     @property
     def label(self) -> str:

@@ -176,7 +176,7 @@ def compare(
     before: BoolArray = np.logical_or.accumulate(spoken, axis=0)
     events = []
     for i, name in enumerate(names):
-        for onset, end in _stretches(there[:, i]):
+        for onset, end in stretches(there[:, i]):
             first, stop = onset + fault_delay, end + fault_delay + 1
             raised = first + np.flatnonzero(alarm[first:stop, i])
             counting = first + np.flatnonzero(valid[first:stop])
@@ -213,7 +213,7 @@ def compare(
     )
 
 
-def _stretches(there: BoolArray) -> list[tuple[int, int]]:
+def stretches(there: BoolArray) -> list[tuple[int, int]]:
     """Return first and last index of every run of True."""
     edges = np.diff(np.concatenate([[0], there.astype(np.int8), [0]]))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
@@ -222,4 +222,4 @@ def _stretches(there: BoolArray) -> list[tuple[int, int]]:
 
 def _first_run(there: BoolArray, length: int) -> int | None:
     """Return where `length` values True in a row are complete for the first time."""
-    return next((a + length - 1 for a, b in _stretches(there) if b - a + 1 >= length), None)
+    return next((a + length - 1 for a, b in stretches(there) if b - a + 1 >= length), None)

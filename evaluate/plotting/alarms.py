@@ -160,19 +160,23 @@ def plot_alarms(
         return ax
 
 
-def shade(ax: Any, t: FloatArray, alarm: BoolArray) -> None:
-    """Shade where an alarm is raised over the whole height of a panel."""
-    bars = _bars(t, alarm)
+def shade(
+    ax: Any, t: FloatArray, there: BoolArray, color: str, word: str, alpha: float = 0.1
+) -> None:
+    """Shade where something is true over the whole height of a panel; strong shades have an edge.
+
+    The edge keeps single samples visible.
+    """
+    bars = _bars(t, there)
     if bars:
-        across = ax.get_xaxis_transform()
         ax.broken_barh(
             bars,
             (0.0, 1.0),
-            transform=across,
-            color=ESTIMATE,
-            alpha=0.10,
-            linewidth=0,
-            label="alarm",
+            transform=ax.get_xaxis_transform(),
+            color=color,
+            alpha=alpha,
+            linewidth=1.4 if alpha > 0.2 else 0.0,
+            label=word,
         )
 
 

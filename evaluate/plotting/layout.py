@@ -68,7 +68,8 @@ def style() -> Iterator[None]:
         mpl.rcParams.update(before)
 
 
-_ORDER = {"truth": 0, "estimate": 1, "interval": 2, "alarm": 3}
+_WORDS = ("truth", "estimate", "interval", "alarm", "void", "recovering")
+_ORDER = {word: i for i, word in enumerate(_WORDS)}
 
 
 def new_figure(size: tuple[float, float]) -> Any:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.evaluate.domain import RECOVERING, VOID
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import shade
 from obsynth.evaluate.plotting.layout import (
@@ -138,7 +139,7 @@ def plot_run(
     Notes
     -----
     Of signals without bounds truth and estimate are drawn; where a fault detector ran, its
-    alarms shade the panels of the faults.
+    alarms shade the panels of the faults. Void and recovering instants are shaded everywhere.
     """
     names = run.estimated if signals is None else tuple(signals)
     with style():
@@ -224,7 +225,12 @@ def _cut(t: FloatArray, values: FloatArray, window: Window | None) -> tuple[Floa
 def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
     """Interval as a band with edges, truth as a strong line, the estimate fine on top of it."""
     if trace.alarm is not None:
-        shade(ax, trace.t, trace.alarm)
+        shade(ax, trace.t, trace.alarm, ESTIMATE, "alarm")
+    if trace.status is not None:
+        void = (trace.status & VOID) != 0
+        recovering = ~void & ((trace.status & RECOVERING) != 0)
+        shade(ax, trace.t, recovering, BARS[1], "recovering", 0.15)
+        shade(ax, trace.t, void, BARS[4], "void", 0.4)
     if trace.lower is not None and trace.upper is not None and trace.bounded:
         t, lower = _cut(trace.t, _finite(trace.lower), window)
         _, upper = _cut(trace.t, _finite(trace.upper), window)
@@ -255,7 +261,9 @@ def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
 
 def _limits(ax: Any, trace: Trace) -> None:
     """Let truth, estimate and settled interval set the scale, not the first wide intervals."""
-    settled = slice(len(trace.t) // 10, None)
+    settled = np.arange(len(trace.t)) >= len(trace.t) // 10
+    if trace.status is not None:
+        settled &= (trace.status & VOID) == 0
     series = [trace.true]
     if trace.estimate is not None:
         series.append(trace.estimate)
