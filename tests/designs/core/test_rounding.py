@@ -1,0 +1,330 @@
+"""The bound of a function's rounding error: never exceeded, by any tape, and sharp."""
+
+import casadi as ca
+import mpmath
+import numpy as np
+import pytest
+
+from obsynth.derive.intervals.rules import NAMES
+from obsynth.designs.core.rounding import rounding_bound
+
+TYPES = {"double": np.float64, "single": np.float32}
+SAME = {
+    "exp",
+    "log",
+    "sinh",
+    "cosh",
+    "tanh",
+    "asin",
+    "acos",
+    "atan",
+    "asinh",
+    "acosh",
+    "atanh",
+    "expm1",
+    "log1p",
+    "erf",
+}
+ARCS = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
+SINGLE = {"sine": "sin", "cosine": "cos", "tangent": "tan", "hypotenuse": "hypot"}
+
+
+def truth(value):
+    return mpmath.mpf(1 if value else 0)
+
+
+EXACT = {
+    "assign": lambda a: a,
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+    "inverse": lambda a: 1 / a,
+    "square": lambda a: a * a,
+    "twice": lambda a: 2 * a,
+    "negate": lambda a: -a,
+    "absolute": abs,
+    "sqrt": mpmath.sqrt,
+    "minimum": min,
+    "maximum": max,
+    "less": lambda a, b: truth(a < b),
+    "less_equal": lambda a, b: truth(a <= b),
+    "logical_not": lambda a: truth(a == 0),
+    "conjunction": lambda a, b: truth(a != 0 and b != 0),
+    "if_else_zero": lambda a, b: b if a != 0 else mpmath.mpf(0),
+    "sign": mpmath.sign,
+    "power_const": mpmath.power,
+    "arctangent2": mpmath.atan2,
+    **{name: getattr(mpmath, SINGLE[name]) for name in SINGLE},
+    **{name: getattr(mpmath, name) for name in SAME},
+}
+NUMPY = {
+    "assign": lambda a: a,
+    "add": np.add,
+    "subtract": np.subtract,
+    "multiply": np.multiply,
+    "divide": np.divide,
+    "inverse": lambda a: a.dtype.type(1) / a,
+    "square": lambda a: a * a,
+    "twice": lambda a: a + a,
+    "negate": np.negative,
+    "absolute": np.abs,
+    "sqrt": np.sqrt,
+    "minimum": np.fmin,
+    "maximum": np.fmax,
+    "less": np.less,
+    "less_equal": np.less_equal,
+    "logical_not": lambda a: a == 0,
+    "conjunction": lambda a, b: (a != 0) & (b != 0),
+    "if_else_zero": lambda a, b: np.where(a != 0, b, b.dtype.type(0)),
+    "sign": np.sign,
+    "power_const": np.power,
+    "arctangent2": np.arctan2,
+    **{f"a{name}": getattr(np, f"arc{name}") for name in ARCS},
+    "erf": lambda a: a.dtype.type(1) * np.vectorize(lambda v: float(mpmath.erf(float(v))))(a),
+    **{name: getattr(np, SINGLE[name]) for name in SINGLE},
+    **{name: getattr(np, name) for name in SAME - {"erf"} if name[0] != "a"},
+}
+
+
+def tape(function, inputs, rules, number):
+    """Run the instructions with rules of an arithmetic; inputs are lists per input."""
+    work, found = {}, {}
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        out, args = function.instruction_output(k), function.instruction_input(k)
+        if code == ca.OP_INPUT:
+            work[out[0]] = inputs[args[0]][args[1]]
+        elif code == ca.OP_CONST:
+            work[out[0]] = number(function.instruction_constant(k))
+        elif code == ca.OP_OUTPUT:
+            found[out[0], out[1]] = work[args[0]]
+        else:
+            work[out[0]] = rules[NAMES[code]](*(work[a] for a in args))
+    return [found[key] for key in sorted(found)]
+
+
+def errors(function, points, precision, constants=None):
+    """|computed - exact| of every output at every point: (outputs, points), rounded down.
+
+    constants: what the numbers of the tape stand for, where that is not the double.
+    """
+    kind = TYPES[precision]
+    meant = constants or {}
+    with np.errstate(all="ignore"):
+        computed = tape(
+            function,
+            [[row.astype(kind) for row in part] for part in points],
+            NUMPY,
+            lambda value: np.full(points[0].shape[1], value, dtype=kind),
+        )
+    result = np.zeros((len(computed), points[0].shape[1]))
+    with mpmath.workprec(300):
+        for k in range(result.shape[1]):
+            exact = tape(
+                function,
+                [[mpmath.mpf(float(v)) for v in part[:, k]] for part in points],
+                EXACT,
+                lambda value: meant.get(value, mpmath.mpf(value)),
+            )
+            for i, value in enumerate(exact):
+                result[i, k] = float(abs(mpmath.mpf(float(computed[i][k])) - value)) * (1 - 1e-15)
+    return result
+
+
+def sample(rng, lo, hi, count, precision):
+    """Numbers of the precision in cells, ends among them: (entries, count)."""
+    pick = rng.integers(0, lo.shape[1], count)
+    low, high = lo[:, pick], hi[:, pick]
+    share = rng.random(low.shape)
+    share = np.where(rng.random(low.shape) < 0.2, np.round(share), share)
+    value = (low + share * (high - low)).astype(TYPES[precision]).astype(float)
+    return np.clip(value, low, high)
+
+
+def bound(function, lo, hi, precision, **known):
+    """All bounds, one after the other, over cells of one input."""
+    return np.concatenate(
+        list(rounding_bound(function, {"v": (lo, hi)}, precision, known).values())
+    )
+
+
+def random_function(rng, size=3, steps=14, library=True):
+    """A tape of sums, products, quotients, roots, choices and library functions."""
+    v = ca.SX.sym("v", size)
+    nodes = [v[i] for i in range(size)]
+
+    def pick():
+        if rng.random() < 0.2:
+            return ca.SX(float(rng.choice([0.1, 3.0, 1 / 3, -2.7, 1e-3, 40.0])))
+        return nodes[rng.integers(len(nodes))]
+
+    unary = [
+        lambda a: -a,
+        ca.fabs,
+        lambda a: a * a,
+        lambda a: ca.sqrt(ca.fabs(a) + 0.01),
+        lambda a: 1 / (a * a + 0.3),
+        lambda a: a + a,
+    ]
+    if library:
+        unary += [
+            ca.sin,
+            ca.cos,
+            ca.tanh,
+            ca.atan,
+            lambda a: ca.atanh(ca.fmax(ca.fmin(a, 0.9), -0.9)),
+            ca.asinh,
+            lambda a: ca.acosh(1.2 + a * a),
+            lambda a: ca.exp(ca.fmin(a, 2.0)),
+            lambda a: ca.log(ca.fabs(a) + 0.2),
+            lambda a: ca.log1p(a * a),
+            lambda a: ca.expm1(ca.fmax(ca.fmin(a, 1.0), -1.0)),
+            lambda a: ca.asin(ca.fmax(ca.fmin(a, 0.9), -0.9)),
+            lambda a: ca.acos(ca.fmax(ca.fmin(a, 0.9), -0.9)),
+            lambda a: ca.sinh(ca.fmin(ca.fmax(a, -2.0), 2.0)),
+            lambda a: ca.cosh(ca.fmin(ca.fmax(a, -2.0), 2.0)),
+            lambda a: ca.tan(ca.fmin(ca.fmax(a, -1.2), 1.2)),
+            lambda a: (a * a + 0.1) ** 1.7,
+            lambda a: (a * a + 0.1) ** -0.6,
+            lambda a: ca.atan2(a, a * a + 0.2),
+            ca.erf,
+        ]
+    binary = [
+        lambda a, b: a + b,
+        lambda a, b: a - b,
+        lambda a, b: a - b,
+        lambda a, b: a * b,
+        lambda a, b: a / (b * b + 0.1),
+        ca.fmin,
+        ca.fmax,
+        lambda a, b: ca.if_else(a < b, a, b * b),
+        lambda a, b: ca.if_else(a <= 0.5, a - b, b),
+        ca.hypot,
+    ]
+    for _ in range(steps):
+        if rng.random() < 0.4:
+            nodes.append(unary[rng.integers(len(unary))](pick()))
+        else:
+            nodes.append(binary[rng.integers(len(binary))](pick(), pick()))
+    return ca.Function("F", [v], [ca.vertcat(*nodes[-3:])], ["v"], ["out"])
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("library", [False, True])
+def test_no_random_function_exceeds_its_bound(precision, library):
+    """Mutants: half the unit roundoff, Sterbenz not looked at, a root without its error."""
+    rng = np.random.default_rng(7 + library)
+    finite, ratios = 0, []
+    for _ in range(40):
+        function = random_function(rng, library=library)
+        centre = rng.normal(size=(3, 8)) * 10.0 ** rng.integers(-2, 2, (3, 8))
+        width = 10.0 ** rng.integers(-6, 1) * np.abs(centre) * rng.integers(0, 2, (3, 1))
+        lo, hi = (
+            (centre + side * width).astype(TYPES[precision]).astype(float) for side in (-1, 1)
+        )
+        limits = bound(function, lo, hi, precision)
+        seen = errors(function, [sample(rng, lo, hi, 40, precision)], precision).max(axis=1)
+        assert (seen <= limits).all(), (str(function), seen, limits)
+        ok = np.isfinite(limits) & (seen > 0)
+        finite += int(np.isfinite(limits).sum())
+        ratios += list(limits[ok] / seen[ok])
+    assert finite > 100
+    # a library function is good to 8 units, and mostly returns the nearest number
+    assert np.median(ratios) < (40.0 if library else 10.0)
+
+
+def one(formula, size=2):
+    v = ca.SX.sym("v", size)
+    return ca.Function("F", [v], [formula(*ca.vertsplit(v))], ["v"], ["out"])
+
+
+def at(*values):
+    column = np.array(values, dtype=float)[:, None]
+    return column, column
+
+
+CASES = {
+    # the rounding of one product, nearly half a unit in the last place of 1
+    "one product": (lambda a, b: a * b, (1 + 2042 * 2**-23, 1 + 2054 * 2**-23), 1.1),
+    # nothing is rounded but the number itself
+    "a number": (lambda a, b: ca.fmax(a, 0.1), (0.0, 0.0), 1.1),
+    # |b| e_a: what a difference of nearly equal numbers keeps, made large
+    "a product": (lambda a, b: (a * a - 1.0) * b, (1 + 2**-12 + 2**-23, 2.0**20), 2.1),
+    # e_a |1/b|, and |a| e_b |1/b|^2
+    "a numerator": (lambda a, b: (a * a - 1.0) / b, (1 + 2**-12 + 2**-23, 2.0**-20), 2.1),
+    "a denominator": (lambda a, b: b / (a * a - 1.0), (1 + 2**-12 + 2**-23, 1.0), 2.1),
+    "a root": (lambda a, b: ca.sqrt(a * a - 1.0) * b, (1 + 2**-12 + 2**-23, 1.0), 2.1),
+    "a square": (lambda a, b: ((a * a - 1.0) * b) ** 2, (1 + 2**-12 + 2**-23, 2.0**20), 2.1),
+    "a power": (lambda a, b: ((a * a - 1.0) * b) ** 1.7, (1 + 2**-12 + 2**-23, 2.0**20), 2.1),
+    "a function": (lambda a, b: ca.exp((a * a - 1.0) * b), (1 + 2**-12 + 2**-23, 1024.0), 2.1),
+    # a^2 is larger than b, but not when it is rounded
+    "a choice": (lambda a, b: ca.if_else(a * a <= b, 3.0, 7.0), (1 + 2**-12, 1 + 2**-11), 2.6),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_term_is_needed(case):
+    """Single precision at one point. Mutants: half the unit roundoff, no error of a constant, no
+    |b| e_a in a product, no term of a quotient, the error of a root, square, power or function
+    dropped or halved, a choice that is never wrong."""
+    formula, point, ratio = CASES[case]
+    function = one(formula)
+    points = np.array(point)[:, None]
+    assert (points == points.astype(np.float32)).all()
+    seen = errors(function, [points], "single")[0, 0]
+    limit = bound(function, *at(*point), "single")[0]
+    assert seen <= limit <= ratio * seen
+
+
+def test_a_difference_is_exact_within_a_factor_of_two_only():
+    """Mutant: the condition of Sterbenz taken for granted, or for a factor of four."""
+    rng = np.random.default_rng(0)
+    difference = one(lambda a, b: a - b)
+    for low, high, exact in [
+        (1.0, 2.0, True),
+        (-2.0, -1.0, True),
+        (0.3125, 1.234375, False),
+        (-1.234375, -0.3125, False),
+    ]:
+        lo, hi = np.array([[low], [low]]), np.array([[high], [high]])
+        limit = bound(difference, lo, hi, "single")[0]
+        seen = errors(difference, [sample(rng, lo, hi, 400, "single")], "single").max()
+        assert seen <= limit
+        assert (limit == 0.0) == exact
+        assert (seen == 0.0) == exact
+
+
+def test_a_form_is_cut_with_what_the_box_says_of_it():
+    """(a + b) - (a - b) is 2 b, however large a is. Mutant: forms dropped, or cut to half."""
+    rng = np.random.default_rng(1)
+    back = one(lambda a, b: (a + b) - (a - b))
+    lo, hi = np.array([[-1e3], [-1.0]]), np.array([[1e3], [1.0]])
+    seen = errors(back, [sample(rng, lo, hi, 400, "double")], "double").max()
+    limit = bound(back, lo, hi, "double")[0]
+    assert seen <= limit < 2.01e3 * 2.0**-53
+    kept = one(lambda a, b: 1 / (10.0 + ((a + b) - (a - b))))
+    assert bound(kept, lo, hi, "double")[0] < 1e-14
+
+
+def test_what_is_undefined_has_no_bound():
+    lo, hi = np.array([[-1.0], [0.0]]), np.array([[1.0], [1.0]])
+    for formula in (lambda a, b: 1 / a, lambda a, b: ca.sqrt(a), lambda a, b: ca.log(b)):
+        assert bound(one(formula), lo, hi, "double")[0] == np.inf
+    # a^2 - b is below zero, and zero when a^2 is rounded
+    below = at(1 + 5 * 2.0**-14, 1 + 10 * 2.0**-14 + 2.0**-23)
+    assert bound(one(lambda a, b: ca.sqrt(a * a - b)), *below, "single")[0] == np.inf
+    large = at(1e30, 1e30)
+    assert bound(one(lambda a, b: a * b), *large, "single")[0] == np.inf
+    assert bound(one(lambda a, b: a * b), *large, "double")[0] < np.inf
+
+
+def test_numbers_that_stand_for_others_count():
+    """A third is no double. Mutant: numbers taken as the doubles that they are."""
+    with mpmath.workprec(300):
+        meant = {1 / 3: mpmath.mpf(1) / 3}
+    third = one(lambda a, b: ca.fmax(a, 1 / 3))
+    seen = errors(third, [np.zeros((2, 1))], "double", meant)[0, 0]
+    assert 0 < seen <= bound(third, *at(0.0, 0.0), "double")[0]
+    quarter = one(lambda a, b: ca.fmax(a, 0.25))
+    assert bound(quarter, *at(0.0, 0.0), "double")[0] == 0.0
