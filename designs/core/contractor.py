@@ -30,7 +30,7 @@ from obsynth.designs.core.lifted import FAR, Lifted, Rounding
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-Cut = Literal["strips", "image", "inversion", "rates"]
+Cut = Literal["ranges", "strips", "image", "inversion", "rates"]
 CUTS: tuple[Cut, ...] = get_args(Cut)
 """Parts of the contractor, for an option that names those that are used."""
 
@@ -181,7 +181,10 @@ class Contractor:
         up = 1.0 + 2.0**-30
         fixed = 0.5 * np.diff(self.equations.box[n + len(self.plant.f) :], axis=1)[:, 0]
         f_half = 0.5 * np.diff(self.plant.box("f").reshape(-1, 2), axis=1)[:, 0]
-        x = np.minimum(core[:n], 0.5 * np.diff(self.domain, axis=1)[:, 0])
+        x_half = 0.5 * np.diff(self.domain, axis=1)[:, 0]
+        if "ranges" not in self.cuts:
+            x_half, f_half = np.full(n, np.inf), np.full(f_half.size, np.inf)
+        x = np.minimum(core[:n], x_half)
         # late: of the fault one call before, now: of the fault at this one
         late, now = f_half.copy(), f_half.copy()
         (late if delay else now)[:] = np.minimum(f_half, core[n:])

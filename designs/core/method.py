@@ -196,9 +196,9 @@ class Method:
     horizon: N, number of calls after which a set that was begun anew takes over from an older one:
         nothing that happened more than 2 N calls ago matters to what is returned
     recovery: number of calls after a void one that the status marks as recovering
-    cuts: what the returned sets are cut with beside the method's own, of ``"strips"``,
-        ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()`` for the
-        method's own sets, as its paper has them
+    cuts: what the returned sets are cut with beside the method's own, of ``"ranges"``,
+        ``"strips"``, ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()``
+        for the method's own sets, as its paper has them
     """
 
     CLASS: ClassVar[PlantClass]

@@ -50,6 +50,9 @@ class Step:
             ]
         )
         self.reset = Ends.of(x_box), Ends.of(f_box)
+        self.ranges = Ends.of(self.domain), self.reset[1]
+        if "ranges" not in self.contractor.cuts:
+            self.ranges = Ends.unbounded(len(x_box)), Ends.unbounded(len(f_box))
         self.layout = guard.layout()
         self.memory = ca.SX.sym("memory", self.layout["initialised"].stop)
         self.u, self.y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output_names))
@@ -115,12 +118,12 @@ class Step:
         if self.guard.discrete:
             stored = Ends(part["x_lower" + end], part["x_upper" + end])
         before = Before(stored, F, part["before"])
-        X = Ends.of(self.domain)
+        X = self.ranges[0]
         if self.guard.discrete and "image" in contractor.cuts:
             X = X.meet(contractor.image(before))
         X = X.where(have, Ends.of(self.domain).meet(stored))
         X = contractor.measure(X, self.y, self.used)
-        now = contractor.drift(F).meet(self.reset[1]).where(have, F)
+        now = contractor.drift(F).meet(self.ranges[1]).where(have, F)
         return X, now, before
 
     def _copy(self, end: str, have: ca.SX, sets: tuple[Ends, Ends, Before], kept: Parts) -> _Copy:
@@ -146,7 +149,7 @@ class Step:
             late = contractor.invert(before, X).where(have, late)
         if known.f is not None and delay:
             late = late.meet(known.f).where(told, late)
-        now = contractor.drift(late).meet(self.reset[1]).where(have, before.faults)
+        now = contractor.drift(late).meet(self.ranges[1]).where(have, before.faults)
         shown = late if delay else now
         if known.f is not None and not delay:
             shown = now.meet(known.f).where(told, now)
@@ -186,8 +189,9 @@ class Step:
             inputs["theta"] = self.theta
         outputs = {
             "memory": select(initialised, memory, self.memory),
-            "xhat": _inside(old.known.xhat, X),
-            "fhat": _inside(old.known.fhat, F),
+            # estimates of a core without sets are promised for states and faults of any size
+            "xhat": old.known.xhat if old.known.x is None else _inside(old.known.xhat, X),
+            "fhat": old.known.fhat if old.known.f is None else _inside(old.known.fhat, F),
             "x_lower": _open(X.lower, -1.0),
             "x_upper": _open(X.upper, 1.0),
             "f_lower": _open(F.lower, -1.0),

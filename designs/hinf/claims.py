@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.derive.rigour import ExactMatrix, is_positive_definite, prove_positive_definite
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.equations import covered_inputs
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import (
     LARGEST_SIGNAL,
@@ -290,13 +291,13 @@ def guarantee(design: HinfDesign) -> Guarantee:
         f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}" for s in plant.x
     )
     residual = max(decoupling_residual(design))
-    seen = "[monitored: status bit 4, as far as y and xhat show it]"
+    seen = "[monitored: status bits 4 and 8, as far as xhat and y show it]"
     inside = "x lies in the box" if design.sector is not None else "x and xhat lie in the box"
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
         f"{inside}: {ranges} {seen}",
         *_inputs_assumed(design),
-        "every sample arrives (status bit 2); one that is missing counts as a new initial error",
+        "every reading arrives (status bit 32); one that is missing counts as a new initial error",
         f"{about} has finite energy over the horizon; no bound is used",
         "rounding errors of the step, about 1e-16 of the signals, are not counted as disturbances",
     ]
@@ -308,6 +309,7 @@ def guarantee(design: HinfDesign) -> Guarantee:
 
 
 def _inputs_assumed(design: HinfDesign) -> list[str]:
-    bounded = [s for s in design.plant.u if np.isfinite([s.lower, s.upper]).any()]
+    held = zip(design.plant.u, covered_inputs(design.plant).tolist(), strict=True)
+    bounded = [s for s, matters in held if matters and np.isfinite([s.lower, s.upper]).any()]
     ranges = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in bounded)
     return [f"{ranges} [monitored: status bit 4]"] if bounded else []

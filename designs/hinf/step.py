@@ -1,7 +1,6 @@
 """The run-time function of the filter: equations (18)-(19) in the order in which data arrive."""
 
 import casadi as ca
-import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.core.boxes import Ends
@@ -9,6 +8,7 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.core.stepping import (
+    all_finite,
     clip,
     inside,
     select,
@@ -31,18 +31,6 @@ def memory_sizes(design: HinfDesign) -> dict[str, int]:
 def first_memory(design: HinfDesign, start: Start) -> dict[str, ArrayLike]:
     """Start at the guess; the boxes and y0 are not needed, as no set is carried along."""
     return {"prediction": start.guess}
-
-
-def output_box(C: FloatArray, box: FloatArray) -> FloatArray:
-    """Return the ranges of C x over a box of shape (n, 2), rounded outwards, shape (m, 2)."""
-    rows = []
-    for row in C:
-        used = np.flatnonzero(row)
-        ends = np.sort(row[used, None] * box[used], axis=1)
-        low, high = ends.sum(axis=0) if used.size else np.zeros(2)
-        slack = 2.0**-48 * float(np.abs(ends[np.isfinite(ends)]).sum())
-        rows.append((low - slack, high + slack))
-    return np.array(rows).reshape(len(C), 2)
 
 
 def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
@@ -84,10 +72,12 @@ def build_core(design: HinfDesign) -> Core:
             "innovation": select(seen.all_used, seen.y - C @ xhat, 0.0 * r0),
             "running": ca.SX(1),
         }
-        return Known(xhat, select(valid, estimate, 0.0 * estimate), None, None, moved, valid=valid)
+        away = ca.logic_not(inside(xhat, xhat, model.box("x")))
+        fhat = select(valid, estimate, 0.0 * estimate)
+        return Known(xhat, fhat, None, None, moved, outside=away, valid=valid)
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
-        near = inside(kept["prediction"], kept["prediction"], model.box("x"))
+        near = all_finite(kept["prediction"])
         return {
             "prediction": select(near, kept["prediction"], x.middle),
             "innovation": select(near, kept["innovation"], 0.0 * kept["innovation"]),
