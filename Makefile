@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-long notebook lint format lock benchmarks clean
+.PHONY: help run test test-long mutants notebook lint format lock benchmarks clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -28,6 +28,9 @@ test: $(VENV)/.installed lint ## lint, types and all tests except the long stati
 
 test-long: $(VENV)/.installed ## the long statistics only
 	$(BIN)/python -m pytest -m long -n $(WORKERS) --dist worksteal
+
+mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print those that no test sees
+	$(BIN)/python tools/mutants.py --workers $(WORKERS) --minutes 6
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -1,76 +1,226 @@
 """Plant mistakes in what guarantees rest on, one at a time, and print those that no test sees.
 
-The mistakes stand in ``mutants.toml`` beside this file: a file of the package, the text that is
-changed (once in the file), what it becomes, and the tests that have to fail. One that no test can
-see because nothing changes says why; it is not planted.
+``mutants.toml`` beside this file lists mistakes (a file, the text that is changed, what it becomes,
+the tests that have to fail), and the files in which `mutation` makes more of them, each with its
+tests and the functions left aside because they only steer or show. What is made follows from the
+words of the source and the seed alone. A test that hangs has seen its mutant. Mutants that change
+nothing say why; they are counted and not planted.
 
-    python tools/mutants.py                 # all; ends with 1 if one survives
-    python tools/mutants.py lipschitz       # those whose file or text has the word
+    python tools/mutants.py                   # all listed ones, four made in every file
+    python tools/mutants.py derive/rigour     # in files whose name has these words
+    python tools/mutants.py derive/rigour/interval.py --each 20 --seed 7
 """
 
 import argparse
+import contextlib
+import importlib
+import importlib.util
 import os
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
+import time
 import tomllib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parent))
+from mutation import changes, pick
+
 HERE = Path(__file__).resolve().parents[1]
 ROOMS = ("symbolic", "derive", "designs", "codegen", "evaluate")
+HEAVY = (
+    *("numpy", "scipy.optimize", "scipy.linalg", "sympy", "casadi", "mpmath", "flint", "clarabel"),
+    *("pytest", "hypothesis"),
+)
+PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
+
+
+@dataclass(frozen=True)
+class Job:
+    """Tests to run, in a file that reads otherwise if there is one.
+
+    where, says: place and change of the mistake, for people
+    why: reason for which no test can see it
+    limit: seconds after which it counts as seen
+    """
+
+    tests: tuple[str, ...]
+    file: str = ""
+    text: str = ""
+    where: str = ""
+    says: str = ""
+    why: str = ""
+    limit: float = 600.0
+
+    @property
+    def room(self) -> str:
+        """The folder that the table counts it for."""
+        return "/".join(self.file.split("/")[:2]) if self.file.count("/") > 1 else "codegen"
+
+
+def listed(lists: dict[str, Any]) -> Iterator[Job]:
+    """Mutants that are written down."""
+    for entry in lists["mutant"]:
+        source, was, becomes = (HERE / entry["file"]).read_text(), entry["was"], entry["becomes"]
+        if source.count(was) != 1:
+            raise SystemExit(f"{was!r} does not stand once in {entry['file']}")
+        line = source[: source.index(was)].count("\n") + 1
+        says = f"{' '.join(was.split())} -> {' '.join(becomes.split()) or 'nothing'}"
+        text, why = source.replace(was, becomes), entry.get("why", "")
+        yield Job(tuple(entry["tests"]), entry["file"], text, str(line), says, why)
+
+
+def made(lists: dict[str, Any], each: int, seed: int) -> Iterator[Job]:
+    """Mutants made in the guarded files, some of every file."""
+    reasons = lists.get("equivalent", [])
+    for guard in lists.get("guard", []):
+        source, file = (HERE / guard["file"]).read_text(), guard["file"]
+        chosen = pick(changes(source, set(guard.get("leave", ()))), seed, file)
+        mine = [entry for entry in reasons if entry["file"] == file]
+        for change, _ in zip(chosen, range(each), strict=False):
+            why = next((entry["why"] for entry in mine if change.fits(entry)), "")
+            where = f"{change.line} {change.function}"
+            says = f"[{change.kind}] {change.was} -> {change.becomes}   in: {change.text}"
+            yield Job(tuple(guard["tests"]), file, change.apply(source), where, says, why)
 
 
 def copied(place: Path) -> Path:
     """Copy what tests need of this checkout, links as links."""
     for name in (*ROOMS, "src", "tests"):
-        ignored = shutil.ignore_patterns("__pycache__")
+        ignored = shutil.ignore_patterns("__pycache__", ".hypothesis")
         shutil.copytree(HERE / name, place / name, symlinks=True, ignore=ignored)
     shutil.copy(HERE / "pyproject.toml", place)
     return place
 
 
-def survives(place: Path, mutant: dict[str, Any]) -> bool:
-    """Plant a mutant in a copy and run its tests; leave the copy as it was."""
-    path = place / mutant["file"]
-    right = path.read_text()
-    if right.count(mutant["was"]) != 1:
-        raise SystemExit(f"{mutant['was']!r} does not stand once in {mutant['file']}")
-    path.write_text(right.replace(mutant["was"], mutant["becomes"]))
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"]
-    environment = {**os.environ, "PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
-    tests = [str(place / test) for test in mutant["tests"]]
-    done = subprocess.run(
-        [*command, *tests], cwd=place, env=environment, capture_output=True, text=True, check=False
-    )
-    path.write_text(right)
-    if done.returncode not in (0, 1):
-        raise SystemExit(f"{' '.join(mutant['tests'])} did not run:\n{done.stdout[-2000:]}")
-    return done.returncode == 0
+def begin(place: Path, job: Job) -> int:
+    """Run tests in a child of this process, which has loaded what is heavy; return its number."""
+    if job.file:
+        (place / job.file).write_text(job.text)
+        Path(importlib.util.cache_from_source(str(place / job.file))).unlink(missing_ok=True)
+    child = os.fork()
+    if child:
+        return child
+    code = 3
+    try:
+        os.setsid()
+        os.chdir(place)
+        output = os.open("output.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        # bytecode of what is right is kept, that of a mutant never
+        sys.dont_write_bytecode = bool(job.file)
+        os.environ |= {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+        sys.path.insert(0, str(place / "src"))
+        # a failure is enough, the smallest one is not looked for
+        hypothesis = importlib.import_module("hypothesis")
+        phases = hypothesis.Phase.explicit, hypothesis.Phase.generate
+        hypothesis.settings.register_profile("mutants", phases=phases, report_multiple_bugs=False)
+        hypothesis.settings.load_profile("mutants")
+        code = int(importlib.import_module("pytest").main([*PYTEST, *job.tests]))
+    finally:
+        os._exit(code)
 
 
-def main() -> int:
+def run(places: list[Path], jobs: Iterable[Job]) -> Iterator[tuple[Job, int, float, str]]:
+    """Run jobs, one in every copy at a time; yield return code (-1: too long), seconds, output."""
+    free, left = list(places), iter(jobs)
+    running: dict[int, tuple[Job, Path, str, float]] = {}
+    while True:
+        while free and (job := next(left, None)):
+            place = free.pop()
+            right = (place / job.file).read_text() if job.file else ""
+            running[begin(place, job)] = job, place, right, time.monotonic()
+        if not running:
+            return
+        time.sleep(0.02)
+        for child, (job, place, right, since) in list(running.items()):
+            ended, status = os.waitpid(child, os.WNOHANG)
+            spent = time.monotonic() - since
+            if not ended and spent < job.limit:
+                continue
+            code = os.waitstatus_to_exitcode(status) if ended else -1
+            # what the tests have started ends with them
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGKILL)
+            if not ended:
+                os.waitpid(child, 0)
+            if job.file:
+                (place / job.file).write_text(right)
+            del running[child]
+            free.append(place)
+            yield job, code, spent, (place / "output.txt").read_text()
+
+
+def timed(places: list[Path], mutants: list[Job]) -> dict[str, float]:
+    """Seconds of every file of tests; all have to pass where nothing is planted."""
+    files = sorted({test for job in mutants for test in job.tests})
+    seconds = {}
+    for job, code, spent, output in run(places, [Job((name,)) for name in files]):
+        if code:
+            raise SystemExit(f"{job.tests[0]} fails with nothing planted:\n{output[-3000:]}")
+        seconds[job.tests[0]] = spent
+    return seconds
+
+
+def main(arguments: list[str] | None = None) -> int:
     """Plant the mutants that are asked for and print the survivors."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("word", nargs="?", default="", help="in the file or in the text")
-    word = parser.parse_args().word
-    listed = tomllib.loads((Path(__file__).parent / "mutants.toml").read_text())["mutant"]
-    chosen = [m for m in listed if word in m["file"] or word in m["was"]]
-    planted = [m for m in chosen if "why" not in m]
-    alive = []
+    form = argparse.RawTextHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
+    parser.add_argument("words", nargs="?", default="", help="in the file's name")
+    parser.add_argument("--each", type=int, default=4, help="made in every file")
+    parser.add_argument("--seed", type=int, default=0, help="which are made")
+    parser.add_argument("--most", type=int, default=10**6, help="mutants at most")
+    parser.add_argument("--minutes", type=float, default=60.0, help="none is planted later")
+    parser.add_argument("--trust", action="store_true", help="the tests pass with none planted")
+    parser.add_argument("--workers", type=int, default=2, help="copies of the checkout")
+    parser.add_argument("--list", type=Path, default=Path(__file__).parent / "mutants.toml")
+    asked = parser.parse_args(arguments)
+    began, lists = time.monotonic(), tomllib.loads(asked.list.read_text())
+    everything = [*listed(lists), *made(lists, asked.each, asked.seed)]
+    chosen = [job for job in everything if asked.words in job.file][: asked.most]
+    told = [job for job in chosen if job.why]
+    for name in HEAVY:
+        importlib.import_module(name)
+    alive, table = [], Counter((job.room, "explained") for job in told)
     with tempfile.TemporaryDirectory() as name:
-        place = copied(Path(name))
-        for number, mutant in enumerate(planted, 1):
-            lives = survives(place, mutant)
-            alive += [mutant] if lives else []
-            word = "SURVIVES" if lives else "caught"
-            text = mutant["was"].strip()
-            print(f"{number}/{len(planted)} {word:9} {mutant['file']}: {text}", flush=True)
-    told = len(chosen) - len(planted)
-    print(f"{len(planted)} planted, {len(alive)} survive; {told} change nothing, with the reason")
+        places = [copied(Path(name) / str(k)) for k in range(asked.workers)]
+        seconds = {} if asked.trust else timed(places, [job for job in chosen if not job.why])
+
+        def jobs() -> Iterator[Job]:
+            for job in chosen:
+                if not job.why and time.monotonic() - began < 60.0 * asked.minutes:
+                    tests = tuple(sorted(job.tests, key=lambda test: seconds.get(test, 0.0)))
+                    limit = 20.0 + 5.0 * sum(seconds.get(test, 40.0) for test in tests)
+                    yield Job(tests, job.file, job.text, job.where, job.says, "", limit)
+
+        for job, code, spent, output in run(places, jobs()):
+            if code not in (-1, 0, 1, 2):
+                raise SystemExit(f"{' '.join(job.tests)} did not run:\n{output[-3000:]}")
+            word = {0: "SURVIVES", -1: "too long"}.get(code, "caught")
+            alive += [job] if code == 0 else []
+            table[job.room, "planted"] += 1
+            table[job.room, "survive"] += code == 0
+            print(f"{word} {spent:5.1f} s  {job.file}:{job.where} {job.says}", flush=True)
+    columns = ("planted", "survive", "explained")
+    print(f"\n{'room':24}" + "".join(f"{column:>12}" for column in columns))
+    for room in [*sorted({room for room, _ in table}), "all"]:
+        counts = (
+            sum(table[r, c] for r, _ in {k for k in table if k[1] == c} if room in (r, "all"))
+            for c in columns
+        )
+        print(f"{room:24}" + "".join(f"{count:12}" for count in counts))
+    for job in alive:
+        print(f"survives: {job.file}:{job.where} {job.says}")
+    for job in told:
+        print(f"changes nothing: {job.file}:{job.where} {job.says}: {job.why}")
+    late = len(chosen) - len(told) - sum(table[r, "planted"] for r in {r for r, _ in table})
+    print(f"{late} not planted for want of time" if late else f"{time.monotonic() - began:.0f} s")
     return 1 if alive else 0
 
 

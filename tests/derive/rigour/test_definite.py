@@ -82,6 +82,13 @@ def test_the_radius_counts():
     assert not prove_positive_definite(matrix, corner).all_proved
 
 
+def test_the_radii_of_both_halves_count():
+    """Entries .75 and .85, both up to .25 away, may both be 1; mutant: half of one radius."""
+    matrix, radius = np.array([[1.0, 0.75], [0.85, 1.0]]), np.array([[0.0, 0.25], [0.25, 0.0]])
+    assert prove_positive_definite(matrix, 0.5 * radius).all_proved
+    assert not prove_positive_definite(matrix, radius).all_proved
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_is_not_proved(value):
     matrices = np.stack([np.eye(3), np.eye(3), 2 * np.eye(3)])
