@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.core.observer import STATUS
-from obsynth.designs.detection.comparison import stretches
+from obsynth.designs.detection.comparison import RECOVERING, VOID, Void, find_voids
 from obsynth.symbolic.arrays import FloatArray
 
-VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
 _LISTED = 5
 _WORDS = {
     1: "not initialised: no measurement has been processed yet",
@@ -36,24 +34,6 @@ class StatusCount:
 
     def __str__(self) -> str:
         return f"status {self.bit} at {self.count} instants, first k = {self.first}: {self.meaning}"
-
-
-@dataclass(frozen=True)
-class Void:
-    """Instants from a void until the step has recovered.
-
-    first, last: the first and the last void; count: how many; until: the last recovering instant
-    """
-
-    first: int
-    last: int
-    count: int
-    until: int
-
-    def __str__(self) -> str:
-        at = f"k = {self.first}" + (f" to {self.last}" if self.last > self.first else "")
-        after = f", recovering until k = {self.until}" if self.until > self.last else ""
-        return f"void at {self.count} instant{'s' if self.count > 1 else ''}, {at}{after}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,16 +106,6 @@ def count_status(status: NDArray[np.int64]) -> tuple[StatusCount, ...]:
             meaning = _WORDS.get(bit, "a bit that this version does not know")
             counts.append(StatusCount(bit, int(at.size), int(at[0]), meaning))
     return tuple(counts)
-
-
-def find_voids(status: NDArray[np.int64]) -> tuple[Void, ...]:
-    """Return the stretches in which the status is void or recovering."""
-    found = []
-    for first, until in stretches((status & (VOID | RECOVERING)) != 0):
-        at = first + np.flatnonzero(status[first : until + 1] & VOID)
-        if at.size:
-            found.append(Void(int(at[0]), int(at[-1]), int(at.size), until))
-    return tuple(found)
 
 
 def outside_box(values: FloatArray, box: FloatArray, names: Sequence[str], word: str) -> list[str]:

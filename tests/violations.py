@@ -25,7 +25,6 @@ SETTLED, LATEST, SPARE = 150, 40, 150
 LENGTHS = (1, 1, 1, 2, 5, 10)
 LEFT_OUT = 32
 """A status of this bit alone starts nothing anew: a measurement was missing."""
-WINDOW = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,6 @@ class Case:
     faults: (n_f,) half of the range in which faults jump
     constant: the guarantee speaks of constant faults
     mean: forgetting rate where the fault's interval holds its discounted mean, 0 where the fault
-    window: the finite memory N; sets are right 2 N samples after the last violation
     """
 
     observer: ob.Observer
@@ -48,8 +46,12 @@ class Case:
     constant: bool = False
     mean: float = 0.0
     substeps: int | None = None
-    window: int = WINDOW
     memory: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def window(self) -> int:
+        """The finite memory N: sets are right 2 N samples after the last violation."""
+        return int(self.observer.record["options"].get("horizon", 400))
 
 
 def tanks() -> Case:

@@ -8,9 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
+VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
 
 
 class RunLike(Protocol):
@@ -46,6 +48,24 @@ class RunLike(Protocol):
 
 
 @dataclass(frozen=True)
+class Void:
+    """Instants from a void until the step has recovered.
+
+    first, last: the first and the last void; count: how many; until: the last recovering instant
+    """
+
+    first: int
+    last: int
+    count: int
+    until: int
+
+    def __str__(self) -> str:
+        at = f"k = {self.first}" + (f" to {self.last}" if self.last > self.first else "")
+        after = f", recovering until k = {self.until}" if self.until > self.last else ""
+        return f"void at {self.count} instant{'s' if self.count > 1 else ''}, {at}{after}"
+
+
+@dataclass(frozen=True)
 class FaultEvent:
     """A stretch of instants at which one fault was there.
 
@@ -68,6 +88,9 @@ class FaultEvent:
         Magnitude of the fault at the instant that the alarm speaks of.
     others : tuple of str
         Faults that were not there but whose alarm was raised together with it.
+    violation : int or None
+        Void instant that ended the alarm: some assumption failed before, so that the alarm proves
+        nothing.
     """
 
     fault: str
@@ -79,6 +102,7 @@ class FaultEvent:
     delay: float | None = None
     level: float | None = None
     others: tuple[str, ...] = ()
+    violation: int | None = None
 
     @property
     def isolated(self) -> bool:
@@ -91,6 +115,8 @@ class FaultEvent:
             promise = "" if self.promised is None else f", promised at k = {self.promised}"
             return f"{head}: no alarm{promise}"
         others = f", together with {', '.join(self.others)}" if self.others else ""
+        if self.violation is not None:
+            others += f", before the violation at k = {self.violation}"
         return (
             f"{head}: alarm at k = {self.alarm}, {self.delay:.6g} s after its onset, at "
             f"{self.level:.4g}{others}"
@@ -114,6 +140,11 @@ class Detection:
     lingering : mapping of str to int
         Instants with an alarm for a fault that had been there and was zero again. Bounds of a
         fault at one instant never do that; bounds of its mean over a window may.
+    before_violation : mapping of str to int
+        Instants of alarms that stood until a void instant, right or wrong.
+    violations : tuple of Void
+        Stretches of void instants: at the first of each some assumption had failed since the
+        last one, or the start. That is certain, whatever the faults.
     """
 
     alarm: BoolArray
@@ -121,6 +152,8 @@ class Detection:
     events: tuple[FaultEvent, ...]
     false_alarms: Mapping[str, int]
     lingering: Mapping[str, int]
+    before_violation: Mapping[str, int]
+    violations: tuple[Void, ...]
 
     @property
     def delays(self) -> dict[str, float | None]:
@@ -140,10 +173,12 @@ class Detection:
 
     def __str__(self) -> str:
         lines = [str(event) for event in self.events] or ["no fault was there"]
-        for count, words in ((self.false_alarms, "false"), (self.lingering, "after its end")):
+        kinds = ((self.false_alarms, "false"), (self.lingering, "after its end"))
+        for count, words in (*kinds, (self.before_violation, "before a violation")):
             lines += [f"{name}: {n} instants of alarm {words}" for name, n in count.items() if n]
         if not any(self.false_alarms.values()):
             lines.append("no false alarm")
+        lines += [f"some assumption failed: {void}" for void in self.violations]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -160,13 +195,20 @@ def compare(
     threshold: float,
     width: FloatArray | None,
     valid: BoolArray,
+    status: NDArray[np.int64],
     persistence: Sequence[int],
 ) -> Detection:
     """Compare alarms with the true faults.
 
     Shapes: alarm (N + 1, n_f) bool, truth (N + 1, n_f), t (N + 1,), width (N + 1, n_f), valid (N +
-    1,) bool.
+    1,), status (N + 1,).
     """
+    void = (status & VOID) != 0
+    # An alarm that stands when a void instant sets the counters to zero, from its beginning.
+    ended = np.zeros_like(alarm)
+    for i in range(len(names)):
+        for start, stop in stretches(alarm[:, i]):
+            ended[start : stop + 1, i] = stop + 1 < len(void) and void[stop + 1]
     there: BoolArray = np.abs(truth) > threshold
     # Row k of `spoken` is about the same instant as row k of the alarms.
     spoken = np.zeros_like(there)
@@ -179,10 +221,12 @@ def compare(
         for onset, end in stretches(there[:, i]):
             first, stop = onset + fault_delay, end + fault_delay + 1
             raised = first + np.flatnonzero(alarm[first:stop, i])
-            counting = first + np.flatnonzero(valid[first:stop])
+            counting = first + np.flatnonzero((valid | void)[first:stop])
             large = None
             if width is not None:
-                large = _first_run(size[counting, i] > width[counting, i], persistence[i])
+                large = _first_run(
+                    valid[counting] & (size[counting, i] > width[counting, i]), persistence[i]
+                )
             event = FaultEvent(
                 fault=name,
                 onset=onset,
@@ -199,6 +243,7 @@ def compare(
                     delay=float(t[at] - t[onset]),
                     level=float(size[at, i]),
                     others=tuple(names[j] for j in wrong.tolist()),
+                    violation=int(at + np.argmax(void[at:])) if ended[at, i] else None,
                 )
             events.append(event)
     events.sort(key=lambda event: event.onset)
@@ -210,6 +255,8 @@ def compare(
         events=tuple(events),
         false_alarms={name: int(n) for name, n in zip(names, false, strict=True)},
         lingering={name: int(n) for name, n in zip(names, after, strict=True)},
+        before_violation={n: int(k) for n, k in zip(names, ended.sum(axis=0), strict=True)},
+        violations=find_voids(status),
     )
 
 
@@ -223,3 +270,13 @@ def stretches(there: BoolArray) -> list[tuple[int, int]]:
 def _first_run(there: BoolArray, length: int) -> int | None:
     """Return where `length` values True in a row are complete for the first time."""
     return next((a + length - 1 for a, b in stretches(there) if b - a + 1 >= length), None)
+
+
+def find_voids(status: NDArray[np.int64]) -> tuple[Void, ...]:
+    """Return the stretches in which the status is void or recovering."""
+    found = []
+    for first, until in stretches((status & (VOID | RECOVERING)) != 0):
+        at = first + np.flatnonzero(status[first : until + 1] & VOID)
+        if at.size:
+            found.append(Void(int(at[0]), int(at[-1]), int(at.size), until))
+    return tuple(found)

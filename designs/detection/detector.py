@@ -17,8 +17,8 @@ from obsynth.designs.detection.comparison import Detection, RunLike, compare
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-SKIPPED = ("not_initialised", "non_finite_input", "fault_not_valid")
-"""Bits of the status at which a sample never counts, neither for an alarm nor against it."""
+SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "recovering")
+"""Bits of the status at which a sample never counts; at a void one all counters return to 0."""
 
 _COUNT = "alarm_count"
 
@@ -36,8 +36,8 @@ class FaultDetector:
         one number, or one for each fault. 1 raises it at once.
     also_skip : tuple of str
         Further bits of the status, by their names in ``STATUS``, at which a sample does not
-        count, for example ``("outside_domain",)``. Samples that are not initialised, saw a
-        number that is not finite or have no valid fault interval never count.
+        count, for example ``("outside_domain",)``. Samples that are not initialised, void or
+        recovering, saw an input that is not finite or have no valid fault interval never count.
 
     Raises
     ------
@@ -51,8 +51,12 @@ class FaultDetector:
     the fault is not zero; where the method encloses a mean of the fault, that it was not zero
     throughout. As long as the observer's assumptions hold there is therefore no false
     alarm, for any persistence; persistence guards against single samples at which an assumption
-    is broken. A sample that does not count leaves counter and alarm as they are. The
-    alarm at instant k speaks of instant k - `fault_delay`.
+    is broken. A sample that does not count leaves counter and alarm as they are, a void one
+    (status bit 8) sets them to 0. The alarm at instant k speaks of instant k - `fault_delay`.
+
+    **Violations.** Bit 8 is an event of its own, and a certain one: some assumption failed since
+    the last void instant or the start. An alarm that stood until then proves nothing; `detect`
+    lists the violations and marks such alarms.
 
     **Smallest detectable fault.** Let w_i be the steady half width of fault i. An interval of
     length at most 2 w_i that holds f_i excludes zero whenever abs(f_i) > 2 w_i, wherever in the
@@ -88,11 +92,11 @@ class FaultDetector:
                 "by actuator_faults, sensor_faults or process_faults.",
                 model=model.name,
             )
-        if not _bounded_faults(self.observer.step, len(names)).any():
+        if not _bounded_faults(self.observer).any():
             raise DetectorError(
                 f"{method} estimates {', '.join(names)} without bounds (its fault intervals are "
-                "infinite), so that zero never leaves them: a detector needs a method that bounds "
-                "its faults.",
+                "infinite, or those declared), so that zero never leaves them: a detector needs a "
+                "method that bounds its faults.",
                 method=method,
                 faults=names,
             )
@@ -183,14 +187,19 @@ class FaultDetector:
         n_f = len(self.model.f)
         count, lower, upper = (ca.SX.sym(name, n_f) for name in ("count", "f_lower", "f_upper"))
         status = ca.SX.sym("status")
-        valid = ca.SX(1)
+
+        def bit(name: str) -> Any:
+            return ca.fmod(ca.floor(status / STATUS[name]), 2) >= 1
+
+        valid, void = ca.SX(1), bit("void")
         for name in self._skipped:
-            valid = ca.logic_and(valid, ca.fmod(ca.floor(status / STATUS[name]), 2) < 1)
+            valid = ca.logic_and(valid, ca.logic_not(bit(name)))
         following, alarm = [], []
         for i, needed in enumerate(self.counts):
             outside = ca.logic_or(lower[i] > 0, upper[i] < 0)
             counted = ca.if_else(outside, ca.fmin(count[i] + 1, needed), 0)
-            following.append(ca.if_else(valid, counted, count[i]))
+            kept = ca.if_else(void, 0, count[i])
+            following.append(ca.if_else(valid, counted, kept))
             alarm.append(following[-1] >= needed)
         return ca.Function(
             "decide",
@@ -262,6 +271,10 @@ class FaultDetector:
                     f"in the steady state abs({name}) > {smallest[i]:.6g} at {count} consecutive "
                     "samples that count raises its alarm"
                 )
+        claims.append(
+            "a void sample (status bit 8) proves that some assumption failed since the last void "
+            "one or the start; it ends every alarm, and one that stood until then proves nothing"
+        )
         return Guarantee((*own.claims, *claims), tuple(own.assumptions))
 
     def memory0(
@@ -309,7 +322,7 @@ class FaultDetector:
         Returns
         -------
         Detection
-            Events with their delays, false alarms, alarms that outlast a fault.
+            Events with their delays, false alarms, alarms that outlast a fault, violations.
 
         Raises
         ------
@@ -337,6 +350,7 @@ class FaultDetector:
             threshold=threshold,
             width=width,
             valid=self.valid(run.status),
+            status=np.asarray(run.status, dtype=np.int64),
             persistence=self.counts,
         )
 
@@ -350,22 +364,28 @@ class FaultDetector:
         return "\n".join(lines)
 
 
-def _bounded_faults(step: ca.Function, n_f: int) -> NDArray[np.bool_]:
-    """Return which faults have an interval that is not infinite by construction."""
+def _bounded_faults(observer: Observer) -> NDArray[np.bool_]:
+    """Return which faults have an interval that anything measured can make narrower.
+
+    Not those that are infinite, or handed on from call to call as they were declared.
+    """
+    step, n_f = observer.step, len(observer.model.f)
     ports = [ca.SX.sym(name, step.numel_in(i)) for i, name in enumerate(step.name_in())]
     try:
         outputs = step.call(ports) if step.is_a("SXFunction") else step.expand().call(ports)
     except RuntimeError:
         # A step that has no scalar form cannot be looked into; its bounds are then taken as such.
         return np.ones(n_f, dtype=bool)
+    layout = observer.memory_layout.items()
+    own = [part for name, part in layout if not name.startswith(("f_lower", "f_upper"))]
+    told = ca.vertcat(*ports[1:], *(ports[0][part] for part in own))
     lower, upper = (outputs[STEP_OUTPUTS.index(key)] for key in ("f_lower", "f_upper"))
-    return np.array(
-        [not (_infinite(lower[i]) or _infinite(upper[i])) for i in range(n_f)], dtype=bool
-    )
+    return np.array([_told(lower[i], told) and _told(upper[i], told) for i in range(n_f)])
 
 
-def _infinite(value: ca.SX) -> bool:
-    return bool(value.is_constant()) and bool(np.isinf(float(value)))
+def _told(bound: ca.SX, told: ca.SX) -> bool:
+    slopes = ca.gradient(bound, told)
+    return not all(slopes[i].is_zero() for i in range(slopes.numel()))
 
 
 def _whole_numbers(given: Any, names: tuple[str, ...]) -> tuple[int, ...]:

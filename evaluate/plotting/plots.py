@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.evaluate.domain import RECOVERING, VOID
+from obsynth.designs.detection.comparison import RECOVERING, VOID
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import shade
 from obsynth.evaluate.plotting.layout import (

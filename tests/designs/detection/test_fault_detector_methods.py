@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import obsynth as ob
 from obsynth.designs.core.errors import DetectorError
@@ -138,9 +139,30 @@ def test_a_detector_pickles(request, name):
             assert getattr(again, signal).tobytes() == getattr(run, signal).tobytes(), signal
 
 
+def test_a_filter_bounds_its_faults_where_disturbances_are_bounded():
+    """The inversion tells the fault one sample late, to the bound of w1, though the core does not."""
+    plant = ob.Plant("two states")
+    x1, x2 = plant.states("x1 x2", range=(-4, 4))
+    (f,) = plant.faults("f", range=(-1, 1))
+    w = plant.disturbances("w1:3", bound=0.01)
+    plant.dynamics([x1 / 2 + x2 / 4 + f + w[0], x2 / 2 + sp.sin(x1) / 8 + w[1]], Ts=1.0)
+    plant.outputs([x1, x2])
+    detector = ob.FaultDetector(ob.HinfUIO(method="general").design(plant))
+    assert detector.smallest_detectable == pytest.approx(0.02)
+    faults = np.zeros((61, 1))
+    faults[30:50] = 0.021
+    rest = {"x0": [0, 0], "guess": [0, 0], "inputs": np.zeros((61, 0)), "faults": faults}
+    found = detector.detect(ob.simulate(plant, detector, ob.Scenario("step", 60, **rest)))
+    assert found.false_alarms == {"f": 0} and found.lingering == {"f": 0}
+    assert found.events[0].alarm == 31
+    assert found.violations == ()
+
+
 def test_a_method_without_fault_bounds_is_refused():
+    """Mutant: `own` with the fault's interval of the call before."""
     plant = ob.plants.hinf_example()
     observer = ob.HinfUIO().design(plant)
-    assert observer.half_widths is None
+    # Its disturbances have no bound, so that the interval of f stays the declared one.
+    assert observer.half_widths[3] == pytest.approx(1.0)
     with pytest.raises(DetectorError, match=r"hinf_uio estimates .* without bounds"):
         ob.FaultDetector(observer)
