@@ -311,5 +311,5 @@ def _performance(design: UioDesign, widths: FloatArray) -> dict[str, float]:
             "trace_P": float(eigenvalues.sum()),
         }
     else:
-        values["decay"] = bound.decay
+        values["decay"] = bound.fading.decay
     return values

@@ -9,7 +9,7 @@ from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
-from obsynth.designs.bounded_error.record import PeakData, UioDesign
+from obsynth.designs.bounded_error.record import Fading, PeakData, UioDesign
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic import Plant
@@ -123,6 +123,7 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
         bounds = jacobian_bounds(parts)
     detectability(parts, bounds)
     n, n_f, m = len(model.x), len(model.f), len(parts.C)
+    nothing = np.zeros((n + n_f, n + n_f))
     if decoupling.residual > 0 and not np.isfinite(model.box("d")).all():
         names = ", ".join(model.names("d"))
         raise StructureError(
@@ -156,7 +157,7 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
             rounding_allowance(model, decoupling.residual),
             2.0 * lost_by_rounding(parts, decoupling.E),
         ),
-        bound=PeakData(np.zeros(n + n_f), 0.0),
+        bound=PeakData(np.zeros(n + n_f), Fading(nothing, nothing, nothing, 0.0, None)),
         options={},
     )
     return UioModel(parts, bounds, design)

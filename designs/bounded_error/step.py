@@ -7,13 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.lmis import kept_coordinates
-from obsynth.designs.bounded_error.peak.bound import PeakBound
-from obsynth.designs.bounded_error.peak.design import peak_data, stored_bound
-from obsynth.designs.bounded_error.peak.transient import Transient, transient
+from obsynth.designs.bounded_error.peak.design import peak_data
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.stepping import (
-    FINITE,
     all_finite,
     clip,
     finite_or,
@@ -36,11 +33,11 @@ UP = 1.0 + 2.0**-44
 
 @dataclass(frozen=True, eq=False)
 class RuntimeBound:
-    """How the guaranteed half widths evolve, one scalar recursion per component.
+    """How the guaranteed half widths evolve: ``s+ = decay s + offset``.
 
-    ``s+ = decay * s + offset``; the half width of a component is
-    ``sqrt(s * scale) + add`` if `root` is set (ellipsoids, eqs. (35)-(36)) and
-    ``s * scale + add`` otherwise (peak bounds). All arrays have shape (n + n_f,).
+    The half widths are ``sqrt(reach s) + add`` if `root` is set (ellipsoids, eqs. (35)-(36), one s
+    per component) and ``reach s + add`` otherwise (peak bounds, see `Fading`). Shapes: decay
+    (k, k), offset (k,), reach (n + n_f, k), add (n + n_f,).
 
     reset: value of s that holds whenever the state, the fault and their estimates lie in the
         declared boxes; infinite where no such box is declared
@@ -48,20 +45,21 @@ class RuntimeBound:
 
     decay: FloatArray
     offset: FloatArray
-    scale: FloatArray
+    reach: FloatArray
     add: FloatArray
     root: bool
     reset: FloatArray
 
     def half_widths(self, s: FloatArray) -> FloatArray:
         """Return the half widths that belong to a value of s."""
-        inner = s * self.scale
+        inner = self.reach @ s
         return (np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add
 
     @property
     def steady(self) -> FloatArray:
         """Half widths in the limit k to infinity."""
-        return self.half_widths(self.offset / (1.0 - self.decay))
+        limit = np.linalg.solve(np.eye(len(self.decay)) - self.decay, self.offset)
+        return self.half_widths(np.asarray(limit, dtype=float))
 
 
 def noise_offset(design: UioDesign) -> FloatArray:
@@ -148,7 +146,7 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
         scale[i] = bound.inverse_diagonal[component] * UP
         if box is not None:
             reset[i] = largest_level(P, *box.xi(design, bound.error))
-    return RuntimeBound(decay, offset, scale, add, True, reset)
+    return RuntimeBound(np.diag(decay), offset, np.diag(scale), add, True, reset)
 
 
 def reset_box(design: UioDesign) -> StartBox | None:
@@ -188,38 +186,28 @@ def first_levels(design: UioDesign, box: StartBox) -> FloatArray:
     return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])
 
 
-def _first(design: UioDesign, peak: PeakBound, box: StartBox) -> FloatArray:
-    """Transient at k = 0: covers the first error, and c lambda^k from k = 1 on."""
-    bound = peak_data(design)
-    n = design.A.shape[0]
-    size = n + design.rate.size
-    zeta = np.maximum(np.abs(box.zeta[0]), np.abs(box.zeta[1]))
-    e_f = np.maximum(np.abs(box.e_f[0]), np.abs(box.e_f[1]))
-    tail: Transient = transient(peak, np.concatenate([zeta, e_f]), decay=bound.decay)
-    now = np.concatenate([zeta + noise_offset(design), e_f]) - bound.b[:size]
-    return np.maximum(tail.c[:size], now) * ROUND_UP
-
-
-def first_transient(design: UioDesign, box: StartBox) -> FloatArray:
-    """Return the first transient for a box of first errors."""
-    return _first(design, stored_bound(design), box)
+def first_fading(design: UioDesign, box: StartBox) -> FloatArray:
+    """Return the first s of peak bounds for a box of first errors, see `Fading`."""
+    zeta, e_f = (np.max(np.abs(sides), axis=0) for sides in (box.zeta, box.e_f))
+    first: FloatArray = peak_data(design).fading.start @ np.concatenate([zeta, e_f]) * UP
+    return first
 
 
 def peak_runtime(design: UioDesign) -> RuntimeBound:
-    """Recursion t+ = lambda t of the transient, half width b + t."""
+    """Return the recursion of what the first error adds to the peak bounds.
+
+    Underflow of its products is far below the rounding that `add` counts a second time.
+    """
     bound = peak_data(design)
-    size = design.A.shape[0] + design.rate.size
-    reset = np.full(size, np.inf)
-    box = reset_box(design)
-    if box is not None:
-        reset = first_transient(design, box)
+    fading, box = bound.fading, reset_box(design)
+    count = len(fading.G)
     return RuntimeBound(
-        decay=np.full(size, bound.decay * ROUND_UP),
-        offset=np.zeros(size),
-        scale=np.ones(size),
-        add=(bound.b[:size] + design.rounding) * ROUND_UP,
+        decay=fading.G * UP,
+        offset=np.zeros(count),
+        reach=fading.reach * UP,
+        add=(bound.b[: len(fading.reach)] + design.rounding) * ROUND_UP,
         root=False,
-        reset=reset,
+        reset=np.full(count, np.inf) if box is None else first_fading(design, box),
     )
 
 
@@ -231,7 +219,9 @@ def memory_sizes(design: UioDesign) -> dict[str, int]:
     ``initialised`` (0 or 1).
     """
     n, n_f = len(design.A), len(design.rate)
-    return {"z": n, "fhat": n_f, "bound": n + n_f, "prediction": n, "initialised": 1}
+    ellipsoid = isinstance(design.bound, EllipsoidBound)
+    bound = n + n_f if ellipsoid else len(peak_data(design).fading.G)
+    return {"z": n, "fhat": n_f, "bound": bound, "prediction": n, "initialised": 1}
 
 
 def running_bound(design: UioDesign) -> RuntimeBound:
@@ -251,7 +241,7 @@ def first_memory(
             check_range_of_T(design, design.bound, z)
     fhat = start.f.mean(axis=1)
     box = StartBox(design, z, x_box, fhat, start.f)
-    first = first_levels if isinstance(design.bound, EllipsoidBound) else first_transient
+    first = first_levels if isinstance(design.bound, EllipsoidBound) else first_fading
     return {"z": z, "fhat": fhat, "bound": first(design, box), "prediction": start.guess}
 
 
@@ -321,19 +311,15 @@ def build_step(design: UioDesign) -> ca.Function:
     xhat_inside = inside(xhat, xhat, box)
     fhat_inside = inside(fhat, fhat, f_box)
     can_reset = ca.logic_and(xhat_inside, fhat_inside)
-    s_parts = []
-    for i in range(n + n_f):
-        kept = s[i]
-        if np.isfinite(bound.reset[i]):
-            again = ca.if_else(can_reset, float(bound.reset[i]), ca.inf)
-            kept = ca.if_else(s[i] <= FINITE, s[i], again)
-        s_parts.append(ca.if_else(y_finite, kept, ca.inf))
-    s_now = ca.vertcat(*s_parts)
-    inner = s_now * ca.DM(bound.scale)
+    known = ca.logic_and(y_finite, all_finite(s))
+    again = ca.logic_and(y_finite, can_reset) if np.all(np.isfinite(bound.reset)) else ca.SX(0)
+    s_now = select(known, s, ca.SX(bound.reset))
+    have_bound = ca.logic_or(known, again)
+    inner = ca.sparsify(ca.DM(bound.reach)) @ s_now
     estimate = ca.vertcat(xhat, fhat)
     half = (ca.sqrt(inner) if bound.root else inner) * ROUND_UP + ca.DM(bound.add)
     half = half + ULPS * ca.fabs(estimate)
-    valid = ca.logic_and(initialised, s_now[0] <= FINITE)
+    valid = ca.logic_and(initialised, have_bound)
     half = ca.vertcat(*(ca.if_else(valid, half[i], ca.inf) for i in range(n + n_f)))
     x_lower, x_upper = xhat - half[:n], xhat + half[:n]
     f_lower, f_upper = fhat - half[n:], fhat + half[n:]
@@ -349,13 +335,15 @@ def build_step(design: UioDesign) -> ca.Function:
             "outside_domain": ca.logic_not(
                 ca.logic_and(inside(x_lower, x_upper, box), xhat_inside)
             ),
-            "inconsistent_measurement": ca.logic_not(consistent),
+            "void": ca.logic_not(consistent),
             "fault_not_valid": ca.logic_not(valid),
         }
     )
 
-    s_next = ca.DM(bound.decay) * s_now + ca.DM(bound.offset)
-    s_next = ca.vertcat(*(ca.if_else(u_finite, s_next[i], ca.inf) for i in range(n + n_f)))
+    s_next = ca.sparsify(ca.DM(bound.decay)) @ s_now + ca.DM(bound.offset)
+    s_next = select(
+        ca.logic_and(have_bound, u_finite), s_next, ca.SX(np.full(len(bound.reset), np.inf))
+    )
     moved = ca.vertcat(z_next, fhat_next, s_next, next_state, 1)
     return make_step(
         {"memory": memory, "u": u, "y": y},

@@ -321,12 +321,12 @@ def test_what_a_search_found_is_shown_as_such(tmp_path):
 
 @pytest.mark.parametrize("decay", [-1.0, 0.0, 0.9, 1.0, 1.5])
 def test_the_decay_of_peak_bounds_is_proved(given_peak, decay, tmp_path):
-    """Mutant: the claim without its call of `transient`."""
+    """Mutant: the claim without its call of `contracts`."""
     path = tmp_path / "peak.json"
     given_peak.save(path)
     record = json.loads(path.read_text())
     assert ob.load(path).certificate["decay"].holds
-    record["bound"]["decay"] = decay
+    record["bound"]["fading"]["decay"] = decay
     path.write_text(json.dumps(record))
     with pytest.raises(ob.CertificateError) as refusal:
         ob.load(path)

@@ -1,4 +1,4 @@
-"""Peak bounds for the observer: design, proof, run-time recursion and start."""
+"""Peak bounds for the observer: design and proof."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from obsynth.designs.bounded_error.peak.bound import (
     PeakBound,
     peak_bound,
     prove_peak,
-    small_gain_solution,
 )
+from obsynth.designs.bounded_error.peak.fading import fade, prove_fading
 from obsynth.designs.bounded_error.peak.gain import peak_gain
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
-from obsynth.designs.bounded_error.peak.transient import decaying, transient
 from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
@@ -70,8 +69,7 @@ def bound_peak(design: UioDesign) -> UioDesign:
         rounding=design.rounding,
         dbar=_unknown_input_bound(design),
     )
-    start = transient(peak, _widest_start(design))
-    return replace(design, bound=PeakData(peak.b, start.decay))
+    return replace(design, bound=PeakData(peak.b, fade(peak, _widest_start(design))))
 
 
 def _widest_start(design: UioDesign) -> FloatArray:
@@ -128,6 +126,7 @@ def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
             rounding=design.rounding,
             dbar=_unknown_input_bound(design),
         )
+        peak = stored_bound(design)
     except (CertificateError, InfeasibleDesign) as error:
         return (Claim("peak", statement, False, -np.inf, str(error)),)
     slack = float((proof.slack / bound.b).min())
@@ -147,27 +146,7 @@ def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:
             1.0 - proof.small_gain,
             "max (G v)_i / v_i for a positive v, rounded up",
         ),
-        _prove_decay(design, bound),
-    )
-
-
-def _prove_decay(design: UioDesign, bound: PeakData) -> Claim:
-    """Prove that the step may forget the first error as fast as the stored decay says."""
-    proof = "powers of the error system divided by those of the decay, rounded up"
-    try:
-        gain = decaying(_system(design), bound.decay)[2]
-        small_gain_solution(gain, np.ones(len(gain)))
-    except InfeasibleDesign as error:
-        proof = str(error)
-        holds = False
-    else:
-        holds = True
-    return Claim(
-        "decay",
-        f"what the first error adds to the bounds decays with {bound.decay:.7g} per sample",
-        holds,
-        1.0 - bound.decay if holds else -np.inf,
-        proof,
+        *prove_fading(peak, bound.fading),
     )
 
 

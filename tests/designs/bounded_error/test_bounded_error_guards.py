@@ -201,8 +201,8 @@ def test_a_missing_input_costs_the_bounds_of_the_next_instant_only(base):
 def test_an_impossible_measurement_is_flagged(given_peak):
     box = np.array([[124, 126], [164, 166], [24, 26], [34, 36.0]])
     memory = given_peak.memory0([125, 165, 25, 35], x_range=box)
-    start = memory[given_peak.memory_layout["bound"]]
-    far = 125 + 10 * (given_peak.half_widths[0] + start[0]) + 5
+    first = step(given_peak, memory, y=(125, 165, 25))
+    far = 125 + 5 * (first["x_upper"][0] - first["x_lower"][0]) + 5
     assert int(step(given_peak, memory, y=(125, 165, 25))["status"][0]) & 8 == 0
     assert int(step(given_peak, memory, y=(far, 165, 25))["status"][0]) & 8
 
@@ -328,7 +328,7 @@ def test_the_recursion_of_the_ellipsoid_counts_the_rounding_of_a_step(design):
     rho = np.sqrt(max(s @ P @ s for s in tau * np.array(list(product((-1, 1), repeat=len(tau))))))
     for V in np.linspace(0.0, 3.0, 61):
         moved = (np.sqrt((1 - gamma) * V + gamma) + rho) ** 2
-        assert np.all(bound.decay * V + bound.offset >= moved)
+        assert np.all(bound.decay @ np.full(len(tau), V) + bound.offset >= moved)
 
 
 @pytest.mark.parametrize("options", [{"bounds": "peak"}, {"gamma": 0.05}])
