@@ -218,10 +218,11 @@ def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
     measured = [k for k, signal in enumerate(plant.rho) if signal.measured]
     hidden = [k for k, signal in enumerate(plant.rho) if not signal.measured]
     rows, outputs = plant.function()(*(s[kind] for kind in ("x", "u", "d", "f", "w", "p", "rho")))
-    rest = ca.vertcat(s["d"], s["w"], s["p"], s["rho"][hidden])
+    rho = ca.vertsplit(s["rho"])
+    rest = ca.vertcat(s["d"], s["w"], s["p"], *(rho[k] for k in hidden))
     ranges = np.vstack([plant.box(kind).reshape(-1, 2) for kind in ("d", "w", "p")])
     ranges = np.vstack([ranges, plant.box("rho").reshape(-1, 2)[hidden]])
-    known = ca.vertcat(s["u"], s["rho"][measured])
+    known = ca.vertcat(s["u"], *(rho[k] for k in measured))
     return ca.vertcat(s["x"], s["f"], rest), known, ca.densify(rows), ca.densify(outputs), ranges
 
 
