@@ -63,7 +63,7 @@ class Contract(Generic[D]):
     first: parts of it for a first set; further keywords are those of the method. In discrete time
         the shared ones are enough, since a core begins from the first sets
     core: what the method knows from call to call, see `guard`
-    shared: parts of the memory that estimates are made of
+    shared: parts of the memory that estimates are made of, or a function of the design
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
@@ -81,7 +81,7 @@ class Contract(Generic[D]):
     first: Callable[..., Mapping[str, ArrayLike]]
     core: Callable[[D], Core] | None = None
     step: Callable[[D], ca.Function] | None = None
-    shared: tuple[str, ...] = ()
+    shared: tuple[str, ...] | Callable[[D], tuple[str, ...]] = ()
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
@@ -152,7 +152,7 @@ class Contract(Generic[D]):
             self.fault_delay,
             plant.Ts if plant.Ts is not None else design.Ts,
             getattr(design, "precision", "double"),
-            self.shared,
+            self.shared(design) if callable(self.shared) else self.shared,
         )
 
     def layout(self, design: Any) -> dict[str, slice]:

@@ -81,8 +81,8 @@ def _assumptions(design: QPVDesign) -> Iterator[str]:
     )
     yield "state and faults stay in the ellipsoid of the region [monitored: status bit 4]"
     yield (
-        "e(0) lies in {e'P e <= 1}, as memory0 finds from the ranges it is given "
-        "[monitored: status bit 4]"
+        "e(0) lies in {e'P e <= 1}, as memory0 finds from the ranges it is given, and the step "
+        "from the declared ones where it begins anew [monitored: status bit 4]"
     )
     scheduling = measured_schedule(plant)
     if scheduling:

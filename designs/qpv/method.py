@@ -33,7 +33,7 @@ from obsynth.designs.qpv.model import (
 from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
-from obsynth.designs.qpv.step import build_ode, build_step, first_memory, memory_sizes
+from obsynth.designs.qpv.step import build_core, build_ode, first_memory, memory_sizes, shared
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -143,7 +143,8 @@ class QPVObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         quiet=True,
-        step=build_step,
+        core=build_core,
+        shared=shared,
         ode=build_ode,
     )
 

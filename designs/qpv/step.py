@@ -10,16 +10,10 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.stepping import (
-    all_finite,
-    finite_or,
-    largest_level,
-    make_step,
-    select,
-    slices,
-    status_word,
-)
+from obsynth.designs.core.stepping import all_finite, largest_level, select, slices
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -29,6 +23,8 @@ from obsynth.symbolic.text import read_text
 
 # Above the rounding of the few dozen operations behind every returned number.
 _UP = 1.0 + 2.0**-40
+# What the root of V is at estimates that were placed anew.
+_PLACED = 0.999
 
 
 def memory_sizes(design: QPVDesign) -> dict[str, int]:
@@ -133,6 +129,13 @@ class _Equations:
             return noise.rate, 1.0
         return (self.design.alpha, 0.0) if self.design.bounded else (0.0, 0.0)
 
+    def next_level(self, level: ca.SX) -> ca.SX:
+        """Bound of V one sample later: V' <= rate (limit - V), exactly."""
+        rate, limit = self.level_rate()
+        share = float(np.exp(-rate * self.design.Ts))
+        after = limit * (1.0 - share) + share * level * (1.0 + 2.0**-50)
+        return ca.fmin(after, ca.fmax(level, limit)) if limit else after
+
 
 def _symbols(plant: Plant) -> dict[str, ca.SX]:
     names = {
@@ -205,89 +208,115 @@ class _Sizes:
 
 def _inside_region(sizes: _Sizes, offset: ca.SX, level: ca.SX) -> ca.SX:
     """Whether offset + {e'P e <= level} lies in the ellipsoid X - c, by the triangle inequality."""
-    distance = ca.sqrt(ca.mtimes([offset.T, ca.DM(sizes.inverse_Q), offset]))
+    distance = ca.sqrt(_form(sizes.inverse_Q, offset))
     return distance + ca.sqrt(level) * sizes.region <= 1.0
 
 
-def build_step(design: QPVDesign) -> ca.Function:
-    """Return `Observer.step`: the Runge-Kutta step of order four with u, y and theta held."""
-    plant = design.plant
-    n, n_f, m = len(plant.x), len(plant.f), len(plant.output)
-    layout = slices(memory_sizes(design))
-    memory = ca.SX.sym("memory", layout["initialised"].stop)
-    found = _symbols(plant)
-    u, y, theta = found["u"], found["y"], found["theta"]
+def build_core(design: QPVDesign) -> Core:
+    """Build the Runge-Kutta step of order four with u, y and theta held, and the bound of V.
+
+    The sets of an instant follow from readings before it. One that is missing is replaced by what
+    is expected, which says nothing of V from then on: the bound begins anew.
+    """
+    n, m = len(design.plant.x), len(design.plant.output)
     equations, sizes = _Equations(design), _Sizes.of(design)
-    initialised = memory[layout["initialised"]] > 0.5
-    state = memory[: n + n_f]
 
-    u_used = finite_or(u, [0.0 if s.nominal is None else float(s.nominal) for s in plant.u])
-    middle = [0.5 * (s.lower + s.upper) for s in measured_schedule(plant)]
-    theta_used = finite_or(theta, middle) if theta.numel() else theta
-    known = ca.logic_and(all_finite(u), all_finite(theta))
-    gain, scheduled = equations.gain(u_used, theta_used)
-    expected = equations.model(state, u_used, theta_used)[1]
-    y_used = finite_or(y, expected)
-    seen = all_finite(y)
+    def run(seen: Seen) -> Known:
+        state = ca.vertcat(seen.memory["xhat"], seen.memory["fhat"])
+        gain, scheduled = equations.gain(seen.u, seen.theta)
+        expected = equations.model(state, seen.u, seen.theta)[1]
+        y = seen.readings(expected)
+        offset = state - ca.DM(design.region.c)
+        level = seen.memory["level"]
+        if design.reset < 1.0:
+            level = ca.fmin(level, _region_level(design, offset))
+        certified = ca.logic_and(level <= 1.0, scheduled)
+        reach = ca.sqrt(level) if design.bounded else ca.SX(1)
+        consistent = ca.SX(1)
+        for i in range(m):
+            if np.isfinite(sizes.noise[i]):
+                allowed = reach * sizes.reach[i] + sizes.noise[i] + 2.0**-40 * ca.fabs(y[i])
+                fits = ca.fabs(y[i] - expected[i]) <= allowed
+                consistent = ca.logic_and(consistent, fits)
+        in_region = _inside_region(sizes, offset, level if design.bounded else ca.SX(0))
+        x = f = None
+        if design.bounded:
+            half = ca.DM(sizes.half) * reach
+            half = half + 2.0**-40 * (ca.fabs(state) + half)
+            found = Ends(state - half, state + half).where(certified, Ends.unbounded(state.numel()))
+            x = Ends(found.lower[:n], found.upper[:n])
+            f = Ends(found.lower[n:], found.upper[n:])
+        after = _runge_kutta(
+            lambda value: equations.rate(value, seen.u, y, seen.theta, gain), state, design.Ts
+        )
+        going = all_finite(after)
+        after = select(going, after, state)
+        moved = {"xhat": after[:n], "fhat": after[n:], "level": equations.next_level(level)}
+        return Known(
+            state[:n],
+            state[n:],
+            x,
+            f,
+            moved,
+            sound=ca.logic_and(ca.logic_and(certified, seen.all_used), going),
+            empty=ca.logic_and(certified, ca.logic_not(consistent)),
+            outside=ca.logic_not(ca.logic_and(certified, in_region)),
+            valid=certified,
+        )
 
-    offset = state - ca.DM(design.region.c)
-    level = memory[layout["level"]]
-    if design.reset < 1.0:
-        # whatever was lost before, the state lies in X
-        away = ca.sqrt(ca.mtimes([offset.T, ca.DM(design.P), offset])) + design.reset
-        level = ca.fmin(level, away * away * _UP)
-    certified = ca.logic_and(initialised, ca.logic_and(level <= 1.0, scheduled))
-    bounded = design.bounded
-    valid = ca.logic_and(certified, seen) if bounded else ca.SX(0)
-    half = ca.DM(sizes.half) * ca.sqrt(level)
-    half = half + 2.0**-40 * (ca.fabs(state) + half)
-    half = ca.vertcat(*(ca.if_else(valid, half[i], ca.inf) for i in range(n + n_f)))
-    innovation = y_used - expected
-    reach = ca.sqrt(level) if bounded else ca.SX(1)
-    consistent = ca.SX(1)
-    for i in range(m):
-        if np.isfinite(sizes.noise[i]):
-            allowed = reach * sizes.reach[i] + sizes.noise[i] + 2.0**-40 * ca.fabs(y_used[i])
-            consistent = ca.logic_and(consistent, ca.fabs(innovation[i]) <= allowed)
-    in_region = _inside_region(sizes, offset, level if bounded else ca.SX(0))
-    status = status_word(
-        {
-            "not_initialised": ca.logic_not(initialised),
-            "non_finite_input": ca.logic_not(ca.logic_and(known, seen)),
-            "outside_domain": ca.logic_not(ca.logic_and(certified, in_region)),
-            "inconsistent_measurement": ca.logic_and(certified, ca.logic_not(consistent)),
-            "fault_not_valid": ca.logic_not(ca.logic_and(certified, seen)),
-        }
-    )
+    def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
+        state = ca.vertcat(kept["xhat"], kept["fhat"])
+        box = Ends(ca.vertcat(x.lower, f.lower), ca.vertcat(x.upper, f.upper))
+        return {"level": _box_level(design, box, state) * _UP}
 
-    moved = _runge_kutta(
-        lambda value: equations.rate(value, u_used, y_used, theta_used, gain), state, design.Ts
-    )
-    rate, limit = equations.level_rate()
-    share = float(np.exp(-rate * design.Ts))
-    next_level = limit * (1.0 - share) + share * level * (1.0 + 2.0**-50)
-    next_level = ca.fmin(next_level, ca.fmax(level, limit)) if limit else next_level
-    alive = ca.logic_and(ca.logic_and(known, seen), scheduled)
-    next_level = ca.if_else(ca.logic_and(alive, level <= 1.0), next_level, ca.inf)
-    going = all_finite(moved)
-    next_level = ca.if_else(going, next_level, ca.inf)
-    following = ca.vertcat(select(going, moved, state), next_level, 1)
-    inputs = {"memory": memory, "u": u, "y": y}
-    if theta.numel():
-        inputs["theta"] = theta
-    return make_step(
-        inputs,
-        {
-            "memory": select(initialised, following, memory),
-            "xhat": state[:n],
-            "fhat": state[n:],
-            "x_lower": state[:n] - half[:n],
-            "x_upper": state[:n] + half[:n],
-            "f_lower": state[n:] - half[n:],
-            "f_upper": state[n:] + half[n:],
-            "status": status,
-        },
-    )
+    def place(x: Ends, f: Ends, kept: Parts) -> Parts:
+        """Move the estimates towards the middle, as little as their bound needs to be below 1."""
+        box = Ends(ca.vertcat(x.lower, f.lower), ca.vertcat(x.upper, f.upper))
+        middle, state = box.middle, ca.vertcat(kept["xhat"], kept["fhat"])
+        state = select(all_finite(state), state, middle)
+        least, away = ca.sqrt(_box_level(design, box, middle)), _length(design, state - middle)
+        share = ca.fmin((_PLACED - least) / ca.fmax(away, _PLACED - least), 1.0)
+        share = ca.if_else(least < _PLACED, share, 1.0)
+        state = middle + share * (state - middle)
+        placed = {"xhat": state[:n], "fhat": state[n:]}
+        return placed if design.bounded else {**placed, **begin(x, f, placed)}
+
+    c, half = design.region.c[:n], design.region.half_widths[:n]
+    domain = np.column_stack([c - half * _UP, c + half * _UP])
+    return Core(run, begin, place, domain=domain, bridges=True)
+
+
+def shared(design: QPVDesign) -> tuple[str, ...]:
+    """Return what both copies have in common: the level too where no set follows from it."""
+    return ("xhat", "fhat") if design.bounded else ("xhat", "fhat", "level")
+
+
+def _form(matrix: FloatArray, vector: ca.SX) -> ca.SX:
+    """Return v'M v for a symmetric M."""
+    total = ca.SX(0)
+    for i in range(len(matrix)):
+        row = matrix[i, i] * vector[i]
+        for j in range(i + 1, len(matrix)):
+            row += 2.0 * matrix[i, j] * vector[j]
+        total += row * vector[i]
+    return total
+
+
+def _length(design: QPVDesign, vector: ca.SX) -> ca.SX:
+    """Bound the root of v'P v, and of |v|'|P||v|, by sum P_ii^1/2 |v_i|."""
+    return ca.dot(ca.DM(np.sqrt(np.diag(design.P)) * _UP), ca.fabs(vector))
+
+
+def _box_level(design: QPVDesign, box: Ends, state: ca.SX) -> ca.SX:
+    """Bound V for a truth in a box by sum |P_ij| r_i r_j, up to rounding."""
+    return _form(np.abs(design.P), ca.fmax(box.upper - state, state - box.lower))
+
+
+def _region_level(design: QPVDesign, offset: ca.SX) -> ca.SX:
+    """Bound V for a truth in the region, by the triangle inequality."""
+    rounding = 2.0**-44 * _length(design, offset) ** 2
+    away = ca.sqrt(ca.fmax(_form(design.P, offset), 0.0) + rounding) + design.reset
+    return away * away * _UP
 
 
 def _runge_kutta(rate: Callable[[ca.SX], ca.SX], state: ca.SX, step: float) -> ca.SX:

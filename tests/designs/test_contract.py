@@ -368,7 +368,7 @@ def test_an_impossible_reading_is_void_and_forgotten(entry, observer):
         np.testing.assert_array_equal(one["x_upper"], x_box[:, 1])
         assert one["memory"][layout["age"]] == 0
         assert one["memory"][layout["begin"]] == one["memory"][layout["begin_2"]] == 1
-    shared = observer.certificate.contract.shared
+    shared = contract_of(observer).guard(observer.certificate.design).shared
     kept = np.ones(len(memories[0]), dtype=bool)
     for part in shared:
         kept[layout[part]] = False

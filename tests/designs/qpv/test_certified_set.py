@@ -163,13 +163,14 @@ def test_bounded_noise_keeps_every_fault_inside_its_bound(designed):
     observer = designed("noise")
     level, reach = noisy(observer, 2.5, count=1500, duration=0.5)
     assert level <= 1.0
-    assert (reach <= observer.half_widths).all()
+    widths = observer.performance["core_half_widths"]
+    assert (reach <= widths).all()
     # the starts fill the set, so the bound is not idle
-    assert reach[5] > 0.5 * observer.half_widths[5]
+    assert reach[5] > 0.5 * widths[5]
 
 
 def test_the_noise_check_sees_noise_that_is_too_large(designed):
     """Mutant: four hundred times the declared noise."""
     level, reach = noisy(designed("noise"), 1000.0, count=300, duration=0.2)
     assert level > 1.0
-    assert (reach > designed("noise").half_widths).any()
+    assert (reach > designed("noise").performance["core_half_widths"]).any()

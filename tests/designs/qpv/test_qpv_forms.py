@@ -157,7 +157,8 @@ def test_actuator_faults_are_states_too():
 def test_bounded_rates_of_faults_are_disturbances_of_the_bound():
     steady = small(alpha_q=0.5).design(varying())
     moving = small(alpha_q=0.5).design(varying(rate=0.02))
-    assert moving.half_widths[1] > steady.half_widths[1]
+    widths = [one.performance["core_half_widths"][1] for one in (moving, steady)]
+    assert widths[0] > widths[1]
     assert any("|df/dt| <= 0.02/s" in text for text in moving.guarantee.assumptions)
     assert any("f do not change" in text for text in steady.guarantee.assumptions)
 
@@ -188,7 +189,7 @@ def test_without_disturbances_the_sets_shrink():
     made.dynamics([-x + f * x + u])
     made.outputs([x])
     observer = small(alpha=0.5, gain_cap=20.0).design(made)
-    assert observer.half_widths.tolist() == [0.0, 0.0]
+    assert observer.performance["core_half_widths"].tolist() == [0.0, 0.0]
     memory = observer.memory0([5.0], x_range=[(4.9, 5.1)], f_range=[(-0.01, 0.01)])
     truth, fault = np.array([5.08]), 0.008
     widths = []
