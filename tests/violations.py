@@ -7,7 +7,7 @@ again. `broken` says at which instants something was, from the truth alone.
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import sympy as sp
 
 import obsynth as ob
 from methods import METHODS, observer_of
+from obsynth.designs.core.guard import HORIZON
 from obsynth.evaluate.truth import Call, Truth, dense
 
 KINDS = ("glitch", "drop-out", "excursion", "fault jump", "burst")
@@ -51,7 +52,7 @@ class Case:
     @property
     def window(self) -> int:
         """The finite memory N: sets are right 2 N samples after the last violation."""
-        return int(self.observer.record["options"].get("horizon", 400))
+        return int(self.observer.record["options"].get("horizon") or HORIZON)
 
 
 def tanks() -> Case:
@@ -124,6 +125,8 @@ def of_method(name: str) -> Case:
     """The plant and the inputs of a method's entry in the table, at rest."""
     entry, observer = METHODS[name], observer_of(name)
     plant, scenario = entry.plant(), entry.scenario()
+    if observer.record["options"].get("horizon") not in (None, HORIZON):
+        observer = replace(entry.method, horizon=HORIZON).design(plant)
     arrays = scenario.arrays(plant, 0)
     given: Any = scenario.inputs
     law = given if scenario.feedback else lambda k, y: arrays["u"][k % (scenario.steps + 1)]
@@ -235,7 +238,10 @@ def _gain_of_noise(case: Case) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What was true and what was said: (K, B, ...) each."""
+    """What was true and what was said: (K, B, ...) each.
+
+    age: (K, B), calls over which a mean of the fault goes back, where the fault's set holds one
+    """
 
     x: Any
     f: Any
@@ -245,6 +251,7 @@ class Record:
     f_lower: Any
     f_upper: Any
     broken: Any
+    age: Any = None
 
 
 def record(case: Case, given: Trials) -> Record:
@@ -263,6 +270,7 @@ def record(case: Case, given: Trials) -> Record:
     x[:] = case.x0
     home = x.copy()
     logs: list[list[Any]] = [[] for _ in range(7)]
+    ages = []
     for k in range(K):
         forced = given.shift[k]
         out = np.isfinite(forced)
@@ -282,6 +290,7 @@ def record(case: Case, given: Trials) -> Record:
         if len(step.args) > 3:
             step.args[3].reshape(B, -1)[:] = rho[:, measured]
         step.evaluate()
+        ages.append(_age(case, memory))
         values = (x, f, said[7], *said[3:7])
         for log, value in zip(logs, values, strict=True):
             log.append(value.copy())
@@ -293,7 +302,16 @@ def record(case: Case, given: Trials) -> Record:
         x[:] = following_x
     arrays = [np.array(log) for log in logs]
     arrays[2] = arrays[2][:, :, 0].astype(np.int64)
-    return Record(*arrays, broken=broken(case, given, arrays[0], arrays[1]))
+    return Record(*arrays, broken=broken(case, given, arrays[0], arrays[1]), age=np.array(ages))
+
+
+def _age(case: Case, memory: Any) -> Any:
+    """Return (B,): how many calls the mean in the fault's set goes back, from its response."""
+    if not case.mean:
+        return np.zeros(len(memory), dtype=int)
+    response = memory[:, case.observer.memory_layout["response"]][:, 0]
+    full = case.observer.record["gain"][0] / case.mean
+    return np.rint(-np.log1p(-response / full) / (case.mean * case.observer.model.Ts)).astype(int)
 
 
 def broken(case: Case, given: Trials, x: Any, f: Any) -> Any:
@@ -350,11 +368,13 @@ def missed(case: Case, seen: Record) -> Any:
     """Return (K, B): some set misses the truth, or a bound is no number."""
     late, f = case.observer.fault_delay, seen.f
     if case.mean:
-        kept = np.exp(-case.mean * case.observer.model.Ts)
-        total, weight, f = np.zeros_like(f[0]), 0.0, f.copy()
-        for k in range(len(f) - 1):
-            total, weight = kept * total + (1 - kept) * seen.f[k], kept * weight + 1 - kept
-            f[k + 1] = total / weight
+        later = np.exp(case.mean * case.observer.model.Ts * np.arange(len(f)))[:, None, None]
+        sums = np.concatenate([np.zeros_like(f[:1]), np.cumsum(later * f, axis=0)])
+        weights = np.concatenate([np.zeros((1, 1, 1)), np.cumsum(later, axis=0)])
+        k, b = np.arange(len(f))[:, None], np.arange(f.shape[1])
+        gone = weights[k, 0] - weights[k - seen.age, 0]
+        mean = (sums[k, b] - sums[k - seen.age, b]) / np.where(gone > 0.0, gone, 1.0)
+        f = np.where(gone > 0.0, mean, seen.f)
     f = np.roll(f, late, axis=0)
     good_f = (seen.f_lower <= f) & (f <= seen.f_upper)
     good_f[:late] = True

@@ -118,10 +118,12 @@ class Monotone:
         return symbol
 
 
-def with_ranges(plant: Plant, box: Sequence[Sequence[float]] | FloatArray) -> Plant:
-    """Return a copy of a plant whose states have other ranges."""
+def with_ranges(
+    plant: Plant, box: Sequence[Sequence[float]] | FloatArray, kind: str = "x"
+) -> Plant:
+    """Return a copy of a plant whose states, or signals of another kind, have other ranges."""
     data = plant.to_dict()
-    ranges = dict(zip(plant.names("x"), np.asarray(box, dtype=float).tolist(), strict=True))
+    ranges = dict(zip(plant.names(kind), np.asarray(box, dtype=float).tolist(), strict=True))
     signals = []
     for entry in data["signals"]:
         if entry["name"] in ranges:

@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import CONSTANT_ULPS, constant_interval
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.equations import Before, Equations
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding
@@ -83,7 +84,9 @@ class Contractor:
         step = 1.0 if self.plant.Ts is not None else self.Ts * (1.0 + 2.0**-50)
         found = [np.inf if s.rate is None else float(s.rate) * step for s in self.plant.f]
         still = [0.0 if s.constant else r for s, r in zip(self.plant.f, found, strict=True)]
-        return np.array(still)
+        ends = np.column_stack([np.zeros(len(still)), still])
+        limits: FloatArray = outward(ends, self.precision)
+        return limits[:, 1]
 
     @cached_property
     def strips(self) -> tuple[Strip | None, ...]:
@@ -125,19 +128,28 @@ class Contractor:
 
     def _told(self, strip: Strip, j: int, y: ca.SX, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return what one reading says of a state, the others of its strip in their ends."""
-        r = self.rounding
-        below, above = r.down(y - strip.high), r.up(y - strip.low)
+        r, slack = self.rounding, ca.SX(0)
+        if self.precision != "double":
+            # the reading and the numbers of the strip are rounded too
+            slack = r.step * (ca.fabs(y) + max(abs(strip.low), abs(strip.high)))
+        below, above = r.down(y - strip.high - slack), r.up(y - strip.low + slack)
         for k in np.flatnonzero(strip.row).tolist():
             if k != j:
-                c, units = float(strip.row[k]), _units(strip.row[k])
+                c, units = float(strip.row[k]), self._units(strip.row[k])
                 least, most = (low[k], high[k]) if c > 0 else (high[k], low[k])
                 below = r.down(below - r.up(c * most, units, tiny=True))
                 above = r.up(above - r.down(c * least, units, tiny=True))
-        c, units = float(strip.row[j]), _units(strip.row[j])
+        c, units = float(strip.row[j]), self._units(strip.row[j])
         if c == 1.0:
             return below, above
         ends = (below / c, above / c) if c > 0 else (above / c, below / c)
         return r.down(ends[0], units, tiny=True), r.up(ends[1], units, tiny=True)
+
+    def _units(self, coefficient: float) -> float:
+        """Return how many roundings a product takes: a coefficient may stand for one near it."""
+        low, high = constant_interval(float(coefficient))
+        exact = self.precision == "double" or float(np.float32(coefficient)) == coefficient
+        return (1.0 if low == high else 2.0 + CONSTANT_ULPS) + (0.0 if exact else 1.0)
 
     def image(self, before: Before) -> Ends:
         """Return what the states can be one call later, unbounded where a row has no image."""
@@ -219,12 +231,6 @@ class Contractor:
         slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
         found: FloatArray = np.concatenate([x, late if delay else now]) + slack
         return found
-
-
-def _units(coefficient: float) -> float:
-    """Return how many roundings a product takes: the coefficient may stand for a number near it."""
-    low, high = constant_interval(float(coefficient))
-    return 1.0 if low == high else 2.0 + CONSTANT_ULPS
 
 
 def _finite(halves: FloatArray, row: FloatArray, j: int) -> FloatArray:

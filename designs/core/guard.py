@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
@@ -37,6 +38,9 @@ from obsynth.designs.core.stepping import slices
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
+HORIZON = 400
+"""N where nothing else is said."""
+MOST_CALLS = 10**9
 YOUNG = "_2"
 """What the names of the younger copy's parts of the memory end with."""
 
@@ -58,9 +62,10 @@ class Watch:
     def of(cls, options: Mapping[str, object]) -> "Watch":
         """Read what a design stores, or refuse it."""
         horizon, recovery, cuts = (options.get(name) for name in ("horizon", "recovery", "cuts"))
+        horizon = HORIZON if horizon is None else horizon
         named: Any = CUTS if cuts is None else cuts
         known = isinstance(named, list | tuple) and all(name in CUTS for name in named)
-        counts = [n for n in (horizon, recovery) if isinstance(n, int) and 1 <= n <= 10**9]
+        counts = [n for n in (horizon, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
         if not known or len(counts) < 2:
             raise CertificateError(
                 f"the stored design cannot be read: horizon {horizon!r}, recovery {recovery!r} and "
@@ -115,13 +120,14 @@ class Guard:
         """
         boxes = {"x": x, "f": f} if self.discrete else {"f": self.plant.box("f")}
         ends: dict[str, ArrayLike] = {}
+        layout = self.layout()
         for name, box in boxes.items():
-            near = np.clip(box, -FAR, FAR)
+            near = np.clip(outward(box, self.precision), -FAR, FAR)
             ends |= {f"{name}_lower": near[:, 0], f"{name}_upper": near[:, 1]}
         own = {**parts, **ends, "begin": np.array([float(self.discrete)])}
         both = own | {k + YOUNG: v for k, v in own.items() if k not in self.shared}
         both["since"] = np.array([float(self.watch.recovery)])
-        return {k: v for k, v in both.items() if k in self.layout()}
+        return {k: v for k, v in both.items() if k in layout}
 
     @cached_property
     def contractor(self) -> Contractor:

@@ -5,6 +5,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 `Contract` say what they owe, and the observer, its certificate, its file and its memory follow.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from inspect import signature
@@ -19,7 +20,7 @@ from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Leve
 from obsynth.designs.core.contractor import CUTS
 from obsynth.designs.core.core import Core
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
-from obsynth.designs.core.guard import YOUNG, Guard, Watch, monitored
+from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import plain
 from obsynth.designs.core.step import Step
@@ -30,7 +31,9 @@ from obsynth.symbolic.errors import ObsynthError
 
 D = TypeVar("D")
 
-CALLS = Number(at_least=1, at_most=10**9, because="it has to be a number of calls, at least one")
+CALLS = Number(
+    at_least=1, at_most=MOST_CALLS, because="it has to be a number of calls, at least one"
+)
 FORMAT = "obsynth design"
 VERSION = 2
 
@@ -144,7 +147,7 @@ class Contract(Generic[D]):
 
     def guard(self, design: Any) -> Guard:
         """Return what watches over the core of a design."""
-        plant: Plant = design.plant
+        plant: Plant = getattr(design, "assumed", design.plant)
         return Guard(
             plant,
             self.memory(design),
@@ -194,7 +197,8 @@ class Method:
     A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
 
     horizon: N, number of calls after which a set that was begun anew takes over from an older one:
-        nothing that happened more than 2 N calls ago matters to what is returned
+        nothing that happened more than 2 N calls ago matters to what is returned. By default 400,
+        and in continuous time as many as the slowest sets take to settle
     recovery: number of calls after a void one that the status marks as recovering
     cuts: what the returned sets are cut with beside the method's own, of ``"ranges"``,
         ``"strips"``, ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()``
@@ -204,7 +208,7 @@ class Method:
     CLASS: ClassVar[PlantClass]
     CONTRACT: ClassVar[Contract[Any]]
 
-    horizon: Annotated[int, CALLS] = field(default=400, kw_only=True)
+    horizon: Annotated[int | None, CALLS] = field(default=None, kw_only=True)
     recovery: Annotated[int, CALLS] = field(default=10, kw_only=True)
     cuts: tuple[str, ...] | None = field(default=None, kw_only=True)
 
@@ -297,6 +301,11 @@ class Method:
     def options(self) -> Mapping[str, Any]:
         """Return the options by name, as a design stores them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def settling(self, seconds: float, Ts: float) -> Mapping[str, Any]:
+        """Return the options with a default horizon of so many seconds."""
+        calls = min(math.ceil(seconds / Ts), MOST_CALLS) if self.horizon is None else self.horizon
+        return {**self.options(), "horizon": calls}
 
     def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:
         self.CLASS.check(given if isinstance(given, Plant) else given.model)

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before, covered_inputs
@@ -48,6 +49,9 @@ class Step:
                 np.maximum(self.contractor.domain[:, 0], own[:, 0]),
                 np.minimum(self.contractor.domain[:, 1], own[:, 1]),
             ]
+        )
+        self.domain, x_box, f_box = (
+            outward(box, guard.precision) for box in (self.domain, x_box, f_box)
         )
         self.reset = Ends.of(x_box), Ends.of(f_box)
         self.ranges = Ends.of(self.domain), self.reset[1]
@@ -174,7 +178,9 @@ class Step:
             self._copy(end, one, found, kept)
             for end, one, found in zip(("", YOUNG), both, sets, strict=True)
         )
-        X, shown = old.X.meet(young.X), old.shown.meet(young.shown)
+        X = old.X.meet(young.X)
+        # means over the memories of two copies need not have anything in common
+        shown = old.shown if self.core.mean_fault else old.shown.meet(young.shown)
         empty = ca.logic_or(
             ca.logic_or(old.empty, young.empty), ca.logic_or(X.empty(), shown.empty())
         )

@@ -12,11 +12,13 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.filter_bank.claims import claims, covers, guarantee, numbers
 from obsynth.designs.filter_bank.model import CLASS, read, read_again
 from obsynth.designs.filter_bank.record import BankDesign, BankModel
-from obsynth.designs.filter_bank.step import build_ode, build_step, first_memory, memory_sizes
+from obsynth.designs.filter_bank.step import build_core, build_ode, first_memory, memory_sizes
 from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
 
 _DEFAULT_TS = 0.01
+_SETTLED = 20.0
+"""Time constants of the slowest filter for which a copy of the sets is kept at least."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class FilterBank(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
-        step=build_step,
+        core=build_core,
         ode=build_ode,
         step_covered=True,
     )
@@ -104,12 +106,13 @@ class FilterBank(Method):
 
     def solve(self, model: BankModel) -> BankDesign:
         """Put the filters to what was read; there is nothing to be solved."""
+        Ts = _DEFAULT_TS if self.Ts is None else self.Ts
         return BankDesign(
             **vars(model),
-            Ts=_DEFAULT_TS if self.Ts is None else self.Ts,
+            Ts=Ts,
             filters=np.array(self.filters),
             precision=self.precision,
-            options=self.options(),
+            options=self.settling(_SETTLED / min(self.filters), Ts),
         )
 
     def fix(self, model: BankModel, gains: Mapping[str, Any]) -> BankDesign:

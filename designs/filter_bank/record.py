@@ -2,8 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
+import numpy as np
+
+from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import allowance
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
@@ -79,6 +83,12 @@ class BankDesign(BankModel):
     filters: Annotated[FloatArray, "n_l"]
     precision: Literal["double", "single"]
     options: Mapping[str, Any]
+
+    @cached_property
+    def assumed(self) -> Plant:
+        """The plant with the region for ranges of the states: what sets are held to."""
+        same = np.array_equal(self.region, self.plant.box("x"))
+        return self.plant if same else with_ranges(self.plant, self.region)
 
     @property
     def rounding(self) -> float:

@@ -1,22 +1,18 @@
 """The run-time functions of the bank: envelopes between samples, unmeasured states, filters."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import (
-    all_finite,
-    fill,
-    finite_or,
-    known_signals,
-    make_step,
-    select,
-    slices,
-    status_word,
-)
+from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.stepping import slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -43,36 +39,32 @@ def memory_sizes(design: BankDesign) -> dict[str, int]:
         "response": n_l,
         "shown_lower": m,
         "shown_upper": m,
-        "left": 1,
-        "initialised": 1,
     }
     return {name: size for name, size in sizes.items() if size}
 
 
 def first_memory(design: BankDesign, start: Start) -> dict[str, FloatArray]:
     """Start from a box of the state; guess and y0 are not used, faults have declared ranges."""
-    if start.x_range is None:
-        return _parts(design, design.region)
-    box = np.column_stack(
-        [
-            np.maximum(start.x_range[:, 0], design.region[:, 0]),
-            np.minimum(start.x_range[:, 1], design.region[:, 1]),
-        ]
-    )
+    box = design.region
+    if start.x_range is not None:
+        box = np.column_stack(
+            [np.maximum(start.x[:, 0], box[:, 0]), np.minimum(start.x[:, 1], box[:, 1])]
+        )
     if np.any(box[:, 0] > box[:, 1]):
         raise ObsynthError("x_range lies outside of the region of the bank", option="x_range")
-    return _parts(design, box)
+    ends = outward(box, design.precision).T
+    return {name: np.array(part).ravel() for name, part in begun(design, [*ends]).items()}
 
 
-def _parts(design: BankDesign, x_box: FloatArray) -> dict[str, FloatArray]:
-    """Return the parts of the memory that are not zero for a state in a box."""
-    x_box = outward(x_box, design.precision)
+def begun(design: BankDesign, ends: Sequence[Any]) -> dict[str, Any]:
+    """Return the parts of the memory that are not zero for a state between two ends."""
     parts = {}
-    for side, ends in zip(("lower", "upper"), x_box.T, strict=True):
+    rows = np.repeat(design.fault_rows, len(design.filters)).tolist()
+    for side, end in zip(("lower", "upper"), ends, strict=True):
+        parts[f"filter_{side}"] = end[rows]
+        parts[f"shown_{side}"] = end[design.outputs.tolist()]
         if design.hidden:
-            parts[f"hidden_{side}"] = ends[design.hidden]
-        parts[f"filter_{side}"] = np.repeat(ends[design.fault_rows], len(design.filters))
-        parts[f"shown_{side}"] = ends[design.outputs]
+            parts[f"hidden_{side}"] = end[design.hidden]
     return parts
 
 
@@ -126,94 +118,57 @@ class Corners:
         return value
 
 
-def build_step(design: BankDesign) -> ca.Function:
-    """Build `Observer.step`.
+def build_core(design: BankDesign) -> Core:
+    """Build the bank.
 
     Over a step every state stays in an envelope X with X_0 + [0, Ts] f(X) inside X (checked each
     time; without that check nothing is known). The unmeasured states then move by their own
     equation, others at the worst end of the envelope: for a flow that falls with its own state,
     z + Ts min(F(z), F(z + Ts F(z))) is below the true solution. Every filter gets the balance of
-    its state without fault, from below and from above, and its exact exponential.
+    its state without fault, from below and from above, and its exact exponential. What the
+    envelope leaves of a measured state stands in for a reading that is missing.
     """
-    plant = design.plant
-    layout = slices(memory_sizes(design))
-    memory = ca.SX.sym("memory", layout["initialised"].stop)
-    u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
-    theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
-    y_finite = all_finite(y)
-    u_used, theta_used, u_finite, covered = known_signals(plant, u, theta)
-    corners = Corners(design, u_used, theta_used)
+    outputs = design.outputs.tolist()
+    box = outward(design.region, design.precision)
+    region = ca.DM(box)
 
-    initialised = memory[layout["initialised"]] > 0.5
-    region = ca.DM(outward(design.region, design.precision))
-    told = _from_outputs(design, finite_or(y, [0.0] * y.numel()))
-    inside = ca.SX(1)
-    for k, i in enumerate(design.outputs.tolist()):
-        inside = ca.logic_and(inside, told[1][k] >= design.region[i, 0])
-        inside = ca.logic_and(inside, told[0][k] <= design.region[i, 1])
-    inside = ca.logic_and(ca.if_else(y_finite, inside, 1), covered)
-    again = ca.logic_and(memory[layout["left"]] > 0.5, inside)
-    memory_now = select(again, ca.SX(fill(layout, _parts(design, design.region))), memory)
-    parts = {name: memory_now[part] for name, part in layout.items()}
-
-    expected = parts["shown_lower"], parts["shown_upper"]
-    consistent = ca.SX(1)
-    for k in range(len(design.outputs)):
-        agrees = ca.logic_and(told[0][k] <= expected[1][k], told[1][k] >= expected[0][k])
-        consistent = ca.logic_and(consistent, agrees)
-    consistent = ca.if_else(y_finite, consistent, 1)
-    shown = tuple(select(y_finite, now, then) for now, then in zip(told, expected, strict=True))
-    low, high = _states(design, parts, shown)
-    low, high = ca.fmax(low, region[:, 0]), ca.fmin(high, region[:, 1])
-
-    f_lower, f_upper, sound = _fault_intervals(design, parts, shown)
-    consistent = ca.logic_and(consistent, sound)
-
-    X, contained = _envelope(design, corners, low, high)
-    moved, hull = _move_hidden(design, corners, parts, X)
-    moved |= _move_filters(design, corners, parts, X, hull)
-    moved["shown_lower"] = ca.vertcat(*(X[0][i] for i in design.outputs.tolist()))
-    moved["shown_upper"] = ca.vertcat(*(X[1][i] for i in design.outputs.tolist()))
-    moved["left"] = 1 - ca.logic_and(ca.logic_and(inside, u_finite), contained)
-    moved["initialised"] = ca.SX(1)
-    packed = ca.vertcat(*(moved[name] for name in layout))
-
-    def claimed(value: ca.SX, sign: float) -> ca.SX:
-        return ca.vertcat(
-            *(ca.if_else(initialised, value[i], sign * ca.inf) for i in range(value.numel()))
+    def run(seen: Seen) -> Known:
+        parts = seen.memory
+        corners = Corners(design, seen.u, seen.theta)
+        told = _from_outputs(design, seen.y)
+        expected = parts["shown_lower"], parts["shown_upper"]
+        shown = tuple(
+            ca.vertcat(*(ca.if_else(bit, now[k], then[k]) for k, bit in enumerate(seen.used)))
+            for now, then in zip(told, expected, strict=True)
         )
+        contradicted = ca.SX(0)
+        for k in range(len(outputs)):
+            apart = ca.logic_or(shown[0][k] > expected[1][k], shown[1][k] < expected[0][k])
+            contradicted = ca.logic_or(contradicted, apart)
+        low, high = _states(design, parts, shown)
+        low, high = ca.fmax(low, region[:, 0]), ca.fmin(high, region[:, 1])
+        f = fault_intervals(design, parts, shown)[0]
+        X, contained = _envelope(design, corners, low, high)
+        moved, hull = _move_hidden(design, corners, parts, X)
+        moved |= _move_filters(design, corners, parts, X, hull)
+        for side, ends in zip(("lower", "upper"), X, strict=True):
+            moved[f"shown_{side}"] = ca.vertcat(*(ends[i] for i in outputs))
+        x = Ends(low, high)
+        return Known(x.middle, f.middle, x, f, moved, sound=contained, empty=contradicted)
 
-    inputs = {"memory": memory, "u": u, "y": y}
-    if theta.numel():
-        inputs["theta"] = theta
-    return make_step(
-        inputs,
-        {
-            "memory": select(initialised, packed, memory),
-            "xhat": (low + high) / 2.0,
-            "fhat": (f_lower + f_upper) / 2.0,
-            "x_lower": claimed(low, -1.0),
-            "x_upper": claimed(high, 1.0),
-            "f_lower": claimed(f_lower, -1.0),
-            "f_upper": claimed(f_upper, 1.0),
-            "status": status_word(
-                {
-                    "not_initialised": ca.logic_not(initialised),
-                    "non_finite_input": ca.logic_not(ca.logic_and(y_finite, u_finite)),
-                    "outside_domain": ca.logic_not(inside),
-                    "inconsistent_measurement": ca.logic_not(consistent),
-                    "fault_not_valid": ca.logic_not(ca.logic_and(initialised, inside)),
-                }
-            ),
-        },
-    )
+    def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
+        response = ca.SX.zeros(len(design.gain) * len(design.filters))
+        near = x.meet(Ends.of(box))
+        return {**begun(design, (near.lower, near.upper)), "response": response}
+
+    return Core(run, begin, domain=box, bridges=True, mean_fault=True)
 
 
 def build_ode(design: BankDesign) -> ca.Function:
     """Build the continuous form of the bank, with y(t) known at all times up to its noise."""
     plant = design.plant
     layout = slices(memory_sizes(design))
-    memory = ca.SX.sym("memory", layout["initialised"].stop)
+    memory = ca.SX.sym("memory", max(part.stop for part in layout.values()))
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
     corners = Corners(design, u, theta)
@@ -259,9 +214,7 @@ def _from_outputs(design: BankDesign, y: ca.SX) -> tuple[ca.SX, ca.SX]:
     ) / scale
 
 
-def _states(
-    design: BankDesign, parts: dict[str, ca.SX], shown: tuple[ca.SX, ...]
-) -> tuple[ca.SX, ca.SX]:
+def _states(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> tuple[ca.SX, ca.SX]:
     """Put measured and unmeasured states together."""
     outputs = design.outputs.tolist()
     ends = []
@@ -276,40 +229,27 @@ def _states(
     return ends[0], ends[1]
 
 
-def _fault_intervals(
-    design: BankDesign, parts: dict[str, ca.SX], shown: tuple[ca.SX, ...]
-) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Return the intervals of the first filter, inside the declared ranges, and whether they are.
+def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> list[Ends]:
+    """Return the intervals of every filter, (n_f,) each: of means with the weights exp(-rate age).
 
-    The mean of the fault lies in the declared range too, so an empty intersection is a
-    contradiction.
+    ((y_low - z_upper) / N, (y_high - z_lower) / N), all numbers while the response N is zero.
     """
     outputs, rates = design.outputs.tolist(), len(design.filters)
-    lows, highs, sound = [], [], ca.SX(1)
-    for j, i in enumerate(design.fault_rows.tolist()):
-        first, second = interval(parts, shown, outputs.index(i), j * rates, design.rounding)
-        low, high = outward(design.plant.box("f"), design.precision)[j]
-        fits = ca.logic_and(first <= high, second >= low)
-        sound = ca.logic_and(sound, fits)
-        lows.append(ca.if_else(fits, ca.fmax(first, low), first))
-        highs.append(ca.if_else(fits, ca.fmin(second, high), second))
-    return ca.vertcat(*lows), ca.vertcat(*highs), sound
-
-
-def interval(
-    parts: dict[str, ca.SX], shown: tuple[ca.SX, ...], k: int, place: int, rounding: float
-) -> tuple[ca.SX, ca.SX]:
-    """Return ((y_low - z_upper) / N, (y_high - z_lower) / N), all numbers while N is zero."""
-    N = parts["response"][place]
-    below = shown[0][k] - parts["filter_upper"][place]
-    above = shown[1][k] - parts["filter_lower"][place]
-    slack = rounding * (ca.fabs(shown[0][k]) + ca.fabs(shown[1][k]))
-    started = N > 0.0
-    safe = ca.if_else(started, N, 1.0)
-    return (
-        ca.if_else(started, (below - slack) / safe, -ca.inf),
-        ca.if_else(started, (above + slack) / safe, ca.inf),
-    )
+    found = []
+    for number in range(rates):
+        low, high = [], []
+        for j, i in enumerate(design.fault_rows.tolist()):
+            k, place = outputs.index(i), j * rates + number
+            N = parts["response"][place]
+            below = shown[0][k] - parts["filter_upper"][place]
+            above = shown[1][k] - parts["filter_lower"][place]
+            slack = design.rounding * (ca.fabs(shown[0][k]) + ca.fabs(shown[1][k]))
+            started = N > 0.0
+            safe = ca.if_else(started, N, 1.0)
+            low.append(ca.if_else(started, (below - slack) / safe, -FAR))
+            high.append(ca.if_else(started, (above + slack) / safe, FAR))
+        found.append(Ends(ca.vertcat(*low), ca.vertcat(*high)))
+    return found
 
 
 def _envelope(
@@ -347,7 +287,7 @@ def _envelope(
 
 
 def _move_hidden(
-    design: BankDesign, corners: Corners, parts: dict[str, ca.SX], X: tuple[ca.SX, ca.SX]
+    design: BankDesign, corners: Corners, parts: Parts, X: tuple[ca.SX, ca.SX]
 ) -> tuple[dict[str, ca.SX], tuple[ca.SX, ca.SX]]:
     """Move the ends of the unmeasured states; return them and the hull of all states over it."""
     hull_low, hull_high = X[0] + 0.0, X[1] + 0.0
@@ -375,7 +315,7 @@ def _move_hidden(
 def _move_filters(
     design: BankDesign,
     corners: Corners,
-    parts: dict[str, ca.SX],
+    parts: Parts,
     X: tuple[ca.SX, ca.SX],
     hull: tuple[ca.SX, ca.SX],
 ) -> dict[str, ca.SX]:

@@ -1,12 +1,12 @@
 """The equations (6)-(8), (14) in symbols, shared by the continuous form and the step."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.stepping import slices
 from obsynth.designs.set_adaptive.record import SetDesign
 
 _PARTS = {
@@ -23,9 +23,9 @@ _PARTS = {
     "b_m": "q",
     "b_M": "q",
     "weight": "1",
-    "left": "1",
-    "initialised": "1",
 }
+MONITORS = ("R_m", "R_M", "b_m", "b_M", "weight")
+"""Integrals that no bound is made of."""
 
 
 def memory_sizes(design: SetDesign) -> dict[str, int]:
@@ -33,8 +33,7 @@ def memory_sizes(design: SetDesign) -> dict[str, int]:
 
     ``zeta`` (6), ``Omega`` (7), ``theta`` (8) and ``xi`` (14), each with the index m, then M: in
     case (a) of Theorem 1, which applies, theta_m is the upper and theta_M the lower bound of the
-    fault. ``R``, ``b`` and ``weight`` are the integrals of the monitors (13), ``left`` is 1 from
-    an output outside its range until the method has started again.
+    fault. ``R``, ``b`` and ``weight`` are the integrals of the monitors (13).
     """
     return {name: math.prod(_shape(design, letters)) for name, letters in _PARTS.items()}
 
@@ -45,12 +44,12 @@ def _shape(design: SetDesign, letters: str) -> tuple[int, ...]:
 
 
 class Memory:
-    """The memory taken apart: vectors as columns, matrices in their shape."""
+    """The memory by its parts: vectors as columns, matrices in their shape."""
 
-    def __init__(self, vector: ca.SX, design: SetDesign) -> None:
+    def __init__(self, parts: Mapping[str, ca.SX], design: SetDesign) -> None:
         self.parts: dict[str, ca.SX] = {}
-        for name, part in slices(memory_sizes(design)).items():
-            value = vector[part]
+        for name in _PARTS:
+            value = parts[name]
             if len(_PARTS[name]) == 2:
                 rows, columns = _shape(design, _PARTS[name])
                 value = ca.reshape(value, columns, rows).T
@@ -59,15 +58,12 @@ class Memory:
     def __getitem__(self, name: str) -> ca.SX:
         return self.parts[name]
 
-    def packed(self, **changed: ca.SX) -> ca.SX:
-        """Return the vector with the parts given exchanged."""
-        values = {**self.parts, **changed}
-        return ca.vertcat(
-            *(
-                ca.vec(values[name].T) if len(letters) == 2 else values[name]
-                for name, letters in _PARTS.items()
-            )
-        )
+
+def columns(parts: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
+    """Return parts as they are stored, matrices row by row."""
+    return {
+        name: ca.vec(value.T) if len(_PARTS[name]) == 2 else value for name, value in parts.items()
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,18 +15,20 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi import Problem
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
-from obsynth.designs.set_adaptive.equations import memory_sizes
+from obsynth.designs.set_adaptive.equations import MONITORS, memory_sizes
 from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, design_gain, gain_problem
 from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
 from obsynth.designs.set_adaptive.printed import printed_gain
 from obsynth.designs.set_adaptive.record import SetDesign, System
-from obsynth.designs.set_adaptive.step import build_ode, build_step, first_memory
+from obsynth.designs.set_adaptive.step import build_core, build_ode, first_memory
 from obsynth.designs.set_adaptive.transition import uniformisation
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 _DECADE = (5.0, 2.0, 1.0)
+_SETTLED = 10.0
+"""Time constants of the slowest bound for which a copy of the sets is kept at least."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,8 @@ class SetAdaptiveObserver(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
-        step=build_step,
+        core=build_core,
+        shared=MONITORS,
         ode=build_ode,
         step_covered=True,
     )
@@ -155,7 +158,16 @@ class SetAdaptiveObserver(Method):
     def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
         """Design, prove and return the observer, see `Method.design`, or that of the bank."""
         if self.robust:
-            return FilterBank(self.filters, self.region, self.Ts, self.precision).design(model)
+            bank = FilterBank(
+                self.filters,
+                self.region,
+                self.Ts,
+                self.precision,
+                horizon=self.horizon,
+                recovery=self.recovery,
+                cuts=self.cuts,
+            )
+            return bank.design(model)
         return super().design(model, bounds)
 
     def read(self, given: Plant | Split) -> SetModel:
@@ -212,9 +224,10 @@ class SetAdaptiveObserver(Method):
         outputs = output_of_fault(C, model.A_lower_box, model.G, model.plant.names("f"))
         # -(A_M - L C)^-1 G is where -Omega settles, and Gamma N^2 how fast theta then moves
         settled = C @ np.linalg.solve(gain.L @ C - A_upper, model.G)
-        adaptation = float((Gamma * settled[outputs, np.arange(q)] ** 2).max())
+        adaptation = Gamma * settled[outputs, np.arange(q)] ** 2
         longest = 1.0 / float((-np.diag(A_lower - gain.L @ C)).max())
-        Ts = round_down(min(longest / 32.0, 1.0 / adaptation)) if self.Ts is None else self.Ts
+        shortest = min(longest / 32.0, 1.0 / float(adaptation.max()))
+        Ts = round_down(shortest) if self.Ts is None else self.Ts
         uniformisation(Ts, float((-np.diag(model.A_lower_box - gain.L @ C)).max()))
         A_upper_step = model.extremes(Ts)[1]
         M = A_upper_step - gain.L @ C
@@ -244,7 +257,7 @@ class SetAdaptiveObserver(Method):
             fault_outputs=np.array(outputs),
             window=self.window,
             precision=self.precision,
-            options=self.options(),
+            options=self.settling(_SETTLED / min(alpha_step, float(adaptation.min())), Ts),
         )
 
     def _adaptation(self, plant: Plant) -> FloatArray:

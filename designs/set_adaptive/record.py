@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import allowance
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
@@ -76,6 +78,14 @@ class SetDesign(System):
     window: float | None
     precision: Literal["double", "single"]
     options: Mapping[str, Any]
+
+    @cached_property
+    def assumed(self) -> Plant:
+        """The plant with the stored boxes of the disturbances, zero where noise is left out."""
+        ends = [self.w_centre - self.w_radius, self.w_centre + self.w_radius]
+        box = np.column_stack(ends)
+        same = np.array_equal(box, self.plant.box("w"))
+        return self.plant if same else with_ranges(self.plant, box, "w")
 
     @property
     def rounding(self) -> float:

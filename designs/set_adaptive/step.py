@@ -8,24 +8,23 @@ move by the same transition, so x - zeta + Omega theta keeps its sign. The fault
 backward Euler, which is a convex combination of two bounds.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import (
-    all_finite,
-    fill,
-    finite_or,
-    known_signals,
-    make_step,
-    select,
-    slices,
-    status_word,
-)
+from obsynth.designs.core.stepping import select, slices
 from obsynth.designs.set_adaptive.equations import (
+    MONITORS,
     Drive,
     Memory,
+    columns,
     drives,
     ends,
     memory_sizes,
@@ -43,124 +42,68 @@ def first_memory(design: SetDesign, start: Start) -> dict[str, FloatArray]:
     if np.any(start.x[:, 0] < 0.0):
         raise ObsynthError("x_range reaches below zero, which the method excludes")
     f_box = design.plant.box("f") if start.f_range is None else start.f_range
-    return _parts(design, start.x, f_box)
+    x, f = (outward(box, design.precision).T for box in (start.x, f_box))
+    return begun([*x], [*f])
 
 
-def _parts(design: SetDesign, x_box: FloatArray, f_box: FloatArray) -> dict[str, FloatArray]:
-    """Return the parts of the memory that are not zero, for boxes of the state and the faults."""
-    low, high = outward(x_box, design.precision).T
-    least, largest = outward(f_box, design.precision).T
-    return {
-        "zeta_m": low,
-        "zeta_M": high,
-        "xi_m": low,
-        "xi_M": high,
-        "theta_m": largest,
-        "theta_M": least,
-    }
+def begun(x: Sequence[Any], f: Sequence[Any]) -> dict[str, Any]:
+    """Return the parts of the memory that are not zero, for ends of the state and the faults."""
+    bounds = {"zeta_m": x[0], "zeta_M": x[1], "xi_m": x[0], "xi_M": x[1]}
+    return {**bounds, "theta_m": f[1], "theta_M": f[0]}
 
 
-def build_step(design: SetDesign) -> ca.Function:
-    """Build `Observer.step`.
+def build_core(design: SetDesign) -> Core:
+    """Build the observer.
 
-    At instant k: first the fault bounds from y_k, then the sets of x_k, then the prediction to
-    k + 1 with u_k. The memory of an observer that saw an output outside its range starts again
-    when the output is back.
+    At instant k: first the fault bounds from y_k, then xi of x_k, then the prediction to k + 1
+    with u_k. Where a reading is missing the output is anywhere in its range, and no fault bound
+    moves. The printed law keeps no order, so no bound of it is given.
     """
-    plant = design.plant
-    q, m = len(plant.f), len(plant.output)
-    layout = slices(memory_sizes(design))
-    vector = ca.SX.sym("memory", layout["initialised"].stop)
-    u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", m)
-    theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
-    scheduled = any(s.name in plant.names("rho") for s in design.bounds.exact)
-    x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
-
-    y_finite = all_finite(y)
-    u_used, theta_used, u_finite, inside = known_signals(plant, u, theta)
+    plant, sizes = design.plant, memory_sizes(design)
+    m = len(plant.output)
     row_of = [int(np.flatnonzero(row)[0]) for row in design.C]
     scale = np.array([design.C[k, i] for k, i in enumerate(row_of)])
+    x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
     y_box = scale[:, None] * x_box[row_of]
-    shown = finite_or(y - ca.DM(design.W2 @ design.w_centre), y_box.mean(axis=1))
-    v = ca.DM(design.noise) + SHOWN[design.precision] * (ca.DM(design.noise) + ca.fabs(shown))
-    low = select(y_finite, shown - v, ca.SX(y_box[:, 0]))
-    high = select(y_finite, shown + v, ca.SX(y_box[:, 1]))
-    for k in range(m):
-        inside = ca.logic_and(inside, high[k] >= y_box[k, 0])
-        inside = ca.logic_and(inside, low[k] <= y_box[k, 1])
-
-    initialised = vector[layout["initialised"]] > 0.5
-    again = ca.logic_and(vector[layout["left"]] > 0.5, inside)
-    fresh = fill(layout, _parts(design, x_box, f_box))
-    memory = Memory(select(again, ca.SX(fresh), vector), design)
-
-    r = residuals(design, memory, low, high)
-    sizes = ca.fmax(ca.fabs(low), ca.fabs(high))
-    theta_m, theta_M = _adapt(design, memory, r, sizes)
-    theta_m = select(y_finite, theta_m, memory["theta_m"])
-    theta_M = select(y_finite, theta_M, memory["theta_M"])
-    smallest, largest = ca.fmin(theta_m, theta_M), ca.fmax(theta_m, theta_M)
-    consistent = ca.SX(1)
-    for i in range(q):
-        consistent = ca.logic_and(consistent, smallest[i] <= f_box[i, 1])
-        consistent = ca.logic_and(consistent, largest[i] >= f_box[i, 0])
-    f_lower = select(consistent, ca.fmax(smallest, ca.DM(f_box[:, 0])), smallest)
-    f_upper = select(consistent, ca.fmin(largest, ca.DM(f_box[:, 1])), largest)
-
-    C = ca.DM(design.C)
-    for k in range(m):
-        consistent = ca.logic_and(consistent, (C @ memory["xi_m"])[k] <= high[k])
-        consistent = ca.logic_and(consistent, (C @ memory["xi_M"])[k] >= low[k])
-    x_lower, x_upper = _contract(
-        design, memory, ca.logic_and(inside, consistent), (low, high), row_of
-    )
-
-    lower, upper = _frozen(design, low, high, u_used, _exact_arguments(design, u_used, theta_used))
-    changed = {"theta_m": theta_m, "theta_M": theta_M}
-    changed |= _predict(design, memory, lower, upper, smallest, largest)
-    changed |= _monitor(design, memory, r, y_finite)
-    usable = ca.logic_and(inside, u_finite)
-    changed["left"] = 1 - usable
-    changed["initialised"] = ca.SX(1)
-
     guaranteed = design.law == "cooperative"
-    valid = ca.logic_and(initialised, inside) if guaranteed else ca.SX(0)
-    claims = {
-        "x_lower": (x_lower, -1.0),
-        "x_upper": (x_upper, 1.0),
-        "f_lower": (f_lower, -1.0),
-        "f_upper": (f_upper, 1.0),
-    }
-    shown_sets = {
-        name: ca.vertcat(
-            *(
-                ca.if_else(initialised, value[i], sign * ca.inf) if guaranteed else sign * ca.inf
-                for i in range(value.numel())
-            )
+    C = ca.DM(design.C)
+
+    def run(seen: Seen) -> Known:
+        memory = Memory(seen.memory, design)
+        shown = seen.y - ca.DM(design.W2 @ design.w_centre)
+        v = ca.DM(design.noise) + SHOWN[design.precision] * (ca.DM(design.noise) + ca.fabs(shown))
+        low, high = (
+            ca.vertcat(*(ca.if_else(bit, side[k], end[k]) for k, bit in enumerate(seen.used)))
+            for side, end in ((shown - v, y_box[:, 0]), (shown + v, y_box[:, 1]))
         )
-        for name, (value, sign) in claims.items()
-    }
-    inputs = {"memory": vector, "u": u, "y": y}
-    if scheduled:
-        inputs["theta"] = theta
-    return make_step(
-        inputs,
-        {
-            "memory": select(initialised, memory.packed(**changed), vector),
-            "xhat": (x_lower + x_upper) / 2.0,
-            "fhat": (f_lower + f_upper) / 2.0,
-            **shown_sets,
-            "status": status_word(
-                {
-                    "not_initialised": ca.logic_not(initialised),
-                    "non_finite_input": ca.logic_not(ca.logic_and(y_finite, u_finite)),
-                    "outside_domain": ca.logic_not(inside),
-                    "inconsistent_measurement": ca.logic_not(consistent),
-                    "fault_not_valid": ca.logic_not(valid),
-                }
-            ),
-        },
-    )
+        r = residuals(design, memory, low, high)
+        theta_m, theta_M = _adapt(design, memory, r, ca.fmax(ca.fabs(low), ca.fabs(high)))
+        theta_m = select(seen.all_used, theta_m, memory["theta_m"])
+        theta_M = select(seen.all_used, theta_M, memory["theta_M"])
+        smallest, largest = ca.fmin(theta_m, theta_M), ca.fmax(theta_m, theta_M)
+        empty = ca.SX(0)
+        for k in range(m):
+            empty = ca.logic_or(empty, (C @ memory["xi_m"])[k] > high[k])
+            empty = ca.logic_or(empty, (C @ memory["xi_M"])[k] < low[k])
+        exact = _exact_arguments(design, seen.u, seen.theta)
+        lower, upper = _frozen(design, low, high, seen.u, exact)
+        changed = {"theta_m": theta_m, "theta_M": theta_M}
+        changed |= _predict(design, memory, lower, upper, smallest, largest)
+        changed |= _monitor(design, memory, r, seen.all_used)
+        x, f = Ends(memory["xi_m"], memory["xi_M"]), Ends(smallest, largest)
+        known = Known(x.middle, f.middle, x, f, columns(changed), empty=empty)
+        return known if guaranteed else replace(known, x=None, f=None, empty=no, valid=no)
+
+    def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
+        nothing = {name: ca.SX.zeros(sizes[name]) for name in ("Omega_m", "Omega_M")}
+        near = [one.meet(Ends.of(box)) for one, box in ((x, x_box), (f, f_box))]
+        return {**nothing, **begun(*((one.lower, one.upper) for one in near))}
+
+    def place(x: Ends, f: Ends, kept: Parts) -> Parts:
+        return {name: ca.SX.zeros(sizes[name]) for name in MONITORS}
+
+    no = ca.SX(0)
+    return Core(run, begin, place, domain=x_box, bridges=True)
 
 
 def build_ode(design: SetDesign) -> ca.Function:
@@ -175,7 +118,8 @@ def build_ode(design: SetDesign) -> ca.Function:
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
     scheduling = [s for s in design.bounds.exact if s.name in plant.names("rho")]
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
-    memory = Memory(vector, design)
+    layout = slices(memory_sizes(design))
+    memory = Memory({name: vector[place] for name, place in layout.items()}, design)
     shown = y - ca.DM(design.W2 @ design.w_centre)
     v = ca.DM(design.noise)
     low, high = shown - v, shown + v
@@ -199,14 +143,14 @@ def build_ode(design: SetDesign) -> ca.Function:
         changed[f"R_{o}"] = N.T @ N - forget * memory[f"R_{o}"]
         changed[f"b_{o}"] = N.T @ residual - forget * memory[f"b_{o}"]
     changed["weight"] = 1.0 - forget * memory["weight"]
-    changed["left"] = changed["initialised"] = ca.SX(0)
+    rates = columns(changed)
     inputs = {"memory": vector, "u": u, "y": y}
     if scheduling:
         inputs["theta"] = theta
     return ca.Function(
         "ode",
         list(inputs.values()),
-        [ca.densify(memory.packed(**changed))],
+        [ca.densify(ca.vertcat(*(rates[name] for name in layout)))],
         list(inputs),
         ["dmemory"],
     )
@@ -240,29 +184,6 @@ def _adapt(
             parts.append(moved / (1.0 + push * N[k, i]))
         results.append(ca.vertcat(*parts))
     return results[0], results[1]
-
-
-def _contract(
-    design: SetDesign,
-    memory: Memory,
-    usable: ca.SX,
-    outputs: tuple[ca.SX, ca.SX],
-    row_of: list[int],
-) -> tuple[ca.SX, ca.SX]:
-    """Intersect xi with the declared ranges and the measurement, where all three agree."""
-    box = outward(design.plant.box("x"), design.precision)
-    low = ca.fmax(memory["xi_m"], ca.DM(box[:, 0]))
-    high = ca.fmin(memory["xi_M"], ca.DM(box[:, 1]))
-    for k, i in enumerate(row_of):
-        scale = float(design.C[k, i])
-        told = outputs[0][k] / scale, outputs[1][k] / scale
-        wide = SHOWN[design.precision] * (ca.fabs(told[0]) + ca.fabs(told[1]))
-        low[i] = ca.fmax(low[i], told[0] - wide)
-        high[i] = ca.fmin(high[i], told[1] + wide)
-    agree = usable
-    for i in range(len(box)):
-        agree = ca.logic_and(agree, low[i] <= high[i])
-    return select(agree, low, memory["xi_m"]), select(agree, high, memory["xi_M"])
 
 
 def _frozen(

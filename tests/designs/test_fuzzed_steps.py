@@ -43,13 +43,6 @@ void many(long count, double *memory, const double *in, double *out, int *status
 
 
 PEAK = "peak bounds"
-UNGUARDED = ("filter_bank", "set_adaptive_observer")
-"""Observers whose step returns a lower bound above an upper one after a wild measurement."""
-
-
-def said(name):
-    marks = [pytest.mark.xfail(strict=False)] if name in UNGUARDED else []
-    return pytest.param(name, marks=marks)
 
 
 def observer_for(name):
@@ -179,9 +172,9 @@ def fuzz(name, steps, seed):
     return counts
 
 
-@pytest.mark.parametrize("name", [said(name) for name in METHODS])
+@pytest.mark.parametrize("name", METHODS)
 def test_no_measurement_spoils_a_bound(name):
-    """Mutant: `finite_or` that hands on what it was given; bank and adaptive fail as they are."""
+    """Mutant: `finite_or` that hands on what it was given."""
     assert STEP_OUTPUTS[1:7] == ("xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper")
     counts = fuzz(name, 15_000, seed=1)
     assert counts[0] and all(0 <= status < 2 * max(STATUS.values()) for status in counts)
@@ -189,6 +182,6 @@ def test_no_measurement_spoils_a_bound(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [said(name) for name in (*METHODS, PEAK)])
+@pytest.mark.parametrize("name", [*METHODS, PEAK])
 def test_ten_million_measurements_spoil_no_bound(name):
     fuzz(name, 10**7 // (len(METHODS) + 1), seed=2)
