@@ -63,3 +63,27 @@ def paper():
     """Reference numbers of an independent implementation, all digits."""
     path = Path(__file__).parents[2] / "reference" / "qpv.json"
     return json.loads(path.read_text())
+
+
+@functools.cache
+def _shrinking():
+    """Without disturbances, and with an error set that holds the whole region."""
+    made = ob.Plant("no noise")
+    (x,) = made.states("x", range=(4, 6), nominal=5)
+    (u,) = made.inputs("u", range=(0, 20), nominal=5)
+    (f,) = made.process_faults("f", range=(-0.1, 0.1))
+    made.dynamics([-x + f * x + u])
+    made.outputs([x])
+    return ob.QPVObserver(
+        region=ob.Ellipsoid([0.25, 0.01], [5.0, 0.0]),
+        E_x=[1.5],
+        initial_error=[1.0, 0.3],
+        alpha=0.8,
+        gain_cap=30.0,
+        performance_output=[[0, 1]],
+    ).design(made)
+
+
+@pytest.fixture(scope="session")
+def noiseless():
+    return _shrinking()

@@ -1,7 +1,6 @@
 """The step at run time: its differential equation, status bits, time index."""
 
 import numpy as np
-import pytest
 
 import obsynth as ob
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
@@ -134,10 +133,7 @@ def test_an_innovation_that_no_error_in_the_set_explains(designed):
 
 
 def test_a_bound_begins_anew_after_a_missing_measurement(designed):
-    """From the strips and the declared ranges, where these lie in the error set.
-
-    Mutants: `sound` without the readings; `begin` without the faults.
-    """
+    """From the strips and the declared ranges, where these lie in the error set."""
     for name, reach in (("noise", 0.01), ("box_tight", 1e-3)):
         observer = designed(name)
         for bad in (np.nan, np.inf, -np.inf):
@@ -151,29 +147,6 @@ def test_a_bound_begins_anew_after_a_missing_measurement(designed):
             after = call(observer, found["memory"])
             assert "measurement_left_out" not in bits(after)
             assert ("fault_not_valid" in bits(after)) is (name == "box_tight")
-
-
-def shrinking():
-    """Without disturbances, and with an error set that holds the whole region."""
-    made = ob.Plant("no noise")
-    (x,) = made.states("x", range=(4, 6), nominal=5)
-    (u,) = made.inputs("u", range=(0, 20), nominal=5)
-    (f,) = made.process_faults("f", range=(-0.1, 0.1))
-    made.dynamics([-x + f * x + u])
-    made.outputs([x])
-    return ob.QPVObserver(
-        region=ob.Ellipsoid([0.25, 0.01], [5.0, 0.0]),
-        E_x=[1.5],
-        initial_error=[1.0, 0.3],
-        alpha=0.8,
-        gain_cap=30.0,
-        performance_output=[[0, 1]],
-    ).design(made)
-
-
-@pytest.fixture(scope="module")
-def noiseless():
-    return shrinking()
 
 
 def test_the_bound_comes_back_where_the_region_lies_in_the_error_set(noiseless):
