@@ -140,7 +140,7 @@ def test_a_detector_pickles(request, name):
 
 
 def test_a_filter_bounds_its_faults_where_disturbances_are_bounded():
-    """The inversion tells the fault one sample late, to the bound of w1, though the core does not."""
+    """The inversion tells the fault one sample late to the bound of w1; the core does not."""
     plant = ob.Plant("two states")
     x1, x2 = plant.states("x1 x2", range=(-4, 4))
     (f,) = plant.faults("f", range=(-1, 1))
