@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from obsynth.designs.detection.comparison import RECOVERING, VOID
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.layout import BARS, ESTIMATE, INK, SOFT, new_figure, style
 from obsynth.symbolic.arrays import FloatArray
@@ -102,6 +103,8 @@ def plot_alarms(
 ) -> Any:
     """Plot when each fault was there and when its alarm was raised, one row per fault.
 
+    Void and recovering instants are shaded.
+
     Parameters
     ----------
     run : Run
@@ -150,13 +153,14 @@ def plot_alarms(
                 bars = _bars(run.t, values[:, i])
                 label = None if i else word
                 ax.broken_barh(bars, (row + low, 0.32), color=color, linewidth=0, label=label)
+        shade_status(ax, run.t, run.status)
         ax.set_yticks(np.arange(len(names))[::-1], names)
         ax.set_ylim(-0.6, len(names) - 0.4)
         ax.set_xlim(run.t[0], run.t[-1])
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("time [s]")
         place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-        ax.legend(**place, ncols=2)
+        ax.legend(**place, ncols=4)
         return ax
 
 
@@ -178,6 +182,13 @@ def shade(
             linewidth=1.4 if alpha > 0.2 else 0.0,
             label=word,
         )
+
+
+def shade_status(ax: Any, t: FloatArray, status: NDArray[np.int64]) -> None:
+    """Shade where the step was recovering, and over it where it was void."""
+    void = (status & VOID) != 0
+    shade(ax, t, ~void & ((status & RECOVERING) != 0), BARS[1], "recovering", 0.15)
+    shade(ax, t, void, BARS[4], "void", 0.4)
 
 
 def _bars(t: FloatArray, there: BoolArray) -> list[tuple[float, float]]:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.designs.detection.comparison import RECOVERING, VOID
+from obsynth.designs.detection.comparison import VOID
 from obsynth.evaluate.errors import ReportError
-from obsynth.evaluate.plotting.alarms import shade
+from obsynth.evaluate.plotting.alarms import shade, shade_status
 from obsynth.evaluate.plotting.layout import (
     BARS,
     ESTIMATE,
@@ -227,10 +227,7 @@ def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
     if trace.alarm is not None:
         shade(ax, trace.t, trace.alarm, ESTIMATE, "alarm")
     if trace.status is not None:
-        void = (trace.status & VOID) != 0
-        recovering = ~void & ((trace.status & RECOVERING) != 0)
-        shade(ax, trace.t, recovering, BARS[1], "recovering", 0.15)
-        shade(ax, trace.t, void, BARS[4], "void", 0.4)
+        shade_status(ax, trace.t, trace.status)
     if trace.lower is not None and trace.upper is not None and trace.bounded:
         t, lower = _cut(trace.t, _finite(trace.lower), window)
         _, upper = _cut(trace.t, _finite(trace.upper), window)

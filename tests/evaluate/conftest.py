@@ -64,6 +64,10 @@ class ToyObserver:
         outputs += [fhat - f_radius, fhat + f_radius, status]
         return ca.Function("step", [m, v, y], outputs, NAMES_IN, NAMES_OUT)
 
+    @property
+    def memory_layout(self):
+        return {"past": slice(0, 6)}
+
     def memory0(self, guess, x_range=None, f_range=None, y0=None):
         radius = 2.0 if x_range is None else 0.5 * (x_range[1][1] - x_range[1][0])
         return np.array([0.0, y0[0], 0.0, guess[1], radius, y0[0]])

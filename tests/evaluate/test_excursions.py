@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from obsynth.evaluate import plot_run, plot_signal, report, simulate
+from obsynth.evaluate import plot_alarms, plot_run, plot_signal, report, simulate
 from obsynth.symbolic import Plant, Scenario
 
 pytestmark = [pytest.mark.usefixtures("no_window"), pytest.mark.filterwarnings("error")]
@@ -151,6 +151,9 @@ def test_void_and_recovering_stretches_are_shaded(toy, late):
         (run.t[100], run.t[104]),
         (run.t[108], run.t[109]),
     ]
+    rows = plot_alarms(run, np.zeros(run.f.shape))
+    assert shaded(rows, "void") == [(run.t[100], run.t[104]), (run.t[108], run.t[109])]
+    assert len(shaded(rows, "recovering")) == 2
     calm = plot_run(voided(run))
     assert shaded(calm[0], "void") == shaded(calm[0], "recovering") == []
 
