@@ -15,6 +15,7 @@ import argparse
 import contextlib
 import importlib
 import importlib.util
+import json
 import os
 import shutil
 import signal
@@ -24,7 +25,7 @@ import time
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,41 @@ HEAVY = (
     *("pytest", "hypothesis"),
 )
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
+
+
+@dataclass
+class Watch:
+    """A plugin of pytest that runs first what has caught before, then what is quick.
+
+    seconds: of tests, as far as known
+    caught: how often a test has caught a mistake in a file
+    """
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    caught: Counter[str] = field(default_factory=Counter)
+    last: str = ""
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """Sort the tests."""
+        items.sort(key=lambda i: (-self.caught[i.nodeid], self.seconds.get(i.nodeid, 0.0)))
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Note how long a test takes, or that it fails."""
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        self.last = report.nodeid if report.failed else self.last
+
+    def pytest_sessionfinish(self) -> None:
+        """Hand over what was seen."""
+        Path("seen.json").write_text(json.dumps([self.seconds, self.last]))
+
+    def learn(self, place: Path) -> str:
+        """Take over what a child has seen; return the test that failed."""
+        seen = place / "seen.json"
+        seconds, last = json.loads(seen.read_text()) if seen.exists() else ({}, "")
+        seen.unlink(missing_ok=True)
+        self.seconds.update((k, v) for k, v in seconds.items() if k not in self.seconds)
+        self.caught.update([last] if last else [])
+        return last
 
 
 @dataclass(frozen=True)
@@ -98,7 +134,7 @@ def copied(place: Path) -> Path:
     return place
 
 
-def begin(place: Path, job: Job) -> int:
+def begin(place: Path, job: Job, watch: Watch) -> int:
     """Run tests in a child of this process, which has loaded what is heavy; return its number."""
     if job.file:
         (place / job.file).write_text(job.text)
@@ -122,20 +158,26 @@ def begin(place: Path, job: Job) -> int:
         phases = hypothesis.Phase.explicit, hypothesis.Phase.generate
         hypothesis.settings.register_profile("mutants", phases=phases, report_multiple_bugs=False)
         hypothesis.settings.load_profile("mutants")
-        code = int(importlib.import_module("pytest").main([*PYTEST, *job.tests]))
+        plugins = [Watch(watch.seconds, watch.caught)]
+        code = int(importlib.import_module("pytest").main([*PYTEST, *job.tests], plugins))
     finally:
         os._exit(code)
 
 
-def run(places: list[Path], jobs: Iterable[Job]) -> Iterator[tuple[Job, int, float, str]]:
-    """Run jobs, one in every copy at a time; yield return code (-1: too long), seconds, output."""
+def run(
+    places: list[Path], jobs: Iterable[Job], watch: Watch
+) -> Iterator[tuple[Job, int, float, str]]:
+    """Run jobs, one in every copy at a time; yield return code (-1: too long), seconds, output.
+
+    Where a test has failed, its name is the output.
+    """
     free, left = list(places), iter(jobs)
     running: dict[int, tuple[Job, Path, str, float]] = {}
     while True:
         while free and (job := next(left, None)):
             place = free.pop()
             right = (place / job.file).read_text() if job.file else ""
-            running[begin(place, job)] = job, place, right, time.monotonic()
+            running[begin(place, job, watch)] = job, place, right, time.monotonic()
         if not running:
             return
         time.sleep(0.02)
@@ -154,18 +196,7 @@ def run(places: list[Path], jobs: Iterable[Job]) -> Iterator[tuple[Job, int, flo
                 (place / job.file).write_text(right)
             del running[child]
             free.append(place)
-            yield job, code, spent, (place / "output.txt").read_text()
-
-
-def timed(places: list[Path], mutants: list[Job]) -> dict[str, float]:
-    """Seconds of every file of tests; all have to pass where nothing is planted."""
-    files = sorted({test for job in mutants for test in job.tests})
-    seconds = {}
-    for job, code, spent, output in run(places, [Job((name,)) for name in files]):
-        if code:
-            raise SystemExit(f"{job.tests[0]} fails with nothing planted:\n{output[-3000:]}")
-        seconds[job.tests[0]] = spent
-    return seconds
+            yield job, code, spent, watch.learn(place) or (place / "output.txt").read_text()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -190,23 +221,28 @@ def main(arguments: list[str] | None = None) -> int:
     alive, table = [], Counter((job.room, "explained") for job in told)
     with tempfile.TemporaryDirectory() as name:
         places = [copied(Path(name) / str(k)) for k in range(asked.workers)]
-        seconds = {} if asked.trust else timed(places, [job for job in chosen if not job.why])
+        watch = Watch()
+        files = sorted({test for job in chosen if not job.why for test in job.tests})
+        for job, code, _, output in run(
+            places, [Job((f,)) for f in files if not asked.trust], watch
+        ):
+            if code:
+                raise SystemExit(f"{job.tests[0]} fails with nothing planted: {output[-3000:]}")
 
         def jobs() -> Iterator[Job]:
             for job in chosen:
                 if not job.why and time.monotonic() - began < 60.0 * asked.minutes:
-                    tests = tuple(sorted(job.tests, key=lambda test: seconds.get(test, 0.0)))
-                    limit = 20.0 + 5.0 * sum(seconds.get(test, 40.0) for test in tests)
-                    yield Job(tests, job.file, job.text, job.where, job.says, "", limit)
+                    known = [s for t, s in watch.seconds.items() if t.split("::")[0] in job.tests]
+                    yield job if asked.trust else replace(job, limit=20.0 + 5.0 * sum(known))
 
-        for job, code, spent, output in run(places, jobs()):
+        for job, code, spent, output in run(places, jobs(), watch):
             if code not in (-1, 0, 1, 2):
                 raise SystemExit(f"{' '.join(job.tests)} did not run:\n{output[-3000:]}")
-            word = {0: "SURVIVES", -1: "too long"}.get(code, "caught")
+            word = {0: "SURVIVES", -1: "too long"}.get(code, f"caught by {output.split('::')[-1]}:")
             alive += [job] if code == 0 else []
             table[job.room, "planted"] += 1
             table[job.room, "survive"] += code == 0
-            print(f"{word} {spent:5.1f} s  {job.file}:{job.where} {job.says}", flush=True)
+            print(f"{spent:5.1f} s  {word} {job.file}:{job.where} {job.says}", flush=True)
     columns = ("planted", "survive", "explained")
     print(f"\n{'room':24}" + "".join(f"{column:>12}" for column in columns))
     for room in [*sorted({room for room, _ in table}), "all"]:

@@ -83,6 +83,12 @@ def _is_rounding(node: ast.expr) -> bool:
     return called or (isinstance(node, ast.Name) and node.id in _ZERO)
 
 
+def _factors(node: ast.expr) -> list[ast.expr]:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+        return _factors(node.left) + _factors(node.right)
+    return [node]
+
+
 class _Finder(ast.NodeVisitor):
     """Walk through functions and collect changes; texts, annotations and refusals are left out."""
 
@@ -93,6 +99,7 @@ class _Finder(ast.NodeVisitor):
         for line in self.raw.splitlines(keepends=True):
             self.starts.append(self.starts[-1] + len(line))
         self.leave = leave | _SHOWN
+        self.lines_left = [tuple(name.split(": ", 1)) for name in leave if ": " in name]
         self.scope: list[str] = []
         self.known: set[str] = set()
         self.found: list[Change] = []
@@ -111,6 +118,8 @@ class _Finder(ast.NodeVisitor):
             words = " ".join(self.text(node).split())
             line = self.lines[node.lineno - 1].strip()
             where = ".".join(self.scope)
+            if any(where == name and line.startswith(begin) for name, begin in self.lines_left):
+                return
             self.found.append(Change(kind, where, node.lineno, line, words, becomes, start, end))
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
@@ -150,10 +159,10 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
-        sides = node.left, node.right
-        if isinstance(node.op, ast.Mult) and any(_is_rounding(side) for side in sides):
-            for side in filter(_is_rounding, sides):
-                self.visit(side)
+        factors = _factors(node)
+        if any(map(_is_rounding, factors)):
+            for factor in filter(_is_rounding, factors):
+                self.visit(factor)
             return
         left, right = self.text(node.left), self.text(node.right)
         if isinstance(node.op, ast.Add | ast.Sub) and not isinstance(node.left, ast.List):
@@ -235,7 +244,10 @@ class _Finder(ast.NodeVisitor):
 
 
 def changes(source: str, leave: set[str] | None = None) -> list[Change]:
-    """List the changes of a source, those of functions that are left aside not among them."""
+    """List the changes of a source.
+
+    leave: names of functions that are left aside; lines of one as "function: how the line begins"
+    """
     finder = _Finder(source, leave or set())
     finder.visit(ast.parse(source))
     return finder.found

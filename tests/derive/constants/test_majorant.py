@@ -107,6 +107,19 @@ def test_rounding_of_A_is_told_and_kept_out():
     assert not found.rounding[found.entry_bounds > 0.0].any()
 
 
+@pytest.mark.parametrize("shape", ["diagonal", "scalar"])
+def test_rounding_of_A_is_told_where_nothing_else_is_left(shape):
+    """Mutant: the rounding forgotten where g has no other row."""
+    plant = Plant("third")
+    (x,) = plant.states("x", range=(-1, 1))
+    plant.dynamics([x / 3], Ts=1)
+    plant.outputs([x])
+    found = majorant(split(plant, linear="terms"), shape=shape)
+    assert found.diagonal.tolist() == [0.0]
+    lost = abs(Fraction(1, 3) - Fraction(1 / 3))
+    assert lost <= Fraction(found.rounding[0, 0]) <= lost * (1 + Fraction(1, 2**40))
+
+
 # -- why (11) fails --------------------------------------------------------------------------------
 
 

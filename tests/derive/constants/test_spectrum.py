@@ -3,6 +3,7 @@
 import dataclasses
 from fractions import Fraction
 from itertools import product
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -103,6 +104,20 @@ def test_signs_of_separate_parts_are_not_multiplied():
         coupled[i, j] = coupled[j, i] = True
     assert len(interval_matrix.sign_patterns(coupled)) == 8
     assert len(interval_matrix.sign_patterns(np.diag(np.ones(30, dtype=bool)))) == 1
+
+
+@pytest.mark.parametrize("size", [2, 9])
+def test_a_batch_of_interval_matrices_is_bounded_with_few_signs_and_with_many(size):
+    """Mutant: the radius taken from the eigenvalue where there are too many signs to try."""
+    rows, columns = np.triu_indices(size)
+    field = SimpleNamespace(size=size, rows=rows, columns=columns)
+    matrices = [interval(size, seed) for seed in range(5)]
+    bound = search.interval_bound(field, *(np.array(part) for part in zip(*matrices, strict=True)))
+    for (centre, radius), most in zip(matrices, bound, strict=True):
+        signs = np.sign(np.random.default_rng(0).normal(size=(500, size)))
+        corners = centre + signs[:, :, None] * radius * signs[:, None, :]
+        assert np.linalg.eigvalsh(corners)[:, -1].max() <= most
+        assert np.linalg.eigvalsh(centre)[-1] < most
 
 
 def test_augmented_matrix_has_the_norm():

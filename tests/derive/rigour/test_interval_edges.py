@@ -1,10 +1,14 @@
 """Interval operations at their edges: zeros, underflow, what is not known."""
 
+import math
 from fractions import Fraction
+from itertools import product
 
 import numpy as np
 import pytest
 
+from obsynth.derive.intervals import functions
+from obsynth.derive.intervals.rules import RULES
 from obsynth.derive.rigour import interval as arithmetic
 
 
@@ -96,6 +100,60 @@ def test_unknown_operands_stay_unknown():
         assert np.isnan(ends(rule(nothing, interval(1, 2)))).all()
     for rule in (arithmetic.absolute, arithmetic.sqrt, arithmetic.negate):
         assert np.isnan(ends(rule(nothing))).all()
+
+
+SMALL = [(lo, hi) for lo in range(-2, 3) for hi in range(lo, 3)]
+TRUTHS = [(0, 0), (0, 1), (1, 1)]
+LAWS = {
+    "less": lambda a, b: float(a < b),
+    "less_equal": lambda a, b: float(a <= b),
+    "equal": lambda a, b: float(a == b),
+    "conjunction": lambda a, b: float(bool(a and b)),
+    "disjunction": lambda a, b: float(bool(a or b)),
+    "remainder": lambda a, b: math.fmod(a, b) if b else None,
+    "copysign": lambda a, b: abs(a) * (1 if b > 0 else -1) if b else None,
+    "sign": lambda a: float(a > 0) - float(a < 0),
+    "floor": math.floor,
+    "ceiling": math.ceil,
+    "logical_not": lambda a: float(not a),
+    "if_else_zero": lambda c, a: a if c else 0.0,
+    "select": lambda c, a, b: a if c else b,
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_choices_hold_every_member_and_are_sharp_where_they_are_decided(name):
+    """All small intervals, all their integers. Mutants: an end, a side or a condition changed."""
+    rule, law = getattr(functions, name), LAWS[name]
+    count = law.__code__.co_argcount if hasattr(law, "__code__") else 1
+    kinds = [TRUTHS if name in ("conjunction", "disjunction", "logical_not") else SMALL] * count
+    if name in ("if_else_zero", "select"):
+        kinds[0] = TRUTHS
+    for boxes in product(*kinds):
+        lo, hi = ends(rule(*(interval(*box) for box in boxes)))
+        members = product(*(range(box[0], box[1] + 1) for box in boxes))
+        values = [v for v in (law(*member) for member in members) if v is not None]
+        if name == "remainder" and boxes[1][0] <= 0 <= boxes[1][1]:
+            assert np.isnan(lo) and np.isnan(hi)
+            continue
+        assert lo <= min(values, default=lo) <= max(values, default=hi) <= hi
+        if name not in ("remainder", "copysign"):
+            assert (lo, hi) == (min(values), max(values)), boxes
+
+
+@pytest.mark.parametrize("name", ["asin", "acos", "atanh", "log", "log1p", "acosh"])
+def test_functions_are_known_inside_their_domain_and_nowhere_else(name):
+    """Mutants: a border of the domain on the wrong side."""
+    rule, (low, high) = (
+        RULES[name],
+        {"log": (0, 9), "log1p": (-1, 9), "acosh": (1, 9)}.get(name, (-1, 1)),
+    )
+    within, beyond = low + 0.25 * (high - low), low + 0.75 * (high - low)
+    with np.errstate(all="ignore"):
+        assert np.isfinite(ends(rule(interval(within, beyond)))).all()
+        assert np.isnan(ends(rule(interval(low - 0.5, within)))).all()
+        if high < 9:
+            assert np.isnan(ends(rule(interval(within, high + 0.5)))).all()
 
 
 def test_a_pole_between_two_neighbouring_doubles_is_never_missed():
