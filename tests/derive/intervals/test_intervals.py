@@ -194,6 +194,83 @@ def test_library_is_within_half_of_the_allowed_ulps(name):
     assert max(errors) <= functions.ULPS / 2
 
 
+def escaped(rule, exact, boxes):
+    """Members, ends included, whose exact image is outside; boxes (lo, hi) per operand, arrays."""
+    with np.errstate(all="ignore"):
+        lo, hi = rule(*boxes)
+    rng, beyond = np.random.default_rng(4), 0
+    before, flint.ctx.prec = flint.ctx.prec, 200
+    try:
+        for share in ((0.0,) * len(boxes), (1.0,) * len(boxes), *rng.random((6, len(boxes)))):
+            points = [
+                np.clip(low + s * (high - low), low, high)
+                for (low, high), s in zip(boxes, np.round(share, 1), strict=True)
+            ]
+            for k, at in enumerate(zip(*points, strict=True)):
+                value = exact(*(flint.arb(float(v)) for v in at))
+                known = not (np.isnan(lo[k]) or np.isnan(hi[k]))
+                beyond += known and (value < flint.arb(lo[k]) or value > flint.arb(hi[k]))
+        return beyond, int(np.isfinite(lo).sum())
+    finally:
+        flint.ctx.prec = before
+
+
+def boxes_of(rng, low, high, count=150):
+    """Points and short and long intervals."""
+    at = rng.uniform(low, high, count)
+    width = np.where(rng.random(count) < 0.4, 0.0, (high - low) * 10.0 ** rng.uniform(-6, 0, count))
+    return at, np.minimum(at + width, high)
+
+
+RULE_OF = {"sin": "sine", "cos": "cosine", "tan": "tangent"}
+
+
+@pytest.mark.parametrize("name", sorted(LIBRARY))
+def test_the_range_of_a_function_holds_the_exact_values_of_members(name):
+    """Mutants: what the library loses is not pushed outwards; one end for both."""
+    _, oracle, (low, high) = LIBRARY[name]
+    box = boxes_of(np.random.default_rng(1), low, high)
+    found = escaped(rules.RULES[RULE_OF.get(name, name)], lambda v: getattr(v, oracle)(), [box])
+    assert found[0] == 0
+    assert found[1] > 40
+
+
+@pytest.mark.parametrize(
+    ("name", "exact", "ranges"),
+    [
+        ("power_const", lambda a, b: a**b, [(0.0, 5.0), (-2.5, 3.5)]),
+        ("power", lambda a, b: a**b, [(0.1, 5.0), (-2.5, 3.5)]),
+        ("hypotenuse", lambda a, b: (a * a + b * b).sqrt(), [(-3.0, 4.0), (-5.0, 2.0)]),
+        ("arctangent2", flint.arb.atan2, [(-3.0, 4.0), (-5.0, 2.0)]),
+        ("arctangent2", flint.arb.atan2, [(-3.0, 4.0), (0.5, 2.0)]),
+        ("arctangent2", flint.arb.atan2, [(-3.0, -1.0), (-5.0, 2.0)]),
+        ("arctangent2", flint.arb.atan2, [(1.0, 4.0), (-5.0, 2.0)]),
+    ],
+)
+def test_the_range_of_two_operands_holds_the_exact_values_of_members(name, exact, ranges):
+    """Mutants: a corner for the wrong end, no rounding outwards, a missed cut or half circle."""
+    rng = np.random.default_rng(2)
+    boxes = [boxes_of(rng, *pair) for pair in ranges]
+    found = escaped(rules.RULES[name], exact, boxes)
+    assert found[0] == 0
+    assert found[1] > 100
+
+
+def test_bases_and_angles_at_the_edges():
+    """Mutants: a negative base taken for one that is not; the cut missed where y touches 0."""
+    both = functions.power_const, functions.power
+    for base, known in (((0.0, 2.0), (True, False)), ((-0.1, 2.0), (False, False))):
+        for rule, told in zip(both, known, strict=True):
+            operands = [tuple(np.array([end]) for end in box) for box in (base, (0.5, 0.7))]
+            assert np.isfinite(rule(*operands)).all() == told
+    pi = flint.arb.pi()
+    for y, whole in (((0.0, 1.0), True), ((-1.0, 0.0), True), ((0.1, 1.0), False)):
+        box = [tuple(np.array([end]) for end in pair) for pair in (y, (-2.0, -1.0))]
+        low, high = (float(end[0]) for end in functions.arctangent2(*box))
+        assert (flint.arb(low) < -pi and flint.arb(high) > pi) == whole
+        assert whole or 1.5 < low < high < np.pi
+
+
 def test_a_sine_of_nothing_known_is_a_sine():
     nothing = np.full(1, np.nan), np.full(1, np.nan)
     assert [end.tolist() for end in functions.sine(nothing)] == [[-1.0], [1.0]]

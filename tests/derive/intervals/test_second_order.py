@@ -1,5 +1,7 @@
 """Second derivatives and fewer variables: what they prove, that they help, and planted mistakes."""
 
+from fractions import Fraction
+
 import casadi as ca
 import flint
 import numpy as np
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from obsynth.derive.intervals import ranges
 from obsynth.derive.intervals.ranges import Status, bound_ranges
-from obsynth.derive.intervals.search import branch, curvature, reduction
+from obsynth.derive.intervals.search import batch, branch, curvature, reduction
 from obsynth.derive.intervals.search.batch import RowRanges, Rows
 from obsynth.derive.intervals.search.curvature import Hessians, is_concave
 from obsynth.derive.intervals.search.reduction import SxGraph, reduce_variables
@@ -344,3 +346,38 @@ def test_the_bound_of_a_concave_goal_starts_from_the_upper_end_at_the_top():
     goal = offset - (X[0] - 0.3) ** 2 - (X[0] + X[1]) ** 2
     found = bound_ranges(goal, X[:2], [(-1, 1), (-1, 1)], offset, [(0.0, 1.0)])
     assert 1.0 <= found.upper[0] <= 1.0 + 1e-6
+
+
+@pytest.mark.parametrize("bent", ["HILL", "SADDLE", "COMPOSED", "BOWL", "WAVE"])
+def test_what_is_not_known_of_a_constant_is_not_lost(at_once, bent):
+    """f + c with c in [0, 1] and its negative; mutants: a lower end where a bound starts."""
+    more = {"BOWL": X[0] ** 2 + (X[1] - X[0]) ** 2 + ca.exp(X[2]), "WAVE": ca.sin(3 * X[0])}
+    expression = more.get(bent, globals().get(bent))
+    offset = ca.SX.sym("c")
+    alone = bound_ranges(expression, X, ROOM, effort="fast")
+    moved = bound_ranges(
+        ca.vertcat(expression + offset, -expression - offset),
+        X,
+        ROOM,
+        offset,
+        [(0.0, 1.0)],
+        effort="fast",
+    )
+    assert moved.lower[0] <= alone.attained_lower[0]
+    assert moved.upper[0] >= alone.attained_upper[0] + 1.0
+    assert moved.lower[1] <= -alone.attained_upper[0] - 1.0
+    assert moved.upper[1] >= -alone.attained_lower[0]
+
+
+def test_terms_of_the_mean_value_form_hold_the_exact_products():
+    """Mutants: the radius, or its product with the slope, rounded to nearest."""
+    rng = np.random.default_rng(0)
+    lower, width = rng.uniform(-1.0, 0.0, (3, 3000)), rng.uniform(1.0, 3.0, (3, 3000))
+    upper = lower + width
+    centre = np.clip(0.5 * (lower + upper), lower, upper)
+    slope = rng.uniform(1.0, 2.0, (3, 3000))
+    terms = batch.mean_value_terms(lower, upper, centre, slope, slope)
+    numbers = (part.ravel().tolist() for part in (lower, upper, centre, slope, terms))
+    for low, high, middle, s, term in zip(*numbers, strict=True):
+        reach = max(Fraction(high) - Fraction(middle), Fraction(middle) - Fraction(low))
+        assert Fraction(term) >= abs(Fraction(s)) * reach

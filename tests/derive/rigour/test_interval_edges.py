@@ -4,11 +4,13 @@ import math
 from fractions import Fraction
 from itertools import product
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from obsynth.derive.intervals import functions
-from obsynth.derive.intervals.rules import RULES
+from obsynth.derive.intervals.program import Program, evaluate
+from obsynth.derive.intervals.rules import RULES, uncertain
 from obsynth.derive.rigour import interval as arithmetic
 
 
@@ -154,6 +156,29 @@ def test_functions_are_known_inside_their_domain_and_nowhere_else(name):
         assert np.isnan(ends(rule(interval(low - 0.5, within)))).all()
         if high < 9:
             assert np.isnan(ends(rule(interval(within, high + 0.5)))).all()
+
+
+@pytest.mark.parametrize("name", ["remainder", "copysign"])
+def test_a_jump_inside_is_told_and_none_where_there_is_none(name):
+    """fmod(a, b) is a where |a| < |b|; copysign(a, b) jumps where b does. Mutants: an end moved."""
+    for a, b in product(SMALL, SMALL):
+        operands = [interval(*a), interval(*b)]
+        with np.errstate(all="ignore"):
+            rough = bool(uncertain(name, RULES[name](*operands), operands)[0])
+        if name == "copysign":
+            assert rough == (b[0] <= 0 <= b[1])
+        else:
+            least = 0 if b[0] <= 0 <= b[1] else min(map(abs, b))
+            assert rough == (max(map(abs, a)) >= least)
+
+
+def test_what_one_end_does_not_know_is_not_known():
+    """The cube of 1e150 overflows: no lower end, an infinite upper one. Mutant: one end asked."""
+    x = ca.SX.sym("x")
+    program = Program.from_casadi(ca.Function("cube", [x], [x**3]))
+    with np.errstate(all="ignore"):
+        lower, upper = evaluate(program, np.array([[1e150]]), np.array([[1e150]]))
+    assert (lower[0, 0], upper[0, 0]) == (-np.inf, np.inf)
 
 
 def test_a_pole_between_two_neighbouring_doubles_is_never_missed():
