@@ -11,7 +11,7 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive import DerivationError, jacobian_bounds
+from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
 from obsynth.derive.jacobian.entries import JacobianEntries
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes import fewer, support
@@ -391,3 +391,20 @@ def test_too_many_vertices_are_refused():
     many = replace(found, groups=found.groups * 5)
     with pytest.raises(DerivationError, match="1048576 vertices"):
         many.vertices()
+
+
+@pytest.mark.parametrize("end", ["lower", "upper"])
+def test_a_coordinate_without_an_end_is_refused(monkeypatch, end):
+    """Mutant: one end asked twice."""
+    real = JacobianEntries.search
+
+    def endless(self, *arguments):
+        found = real(self, *arguments)
+        if len(arguments) < 3:
+            return found
+        value = np.full_like(found.lower, -np.inf if end == "lower" else np.inf)
+        return replace(found, **{end: value})
+
+    monkeypatch.setattr(JacobianEntries, "search", endless)
+    with pytest.raises(UnboundedError, match="principal coordinate"):
+        principal_family(exothermic_cstr(), keep=1)
