@@ -16,18 +16,13 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
     lift,
 )
-from obsynth.designs.bounded_error.model import (
-    Derived,
-    lost_by_rounding,
-    noise_box,
-    rounding_allowance,
-)
+from obsynth.designs.bounded_error.model import Derived, noise_box
 from obsynth.designs.bounded_error.peak.design import prove_peak_claims
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
+from obsynth.designs.bounded_error.rounding import Limits, of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import LARGEST_SIGNAL
 from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
@@ -39,6 +34,7 @@ def claims(design: UioDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     yield _prove_boxes(design)
     yield _prove_decoupling(design)
+    yield prove_rounding(design)
     if isinstance(design.bound, EllipsoidBound):
         yield from prove_ellipsoid(design)
     else:
@@ -47,21 +43,18 @@ def claims(design: UioDesign) -> Iterator[Claim]:
 
 def _prove_boxes(design: UioDesign) -> Claim:
     boxes = noise_box(design.plant)
-    residual = decouple(design.C, design.D).residual
     w = design.plant.box("w")
     room = np.concatenate(
         [
             w[:, 0] - (design.w_centre - design.w_radius),
             (design.w_centre + design.w_radius) - w[:, 1],
             design.rate - boxes.rate,
-            design.rounding - rounding_allowance(design.plant, residual),
         ]
     )
     margin = float(room.min(initial=np.inf))
     return Claim(
         "boxes",
-        "the stored boxes hold the declared disturbances and fault rates, and the allowance for "
-        "rounding is not below what the ranges ask for",
+        "the stored boxes hold the declared disturbances and fault rates",
         bool(margin >= 0.0),
         margin,
         "comparison",
@@ -213,9 +206,6 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
     parts, family = fresh.split, fresh.bounds.family
     names = ("A", "B", "B_f", "C", "D", "W1", "W2")
     same = all(np.array_equal(getattr(design, name), getattr(parts, name)) for name in names)
-    gain = float(np.abs(design.gain).sum(axis=1).max(initial=0.0))
-    lost = lost_by_rounding(parts, design.E, gain)
-    allowed = float(design.rounding.min(initial=np.inf))
     yield Claim(
         "model",
         "A x + B u + D d + B_f f + W1 w + g equals the stored dynamics, C x + W2 w the outputs",
@@ -223,13 +213,14 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
         0.0,
         str(parts.proof),
     )
+    left = design.rounding - step_error(design)[0] - of_matrices(design, parts.proof.rounding)
+    room = float(left.min(initial=np.inf))
     yield Claim(
         "matrix_rounding",
-        "what rounding the matrices to doubles moves in one step is below the allowance "
-        f"(signals without a range up to {LARGEST_SIGNAL:g})",
-        bool(lost <= allowed),
-        allowed - lost,
-        "bounds of |exact - double| times the boxes",
+        "what rounding the matrices to doubles moves in one step is within the allowance too",
+        bool(room >= 0.0),
+        room,
+        "bounds of |exact - double| times the limits of the signals",
     )
     yield Claim(
         "jacobian",
@@ -276,11 +267,27 @@ def guarantee(design: UioDesign) -> Guarantee:
         assumptions.append(f"{noise} [monitored in part: status bit 8]")
     if rates:
         assumptions.append(rates)
-    largest = float(design.rounding.max(initial=0.0))
-    assumptions.append(
-        f"the rounding errors of one step stay below {largest:.1e} in every component"
-    )
+    assumptions.extend(_on_rounding(design))
     return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def _on_rounding(design: UioDesign) -> Iterator[str]:
+    """Say where the rounding of a step is bounded, or that it is assumed to be."""
+    largest = float(design.rounding.max(initial=0.0))
+    said = f"the rounding errors of one step stay below {largest:.1e} in every component"
+    if not step_error(design)[1]:
+        yield f"{said}, which is not proved for this plant"
+        return
+    plant, limits = design.plant, Limits.of(design.plant)
+    signals = zip((*plant.x, *plant.f, *plant.u), np.concatenate(limits).tolist(), strict=True)
+    listed = [
+        f"{s.name} in [{a:g}, {b:g}]" for s, (a, b) in signals if (a, b) != (s.lower, s.upper)
+    ]
+    where = f", and {', '.join(listed)}, estimates too" if listed else ""
+    yield (
+        f"inputs keep to their ranges{where}: there {said}, which is proved for IEEE doubles "
+        "rounded to nearest"
+    )
 
 
 def _gains(design: UioDesign) -> dict[str, FloatArray]:

@@ -25,6 +25,7 @@ from obsynth.designs.bounded_error.lmis import (
 from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read, read_again
 from obsynth.designs.bounded_error.peak.design import bound_peak, design_peak
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
+from obsynth.designs.bounded_error.rounding import settle
 from obsynth.designs.bounded_error.step import build_step, first_memory, memory_sizes
 from obsynth.designs.bounded_error.synthesis import (
     EllipsoidSolution,
@@ -164,14 +165,15 @@ class BoundedErrorUIO(Method):
     def solve(self, model: UioModel) -> UioDesign:
         """Find gains and their bounds."""
         if self.bounds == "peak":
-            return design_peak(model, self)
-        return self._design_ellipsoid(model)
+            return bound_peak(_settled(design_peak(model, self), model))
+        return _settled(self._design_ellipsoid(model), model)
 
     def fix(self, model: UioModel, gains: Mapping[str, ArrayLike]) -> UioDesign:
         """Bound the errors of given ``K`` of shape (n, m) and ``F`` of shape (n_f, m)."""
         blank = model.design
         found = read_gains(gains, {"K": blank.K.shape, "F": blank.F.shape})
         given = replace(blank, K=found["K"], F=found["F"], options=self.options())
+        given = _settled(given, model)
         if self.bounds == "peak":
             return bound_peak(given)
         system, noise, weights = self._setting(model)
@@ -302,6 +304,10 @@ class BoundedErrorUIO(Method):
             if all(claim.holds for claim in prove_ellipsoid(design)):
                 break
         return design
+
+
+def _settled(design: UioDesign, model: UioModel) -> UioDesign:
+    return settle(design, model.split.proof.rounding)
 
 
 def _with_vertices(model: UioModel, vertices: FloatArray) -> Any:

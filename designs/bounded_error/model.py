@@ -11,7 +11,6 @@ from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.record import Fading, PeakData, UioDesign
 from obsynth.designs.core.given import PlantClass
-from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -152,11 +151,8 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
         Pi=decoupling.Pi,
         K=np.zeros((n, m)),
         F=np.zeros((n_f, m)),
-        # At least half is left for the step where faults without a range meet rounded coefficients.
-        rounding=np.maximum(
-            rounding_allowance(model, decoupling.residual),
-            2.0 * lost_by_rounding(parts, decoupling.E),
-        ),
+        # for the search; that of the gains replaces it
+        rounding=rounding_allowance(model, decoupling.residual),
         bound=PeakData(np.zeros(n + n_f), Fading(nothing, nothing, nothing, 0.0, None)),
         options={},
     )
@@ -170,7 +166,7 @@ def read_again(design: UioDesign) -> Derived:
 
 
 def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:
-    """Return the allowance for the rounding errors of one step, shape (n + n_f,).
+    """Return an allowance for the rounding errors of one step, shape (n + n_f,), not proved.
 
     2^-40 of the largest magnitude of the states (or 1), and the share of the
     unknown input that rounding leaves in the error.
@@ -179,17 +175,3 @@ def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:
     d_box = model.box("d")
     share = residual * float(np.abs(d_box).sum()) * 2.0 if residual > 0 else 0.0
     return np.full(len(model.x) + len(model.f), ROUNDING * size + share)
-
-
-def lost_by_rounding(parts: Split, E: FloatArray, gain: float = 0.0) -> float:
-    """Bound of the error that rounded D, B_f, W1, C, W2 cause in one step of the error."""
-    rounding = parts.proof.rounding
-    largest = {}
-    for kind, names in (("x", ("C",)), ("d", ("D",)), ("f", ("B_f",)), ("w", ("W1", "W2"))):
-        box = np.abs(finite_box(parts.model, kind)).max(axis=1, initial=0.0)
-        for name in names:
-            largest[name] = float((rounding[name] @ box).max(initial=0.0))
-    through = float(np.abs(E).sum(axis=1).max(initial=0.0))
-    size = float(np.abs(parts.A).sum(axis=1).max(initial=1.0))
-    state = (1.0 + through) * (largest["D"] + largest["B_f"] + largest["W1"])
-    return float(state + (gain + size + through) * (largest["C"] + largest["W2"]))

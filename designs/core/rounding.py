@@ -28,6 +28,7 @@ The analysis itself rounds outwards.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -116,26 +117,45 @@ class _Node:
         return absolute(self.range)[0]
 
 
+class Bound(NamedTuple):
+    """Of one output: ``|fl(F) - F|`` and ``|F|``, shape (entries,), infinite where unknown."""
+
+    error: FloatArray
+    size: FloatArray
+
+
+def cut_box(box: FloatArray, pieces: int) -> Interval:
+    """Cut every side of a box, shape (n, 2), into pieces: ends of the cells, (n, pieces^n)."""
+    edges = np.linspace(box[:, 0], box[:, 1], pieces + 1)
+    edges[-1] = box[:, 1]
+    index = np.indices((pieces,) * len(box)).reshape(len(box), -1)
+    rows = np.arange(len(box))[:, None]
+    return edges[index, rows], edges[index + 1, rows]
+
+
 def rounding_bound(
     function: ca.Function,
     box: Mapping[str, Interval],
     precision: str = "double",
     known: Mapping[str, Interval] | None = None,
-) -> dict[str, FloatArray]:
-    """Bound ``|fl(F) - F|`` by the names of the outputs, infinite where nothing can be said.
+) -> dict[str, Bound]:
+    """Bound what rounding does to the outputs, by their names.
 
-    Shapes: ends in `box` (inputs, cells) by the names of all inputs; in `known` (outputs, cells),
-    what the exact outputs are known to lie in for the v in question; returned (outputs,).
+    Shapes: ends in `box` (entries, cells) by the names of all inputs; in `known` the same by names
+    of outputs, what the exact ones are known to lie in for the v in question.
     """
     if not function.is_a("SXFunction"):
         function = function.expand()
     with np.errstate(all="ignore"):
         found = _Tape(function, box, precision, known or {}).run()
-    names = function.name_out()
-    return {
-        name: np.array([found[i, j].max() for j in range(function.nnz_out(i))])
-        for i, name in enumerate(names)
-    }
+    bounds = {}
+    for i, name in enumerate(function.name_out()):
+        nodes = [found[i, j] for j in range(function.nnz_out(i))]
+        size = np.array([node.size[0].max() for node in nodes])
+        bounds[name] = Bound(
+            np.array([node.e.max() for node in nodes]), np.where(np.isnan(size), np.inf, size)
+        )
+    return bounds
 
 
 class _Tape:
@@ -162,16 +182,16 @@ class _Tape:
                 lo, hi = known[name]
                 self.known[writer[args[0]]] = lo[out[1]], hi[out[1]]
 
-    def run(self) -> dict[tuple[int, int], FloatArray]:
-        """Return the bounds per scalar output and cell."""
+    def run(self) -> dict[tuple[int, int], _Node]:
+        """Return the nodes of the scalar outputs."""
         work: dict[int, _Node] = {}
-        found: dict[tuple[int, int], FloatArray] = {}
+        found: dict[tuple[int, int], _Node] = {}
         function = self.function
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
             out, args = function.instruction_output(k), function.instruction_input(k)
             if code == ca.OP_OUTPUT:
-                found[out[0], out[1]] = work[args[0]].e
+                found[out[0], out[1]] = work[args[0]]
                 continue
             if code == ca.OP_INPUT:
                 node = self._input(args[0], args[1])

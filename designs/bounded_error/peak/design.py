@@ -79,7 +79,10 @@ def _widest_start(design: UioDesign) -> FloatArray:
 
 
 def design_peak(model: UioModel, method: BoundedErrorUIO) -> UioDesign:
-    """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves."""
+    """Find gains with narrow peak bounds: an LMI for the start, then the bounds themselves.
+
+    The bounds are not attached, see `bound_peak`.
+    """
     design = model.design
     n, n_f = design.A.shape[0], design.rate.size
     weights = np.ones(n + n_f) if method.weights is None else np.array(method.weights)
@@ -110,7 +113,7 @@ def design_peak(model: UioModel, method: BoundedErrorUIO) -> UioDesign:
         rounding=design.rounding,
         dbar=_unknown_input_bound(design),
     )
-    return bound_peak(replace(given, K=found.K, F=found.F))
+    return replace(given, K=found.K, F=found.F)
 
 
 def prove_peak_claims(design: UioDesign) -> tuple[Claim, ...]:

@@ -70,7 +70,7 @@ def smaller_allowance(record):
 
 
 SPOILS = [
-    (smaller_allowance, "boxes"),
+    (smaller_allowance, "rounding"),
     (shrink_P_inverse, "half_widths"),
     (larger_gamma, "lmi"),
     (other_gain, "lmi"),

@@ -1,0 +1,249 @@
+"""The allowance for rounding is proved: tanks against a table, plants against rationals."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import sympy as sp
+from tapes import NUMPY, tape
+
+import obsynth as ob
+from obsynth.designs.bounded_error.claims import claims, covers, guarantee
+from obsynth.designs.bounded_error.rounding import Limits, of_matrices, of_step
+from obsynth.designs.bounded_error.step import equations
+from obsynth.designs.core.rounding import cut_box, rounding_bound
+
+
+def designed(plant, **options):
+    """A design and what was read of its plant."""
+    method = ob.BoundedErrorUIO(**options)
+    model = method.read(plant)
+    return method.solve(model), model
+
+
+@pytest.fixture(scope="module")
+def peak():
+    return designed(ob.plants.quadruple_tank().discretise("euler", Ts=1.0), bounds="peak")[0]
+
+
+def narrow(design, spread=1.0, faults=5.0, correction=0.2):
+    """Cells of estimates in their ranges, readings within `spread` of them, small faults."""
+    lo, hi = cut_box(design.plant.box("x"), 4)
+    kept = np.abs(design.E).sum(axis=1) == 0.0
+    z = [np.where(kept[:, None], end, side * correction) for end, side in ((lo, -1), (hi, 1))]
+    f = np.full((2, 1), faults)
+    u = design.plant.box("u")
+    box = {
+        "z": tuple(z),
+        "fhat": (-f, f),
+        "u": (u[:, :1], u[:, 1:]),
+        "y": (lo[:3] - spread, hi[:3] + spread),
+    }
+    nu = np.full((3, 1), spread)
+    return box, {"xhat": (lo, hi), "innovation": (-nu, nu)}
+
+
+def test_four_tanks_have_the_bounds_of_the_table(peak):
+    """Within 2 % of what an independent analysis found, and close to what is seen.
+
+    Mutants: Sterbenz left out (fhat a hundred times), known outputs left out.
+    """
+    box, known = narrow(peak)
+    single = rounding_bound(equations(peak), box, "single", known)
+    table = np.array([6.77e-5, 6.73e-5, 1.82e-5])
+    np.testing.assert_allclose(single["z_next"].error[[0, 1, 3]], table, rtol=0.02)
+    double = rounding_bound(equations(peak), box, "double", known)
+    assert double["z_next"].error.max() == pytest.approx(1.29e-13, rel=0.02)
+    rng = np.random.default_rng(0)
+    count = 100_000
+    x = rng.uniform(*peak.plant.box("x").T[:, :, None], (4, count))
+    corner = rng.random(x.shape) < 0.15
+    ends = peak.plant.box("x")
+    x = np.where(corner, np.where(rng.random(x.shape) < 0.5, ends[:, :1], ends[:, 1:]), x)
+    z = np.where(np.abs(peak.E).sum(axis=1)[:, None] == 0, x, rng.uniform(-0.2, 0.2, x.shape))
+    points = [
+        z,
+        rng.uniform(-5, 5, (2, count)),
+        rng.uniform(*peak.plant.box("u").T[:, :, None], (2, count)),
+        x[:3] + rng.uniform(-1, 1, (3, count)),
+    ]
+    points = [part.astype(np.float32) for part in points]
+    found = tape(equations(peak), points, NUMPY, lambda v: np.full(count, v, np.float32))
+    exact = tape(
+        equations(peak), [part.astype(float) for part in points], NUMPY, lambda v: np.full(count, v)
+    )
+    seen = np.array([np.abs(a - b).max() for a, b in zip(found, exact, strict=True)])
+    limits = np.concatenate([part.error for part in single.values()])
+    assert np.all(seen <= limits)
+    z_next = slice(4 + 3 + 4, 4 + 3 + 8)
+    assert np.all(limits[z_next][[0, 1, 3]] < np.array([1.3, 1.3, 1.9]) * seen[z_next][[0, 1, 3]])
+
+
+def test_the_allowance_of_the_tanks_is_proved_and_small(peak):
+    assert np.all(of_step(peak) <= peak.rounding)
+    assert peak.rounding.max() < 2.0**-40 * 280
+    said = " ".join(guarantee(peak).assumptions)
+    assert "f1 in [-1e+06, 1e+06]" in said
+    assert "which is proved for IEEE doubles" in said
+
+
+def test_a_smaller_allowance_falls(peak):
+    """Mutant: a claim that compares with nothing."""
+    spoilt = replace(peak, rounding=peak.rounding * 0.9)
+    assert not {claim.name: claim.holds for claim in claims(spoilt)}["rounding"]
+
+
+def random_plant(seed, ranged=False, shift=0.0, large=2.0):
+    """A linear plant whose coefficients are no doubles; an unknown input; noise off its middle."""
+    rng = np.random.default_rng(seed)
+    plant = ob.Plant(f"random {seed}")
+    n = int(rng.integers(2, 4))
+    x = plant.states(" ".join(f"x{i}" for i in range(n)), range=(-5, 5))
+    (u,) = plant.inputs("u", range=(-3, 3))
+    (d,) = plant.unknown_inputs("d", range=(-large, large))
+    (f,) = plant.faults("f", rate=0.01, **({"range": (-3, 4)} if ranged else {}))
+    w = plant.disturbances(" ".join(f"w{i}" for i in range(n)), range=(shift - 0.1, shift + 0.1))
+
+    def third(top=9):
+        return sp.Rational(int(rng.integers(1, top)), int(rng.choice([3, 7, 11, 13, 30])))
+
+    rows = [third(4) * x[i] / 3 + third() * x[(i + 1) % n] / 30 for i in range(n)]
+    rows = [row + third() * u for row in rows]
+    rows[0] += third() * f
+    rows[1] += third() * d
+    plant.dynamics([row + third() * w[0] / 9 for row in rows], Ts=1)
+    plant.outputs([third() * x[i] + x[0] / 7 + third() * w[i] / 9 for i in range(n)])
+    return plant
+
+
+def exact(matrix):
+    return np.array([[Fraction(float(v)) for v in row] for row in np.atleast_2d(matrix)])
+
+
+def true_matrices(plant):
+    """Coefficients of the plant's own equations, in rationals."""
+    groups = (plant.x, plant.f, plant.d, plant.w, plant.u)
+
+    def of(rows, signals):
+        found = [
+            [sp.diff(row, s.symbol).subs(plant.constant_values) for s in signals] for row in rows
+        ]
+        return np.array([[Fraction(int(v.p), int(v.q)) for v in row] for row in found])
+
+    return [of(plant.rhs, g) for g in groups], [of(plant.output, g) for g in (plant.x, plant.w)]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_plants_with_coefficients_that_are_no_doubles_are_designed_and_covered(seed):
+    """One step in doubles of the true plant against the stored recursion, in rationals.
+
+    What it is off by is rounding of the step, of B_f, C, W1, W2, D, and what is left of d. Mutants:
+    an allowance without the matrices (refused after the design), or without one of their terms.
+    """
+    large = 1e9 if seed == 5 else 2.0
+    plant = random_plant(seed, ranged=seed % 2 == 1, shift=0.3 * (seed % 3), large=large)
+    design, model = designed(plant, bounds="peak" if seed != 4 else "ellipsoid")
+    assert all(claim.holds for claim in [*claims(design), *covers(design, model)])
+    (A, B_f, D, W1, B), (C, W2) = true_matrices(plant)
+    rng = np.random.default_rng(seed)
+    limits, inner = Limits.of(plant), equations(design)
+    stored = {k: exact(getattr(design, k)) for k in ("E", "K", "F", "C", "W1", "W2", "B_f")}
+    stored["T"] = np.eye(len(A), dtype=int) + stored["E"] @ stored["C"]
+    centre = exact(design.w_centre)[0]
+    worst = np.zeros(len(A) + 1)
+    for _ in range(40):
+        side = rng.choice([-1.0, 1.0, 0.3], len(A))
+        x = exact(side * 5.0)[0]
+        f = exact(rng.choice(limits.f[0]))[0]
+        fhat = rng.choice(limits.f[0], 1)
+        d, u = exact(rng.choice([-large, large]))[0], rng.uniform(-3, 3, 1)
+        w = centre + exact(rng.choice([-0.1, 0.1], len(A)))[0]
+        y = np.array([float(v) for v in C @ x + W2 @ w])
+        # the noise that makes the readings doubles
+        w = w + exact_solution(W2, exact(y)[0] - (C @ x + W2 @ w))
+        shifted = y - design.W2 @ design.w_centre
+        guess = rng.uniform(-5, 5, len(A))
+        z = guess + design.E @ shifted
+        xhat, _, _, z_next, fhat_next = (np.array(v).ravel() for v in inner(z, fhat, u, shifted))
+        if np.any(np.abs(xhat) > 5.0):
+            continue
+        zeta = stored["T"] @ x - exact(z)[0]
+        e = zeta + stored["E"] @ stored["W2"] @ (w - centre)
+        e_f = f - exact(fhat)[0]
+        nu = stored["C"] @ e + stored["W2"] @ (w - centre)
+        kept = stored["T"] @ (A @ e + stored["B_f"] @ e_f + stored["W1"] @ (w - centre))
+        x_next = A @ x + B_f @ f + D @ d + W1 @ w + B @ exact(u)[0]
+        off = stored["T"] @ x_next - exact(z_next)[0] - (kept - stored["K"] @ nu)
+        off_f = (f - exact(fhat_next)[0]) - (e_f - stored["F"] @ nu)
+        worst = np.maximum(worst, [float(abs(v)) for v in (*off, *off_f)])
+        outside = np.abs([float(v) for v in x - exact(xhat)[0] - e])
+        assert np.all(outside <= design.rounding[:-1])
+    assert np.all(worst <= design.rounding)
+    assert design.rounding.max() < 1e3 * worst.max()
+
+
+@pytest.mark.parametrize("letter", ["D", "B_f", "W1", "C", "W2"])
+def test_every_matrix_that_is_rounded_counts(letter):
+    """Matrices off by a hundredth, so that nothing else matters: near the bound, never above.
+
+    Mutants: a term of `of_matrices` dropped or halved, the way through E, K or F left out.
+    """
+    rng = np.random.default_rng(1)
+    plant = random_plant(1, ranged=True, shift=0.3)
+    design, _ = designed(plant, gamma=0.05)
+    design = replace(design, K=design.K + 0.3, F=design.F - 0.2, E=design.E + 0.1)
+    design = replace(design, T=np.eye(len(design.A)) + design.E @ design.C)
+    names = ("D", "B_f", "W1", "C", "W2")
+    off = {name: np.zeros_like(getattr(design, name)) for name in names}
+    off[letter] = np.full_like(getattr(design, letter), 0.01)
+    limits, centre = Limits.of(plant), design.w_centre
+    count, E, T, K, F = 4000, design.E, design.T, design.K, design.F
+    x = rng.choice(limits.x[0], (len(T), count))
+    f, fhat = (rng.choice(limits.f[0], (1, count)) for _ in range(2))
+    d, w = rng.choice([-2, 2], (1, count)), rng.choice([0.2, 0.4], (len(centre), count))
+    worst = np.zeros(len(T) + 1)
+    for _ in range(20):
+        true = {k: getattr(design, k) + rng.choice([-1, 1], off[k].shape) * off[k] for k in names}
+        spread = w - centre[:, None]
+        y = true["C"] @ x + true["W2"] @ w - design.W2 @ centre[:, None]
+        z = T @ x - rng.normal(size=x.shape)
+        xhat = z - E @ y
+        nu = y - design.C @ xhat
+        z_next = T @ (design.A @ xhat + true["B_f"] @ fhat + true["W1"] @ centre[:, None]) + K @ nu
+        x_next = design.A @ x + true["B_f"] @ f + true["W1"] @ w + (true["D"] - design.D) @ d
+        e = T @ x - z + E @ design.W2 @ spread
+        seen = design.C @ e + design.W2 @ spread
+        kept = T @ (design.A @ e + design.B_f @ (f - fhat) + design.W1 @ spread) - K @ seen
+        off_x = np.maximum(np.abs(T @ x_next - z_next - kept), np.abs(x - xhat - e))
+        off_f = np.abs(F @ (nu - seen))
+        worst = np.maximum(worst, np.concatenate([off_x, off_f]).max(axis=1))
+    limit = of_matrices(design, off)
+    assert np.all(worst <= limit + 1e-12)
+    assert np.all(limit <= 2.0 * worst + 1e-12)
+
+
+def exact_solution(matrix, right):
+    """Solve a square system of rationals."""
+    table = sp.Matrix(matrix.shape[0], matrix.shape[1], lambda i, j: rational(matrix[i, j]))
+    found = table.LUsolve(sp.Matrix([rational(v) for v in right]))
+    return np.array([Fraction(int(v.p), int(v.q)) for v in found])
+
+
+def rational(value):
+    return sp.Rational(value.numerator, value.denominator)
+
+
+def test_a_plant_that_no_bound_is_found_for_keeps_its_assumption():
+    """A kink that a comparison makes: designed as before, and the guarantee says it assumes."""
+    plant = ob.Plant("kink")
+    x, z = plant.states("x z", range=(-5, 5))
+    plant.disturbances("w", bound=0.1)
+    kink = sp.Piecewise((x / 4, x + z / 3 > 0), (x / 4 + (x + z / 3) / 50, True))
+    plant.dynamics([kink, z / 3 + x / 7], Ts=1)
+    plant.outputs([x, z])
+    design, model = designed(plant, gamma=0.05)
+    named = {claim.name: claim for claim in [*claims(design), *covers(design, model)]}
+    assert all(claim.holds for claim in named.values())
+    assert "assumed" in named["rounding"].statement
+    assert "not proved" in guarantee(design).assumptions[-1]
