@@ -24,8 +24,9 @@ CALM = "calm"
 SETTLED, LATEST, SPARE = 150, 40, 150
 """Samples before anything is broken, further ones within which it begins, and may last."""
 LENGTHS = (1, 1, 1, 2, 5, 10)
-LEFT_OUT = 32
-"""A status of this bit alone starts nothing anew: a measurement was missing."""
+FLAGS = 2 | 4 | 8 | 16
+"""Bits that say that something is wrong now. 32: a measurement was missing, which breaks nothing;
+64: something was wrong before, and what breaks meanwhile may go unnoticed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +386,7 @@ def missed(case: Case, seen: Record) -> Any:
 def counted(case: Case, given: Trials, seen: Record) -> dict[str, Count]:
     """Count by kinds."""
     wrong = missed(case, seen) & (seen.status == 0)
-    flags = (seen.status & ~LEFT_OUT) != 0
+    flags = (seen.status & FLAGS) != 0
     width = np.concatenate([seen.x_upper - seen.x_lower, seen.f_upper - seen.f_lower], axis=2)
     calm = [b for b, label in enumerate(given.kinds) if label == CALM]
     wide = 1.1 * width[SETTLED:, calm].max(axis=(0, 1))
