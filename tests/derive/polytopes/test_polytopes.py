@@ -130,6 +130,8 @@ def test_offsets_rounded_down_are_caught():
     ("call", "message"),
     [
         (lambda: polytope_from_halfspaces([[1, 0], [0, 1]], [1, 1]), "is not bounded"),
+        # a corner that the first linear program finds
+        (lambda: polytope_from_halfspaces([[-1, 0], [0, 1]], [1, 1]), "an edge leads to infinity"),
         (lambda: polytope_from_halfspaces([[1], [-1]], [-1, -1]), "is empty"),
         (lambda: polytope_from_halfspaces([[1, 0]], [1, 2]), "given were shapes"),
         (lambda: polytope_from_halfspaces([[1, np.nan]], [1]), "finite"),

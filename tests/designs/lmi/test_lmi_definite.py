@@ -1,9 +1,13 @@
 """What a solver hands back is accepted only where it is true."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
 from obsynth.designs.lmi import Problem, full, symmetric, symmetric_block, trace
+from obsynth.designs.lmi.proof import _definite, _multipliers
 
 
 def decay_design():
@@ -55,3 +59,28 @@ def test_a_solution_on_the_boundary_is_accepted_only_where_it_is_true():
     assert not np.any(proved & ~exact)
     # The optimum sits on the boundary: the solver's answer is no proof of all vertices.
     assert not proved.all()
+
+
+@pytest.mark.timeout(60)
+def test_a_multiplier_that_is_singular_is_moved_until_it_is_definite():
+    """Mutant: a shift to the wrong side, which never ends."""
+    for dual in (np.diag([1.0, 0.0]), np.ones((3, 3)), np.diag([2.0, -1e-9]), np.eye(2)):
+        moved = _definite(dual, 0.0)
+        assert is_positive_definite(moved)
+        assert np.abs(moved - dual).max() <= 3e-9
+
+
+def test_a_dual_solution_with_a_number_missing_proves_nothing():
+    """Mutant: one finite entry is enough."""
+    P = symmetric("P", 2)
+    problem = Problem("both")
+    problem.add("floor", P >> np.eye(2))
+    problem.add("cap", P << 3.0 * np.eye(2))
+    problem.minimise(trace(P))
+    solution = problem.solve()
+    assert set(_multipliers(problem, solution)) == {"floor", "cap"}
+    spoiled = solution.duals["cap"].copy()
+    spoiled.flat[0] = np.nan
+    assert (
+        _multipliers(problem, replace(solution, duals={**solution.duals, "cap": spoiled})) is None
+    )

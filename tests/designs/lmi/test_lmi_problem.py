@@ -173,6 +173,7 @@ def test_an_almost_solved_answer_is_not_solved():
         (lambda p, P: p.add_lmi("b", P, ">"), "sense"),
         (lambda p, P: p.add("b", P), "no inequality"),
         (lambda p, P: p.minimise(P), "trace"),
+        (lambda p, P: block([[P, P], [P]]), r"rows of \[2, 1\] blocks"),
     ],
 )
 def test_misuse_is_named(attempt, word):
