@@ -32,7 +32,7 @@ class Equations:
 
     rest: unknown inputs, disturbances, parameters and scheduling that is not measured
     box: ranges of (x, f, rest), `FAR` where there is none or where it does not matter
-    curved: states on which some derivative depends, (n,)
+    curved: states on which some derivative by a state or a fault depends, (n,)
     slopes: ranges of the derivatives of every row over the box, (n, variables, 2)
     usable: rows that no unbounded signal enters, (n,)
     """
@@ -41,7 +41,8 @@ class Equations:
         self.plant = plant
         n, n_f = len(plant.x), len(plant.f)
         v, known, rows, outputs, rest = _symbols(plant)
-        J = ca.jacobian(ca.vertcat(rows, outputs), v)
+        # what multiplies a disturbance or a parameter does so whatever the size of the state
+        J = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : n + n_f]
         curved = np.array(ca.which_depends(ca.vec(J), v[:n], 1, False), dtype=bool).reshape(n)
         self.curved: BoolArray = curved
         self.n, self.n_f, self.n_v = n, n_f, int(v.numel())

@@ -160,6 +160,14 @@ def monitored(guarantee: Guarantee, guard: Guard) -> Guarantee:
         "ranges exclude, or an empty set, is void (bit 8): the declared ranges are returned, and "
         "sets begin anew from them",
     ]
+    limits = guard.contractor.domain[:, 0].tolist()
+    at_once = [s for s, low in zip(plant.x, limits, strict=True) if s.bounded and low == -np.inf]
+    if at_once:
+        assumptions.append(
+            f"{', '.join(s.name for s in at_once)} is in its declared range at the instants at "
+            f"which sets begin anew: after a void one or an input that is missing, after a missing "
+            f"reading if nothing else bounds it, and every {N} calls"
+        )
     if loose:
         assumptions.append(
             f"{', '.join(s.name for s in loose)} has no declared range: after a void instant it is "

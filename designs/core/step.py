@@ -29,7 +29,7 @@ class _Copy:
         self, X: Ends, now: Ends, late: Ends, shown: Ends, known: Known, again: ca.SX, told: ca.SX
     ) -> None:
         self.X, self.now, self.late, self.shown, self.known = X, now, late, shown, known
-        self.again = again
+        self.again, self.told = again, told
         self.empty = ca.logic_and(told, known.empty)
         for box in (X, now, late, shown):
             self.empty = ca.logic_or(self.empty, box.empty())
@@ -136,8 +136,9 @@ class Step:
         X, now, before = sets
         names = [k for k in self.guard.sizes if k not in (*self.guard.shared, "initialised")]
         own = {name: self.part[name + end] for name in names}
-        begun = core.begin(X, now, kept)
         begins = self.part["begin" + end] > 0.5
+        X = _declared(X, self.reset[0]).where(begins, X)
+        begun = core.begin(X, now, kept)
         own = {name: select(begins, begun[name], own[name]) for name in names}
         seen = Seen({**kept, **own}, self.u_used, self.theta_used, self.y_clean, self.used)
         known = core.run(seen)
@@ -193,11 +194,14 @@ class Step:
         inputs = {"memory": self.memory, "u": self.u, "y": self.y}
         if self.theta.numel():
             inputs["theta"] = self.theta
+        # without a reading that its core needs an estimate is no more than the middle of a set
+        xhat = select(old.told, old.known.xhat, X.middle)
+        fhat = select(old.told, old.known.fhat, F.middle)
         outputs = {
             "memory": select(initialised, memory, self.memory),
             # estimates of a core without sets are promised for states and faults of any size
-            "xhat": old.known.xhat if old.known.x is None else _inside(old.known.xhat, X),
-            "fhat": old.known.fhat if old.known.f is None else _inside(old.known.fhat, F),
+            "xhat": old.known.xhat if old.known.x is None else _inside(xhat, X),
+            "fhat": old.known.fhat if old.known.f is None else _inside(fhat, F),
             "x_lower": _open(X.lower, -1.0),
             "x_upper": _open(X.upper, 1.0),
             "f_lower": _open(F.lower, -1.0),
@@ -268,6 +272,14 @@ class Step:
                 ),
             }
         )
+
+
+def _declared(X: Ends, declared: Ends) -> Ends:
+    """Return a set with declared ranges in place of ends that nothing bounds."""
+    rows = range(X.lower.numel())
+    lower = [ca.if_else(X.lower[i] > -HUGE, X.lower[i], declared.lower[i]) for i in rows]
+    upper = [ca.if_else(X.upper[i] < HUGE, X.upper[i], declared.upper[i]) for i in rows]
+    return Ends(ca.vertcat(*lower), ca.vertcat(*upper))
 
 
 def _inside(value: ca.SX, box: Ends) -> ca.SX:
