@@ -14,6 +14,7 @@ from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.widths import steady_holds
 from obsynth.symbolic import Signal
 
+IN_PART = "monitored in part: status bit 8"
 EXACT = "exact rational arithmetic on the stored numbers"
 
 
@@ -70,8 +71,8 @@ def _prove_stability(design: IntervalDesign) -> Claim:
 
 def _all_rows(design: IntervalDesign) -> tuple[Rows, ...]:
     contraction = tuple(rows for _, rows in design.contraction_rows)
-    own = (design.prediction_rows, design.state_rows, design.share_rows, design.estimate_rows)
-    return (*own, *contraction)
+    moving = (design.prediction_rows, design.share_rows)
+    return (design.first_rows, *moving, design.state_rows, design.estimate_rows, *contraction)
 
 
 def _prove_rounding(design: IntervalDesign) -> Claim:
@@ -150,22 +151,24 @@ def guarantee(design: IntervalDesign) -> Guarantee:
     def ranges(*signals: Signal) -> str:
         return ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in signals)
 
-    watched = [s for s in (*plant.x, *plant.u) if s.name in design.model.scheduled]
+    watched = [s for s in plant.x if s.name in design.model.scheduled]
+    held = [s for s in plant.u if s.name in design.model.scheduled]
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
         "the first state lies in the box given to memory0",
     ]
     if plant.rho or plant.p:
         assumptions.append(ranges(*plant.rho, *plant.p))
-    if watched:
-        assumptions.append(f"{ranges(*watched)} [monitored: status bit 4]")
-    if plant.w:
-        tail = " [monitored in part: status bit 8]" if design.contraction_rows else ""
-        assumptions.append(ranges(*plant.w) + tail)
+    for signals, seen in (
+        (held, "monitored: status bit 4"),
+        (watched, IN_PART),
+        (plant.w, IN_PART),
+    ):
+        if signals:
+            assumptions.append(f"{ranges(*signals)} [{seen}]")
     assumptions += [
         "the half widths hold in the limit while states and inputs keep to their ranges "
         f"(up to {LARGEST_SIGNAL:g} where none is declared)",
-        "after a missing sample the state lies in its declared range once",
         "rounding to nearest; sums are not reordered by the compiler",
     ]
     return Guarantee(tuple(claims), tuple(assumptions))

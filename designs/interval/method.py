@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.designs.core.given import MATRIX, read_gains, read_rows
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.step import Step
 from obsynth.designs.interval.claims import claims, covers, guarantee, numbers
 from obsynth.designs.interval.decoupling import check_detectable, find_transformation
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
 from obsynth.designs.interval.rows import Precision
-from obsynth.designs.interval.step import build_step, first_memory, memory_sizes
+from obsynth.designs.interval.step import build_core, first_memory, memory_sizes
 from obsynth.designs.interval.synthesis import (
     fitting_gains,
     given_gains,
@@ -64,7 +65,8 @@ class IntervalObserver(Method):
     nominal : array_like of shape (n, n), optional
         The nominal A of ``centred=False``.
     precision : {"double", "single"}
-        In which the step may be evaluated with its bounds still enclosing.
+        In which the step may be evaluated with its bounds still enclosing; in single precision
+        the method's own sets are returned, with no `cuts`.
     R, Q : array_like, optional
         Of the Sylvester equation; R nonnegative, shapes (n - q, n - q) and (n - q, m - q).
     H, R0, K0, N, R1, K1 : array_like, optional
@@ -124,7 +126,7 @@ class IntervalObserver(Method):
         numbers=numbers,
         memory=memory_sizes,
         first=first_memory,
-        step=build_step,
+        core=build_core,
         fault_delay=1,
     )
 
@@ -149,6 +151,14 @@ class IntervalObserver(Method):
         """Refuse options that do not fit each other."""
         object.__setattr__(self, "gains", _read_pair(self.gains))
         object.__setattr__(self, "prefer", _in_words(self.prefer))
+        if self.precision == "single" and self.cuts:
+            raise ObsynthError(
+                f"cuts is {self.cuts!r}; precision='single' takes none: only the method's own sets "
+                "are rounded outwards in single precision",
+                option="cuts",
+            )
+        if self.precision == "single":
+            object.__setattr__(self, "cuts", ())
         if self.centred and self.nominal is not None:
             raise ObsynthError(
                 "nominal is the A of centred=False; with centred=True it is the middle",
@@ -222,7 +232,8 @@ class IntervalObserver(Method):
             )
         start = self._start(self._checked(model_or_form))
         design = with_gains(start, *fitting_gains(start, *self.gains))
-        return build_step(design), partial(self.CONTRACT.start, design)
+        step = Step(self.CONTRACT.guard(design), build_core(design)).build()
+        return step, partial(self.CONTRACT.start, design)
 
     def problem(self, model_or_form: Plant | QuasiLPV) -> Problem:
         """Return the linear programme of L, for the given P or the identity.

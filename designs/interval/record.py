@@ -22,6 +22,7 @@ from obsynth.designs.interval.rows import (
     Precision,
     Rows,
     estimate_rows,
+    first_rows,
     measured_rows,
     state_rows,
 )
@@ -69,6 +70,8 @@ class IntervalDesign(Record):
 
     def check(self) -> None:
         """Refuse numbers for which the observer is not defined."""
+        if self.precision == "single" and self.options.get("cuts") not in ((), []):
+            raise CertificateError("the stored design has cuts that single precision does not")
         try:
             _ = self.decoupled, self.S
         except ObsynthError as error:
@@ -126,6 +129,11 @@ class IntervalDesign(Record):
         if self.bound == "vertex":
             return part.vertex_rows()
         return part.paper_rows(exact(self.nominal))
+
+    @cached_property
+    def first_rows(self) -> Rows:
+        """Bounds of r for a box of states."""
+        return first_rows(exact(self.P) @ self.decoupled.T2)
 
     @cached_property
     def prediction_rows(self) -> Rows:

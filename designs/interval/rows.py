@@ -293,6 +293,15 @@ def estimate_rows(part: Part, faults: int) -> Rows:
     return _linear(sizes, left @ part.decoupled.W @ part.S, left @ part.decoupled.Phi, noise, more)
 
 
+def first_rows(r: Exact) -> Rows:
+    """Bounds of r x for a box of states x."""
+    sizes = {"x_upper": r.shape[1], "x_lower": r.shape[1], "one": 1}
+    up = {"x_upper": positive(r), "x_lower": -negative(r)}
+    down = {"x_lower": positive(r), "x_upper": -negative(r)}
+    upper, lower, nothing = (_stack(sizes, len(r), parts) for parts in (up, down, {}))
+    return Rows(sizes, (upper,), (lower,), nothing)
+
+
 def measured_rows(part: Part, output: int, component: int) -> Rows:
     """Bounds of one component of r from one row of N12 y = C2 S r + N12 W2 w."""
     Q = part.decoupled.C2 @ part.S

@@ -8,9 +8,10 @@ import pytest
 
 import obsynth as ob
 from obsynth.derive.rigour import nearest
+from obsynth.designs.core.step import Step
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
-from obsynth.designs.interval.step import build_step
+from obsynth.designs.interval.step import build_core
 
 SHRINK = 1.0 - 1e-12
 NOISES = ("uniform", "bang-bang", "corner")
@@ -179,7 +180,7 @@ def mutated(observer, mutate):
     """A step made from the observer's design with one mistake in it."""
     design = IntervalDesign.from_record(observer.record)
     mutate(design)
-    return build_step(design)
+    return Step(observer.certificate.contract.guard(design), build_core(design)).build()
 
 
 def swapped(name):

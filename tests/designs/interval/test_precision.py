@@ -1,15 +1,18 @@
 """The bounds enclose in the floating point in which the step is evaluated."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import obsynth as ob
 from obsynth.derive.rigour import UNIT, exact
+from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.certificate import Certificate
+from obsynth.designs.core.step import Step
 from obsynth.designs.interval.claims import claims
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
-from obsynth.designs.interval.step import build_step, first_box
+from obsynth.designs.interval.step import build_core
 
 BOX = np.tile([0.5, 1.5], (3, 1))
 
@@ -89,8 +92,9 @@ def test_without_widening_double_does_not_enclose(tight_plant, run_many):
     x0, w, f, rho = tight_data(observer.model, np.random.default_rng(3), many, steps)
     box = observer.model.box("w")
     w = np.where(w > box.mean(axis=1), box[:, 1], box[:, 0])
+    step = Step(observer.certificate.contract.guard(design), build_core(design)).build()
     none, sides = np.zeros((0, many)), np.tile([-1.0, 1.0], (2, 1))
-    run = run_many(observer, x0, w, f, rho, lambda k, y: none, sides, step=build_step(design))
+    run = run_many(observer, x0, w, f, rho, lambda k, y: none, sides, step=step)
     assert not run.x_inside().all()
 
 
@@ -109,21 +113,30 @@ def test_a_million_steps_in_single_precision(single, tight_plant, run_many, nump
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_the_first_box_is_rounded_outwards(precision, two_faults):
+def test_the_first_box_is_rounded_outwards(precision, two_faults, numpy_step):
+    """Mutant: the box narrowed, or r taken without its widening."""
     observer = ob.IntervalObserver(precision=precision).design(two_faults)
     design = IntervalDesign.from_record(observer.record)
     box = np.array([[-0.1, 0.3], [0.7, 0.9], [-1 / 3, 1 / 3], [0.1, 0.1], [-2.3, 1.7]])
-    low, high = first_box(design, box)
-    rows = exact(design.P) @ design.decoupled.T2
     kind = np.float64 if precision == "double" else np.float32
-    assert np.array_equal(low.astype(kind), low)
-    assert np.array_equal(high.astype(kind), high)
+    X = Ends(ca.SX.sym("lower", 5), ca.SX.sym("upper", 5))
+    begun = build_core(design).begin(X, Ends.unbounded(1), {})
+    ends = [begun["r_lower"], begun["r_upper"]]
+    first = numpy_step(ca.Function("first", [X.lower, X.upper], ends), kind)
+    low, high = (v[:, 0].astype(float) for v in first(*(box.T.astype(kind)[:, :, None])))
+    rows = exact(design.P) @ design.decoupled.T2
     for i, row in enumerate(rows):
-        ends = [sorted((c * a, c * b)) for c, (a, b) in zip(row, exact(box), strict=True)]
+        ends = [
+            sorted((c * a, c * b))
+            for c, (a, b) in zip(row, exact(box.astype(kind).astype(float)), strict=True)
+        ]
         least, largest = sum(e[0] for e in ends), sum(e[1] for e in ends)
+        size = sum(abs(e) for pair in ends for e in pair)
         assert exact(low)[i] <= least
         assert largest <= exact(high)[i]
-        assert exact(low + np.spacing(np.abs(low).astype(kind)).astype(float) * 2)[i] > least
+        # two rounded sums, of five products and of the widening, no more
+        far = exact(np.array(24 * UNIT[precision])).item() * size
+        assert least - exact(low)[i] < far and exact(high)[i] - largest < far
 
 
 @pytest.mark.parametrize(("units", "holds"), [(6, True), (3, True), (2, False), (0, False)])
