@@ -4,6 +4,7 @@ Every pair of vertices, every half-space, every corner.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -26,6 +27,7 @@ from obsynth.designs.qpv.lmis import (
 )
 from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
+from obsynth.designs.qpv.step import allowance
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.text import write_text
 
@@ -36,6 +38,8 @@ EXACT = "the worst ones also by exact rational LDL'"
 def claims(design: QPVDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     yield from prove_inequalities(design)
+    if design.bounded and allowance(design).proved:
+        yield _rounding(design)
     product = design.fastest_mode * design.Ts
     yield Claim(
         "sampling",
@@ -132,6 +136,19 @@ def _error_set(P: FloatArray, sets: ErrorSets) -> Claim:
         else f"E = {{e'P e <= 1}} lies in the polytope of the error, (20) ({count} half-spaces)",
         proof,
         RUMP,
+    )
+
+
+def _rounding(design: QPVDesign) -> Claim:
+    """Prove that the inequalities hold in E made larger by what rounding adds: P made smaller."""
+    added = allowance(design).value
+    larger = _error_set(design.P * (1.0 - 3.0 * added), design.sets)
+    return replace(
+        larger,
+        name="rounding",
+        statement=f"rounding of the steps adds at most {added:.1e} to the root of V, and E made "
+        "larger by that lies in the polytope of the error",
+        proof=f"interval analysis of the rounding of every instruction; {larger.proof}",
     )
 
 

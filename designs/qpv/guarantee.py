@@ -9,14 +9,14 @@ from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import about_centre
 from obsynth.designs.qpv.claims import undisturbed
 from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.step import measured_schedule
+from obsynth.designs.qpv.step import allowance, measured_schedule
 
 
 def numbers(design: QPVDesign) -> Numbers:
     """Return the gains L1, L2, ... at the vertices of the scheduling, (52), and what they reach."""
     widths = None
     if design.noise is not None:
-        widths = np.sqrt(design.inverse_diagonal) * (1.0 + 2.0**-40)
+        widths = np.sqrt(design.inverse_diagonal) * (1.0 + 2.0**-40 + allowance(design).value)
     elif not design.plant.w:
         widths = np.zeros(len(design.P))
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
@@ -74,11 +74,22 @@ def _claims(design: QPVDesign) -> Iterator[str]:
 
 def _assumptions(design: QPVDesign) -> Iterator[str]:
     plant, noise = design.plant, design.noise
+    held = ", ".join(s.name for s in (*plant.u, *measured_schedule(plant)))
     yield (
-        f"the plant is {plant.name} in continuous time, and the observer is its ode; the step "
-        f"follows it with Runge-Kutta steps of {design.Ts:g} s, short against the fastest mode, "
-        "but what they and holding u, y and theta over a sample add is not bounded"
+        f"the plant is {plant.name} in continuous time, and the observer is its ode. The step "
+        f"holds readings for {design.Ts:g} s: it keeps the guarantee for motions on which "
+        f"{f'{held} do not move within a sample and ' if held else ''}disturbances within their "
+        "ranges explain at every instant both the motion and the reading that is held, so that "
+        "what an output moves within a sample counts as a disturbance of it. What the Runge-Kutta "
+        "formula leaves out of the flow of the ode is not bounded"
     )
+    if design.bounded:
+        added = allowance(design)
+        yield (
+            f"IEEE doubles, rounded to nearest, and inputs within their ranges (1e+06 where there "
+            f"is none): rounding then adds {added.value:.1e} of the error set to the intervals"
+            f"{'' if added.proved else ', which is not proved'}"
+        )
     yield "state and faults stay in the ellipsoid of the region [monitored: status bit 4]"
     yield (
         "e(0) lies in {e'P e <= 1}, as memory0 finds from the ranges it is given, and the step "

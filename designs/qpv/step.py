@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
+from obsynth.designs.core.rounding import cut_box, rounding_bound
+from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import all_finite, largest_level, select, slices
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
@@ -25,6 +28,9 @@ from obsynth.symbolic.text import read_text
 _UP = 1.0 + 2.0**-40
 # What the root of V is at estimates that were placed anew.
 _PLACED = 0.999
+# Of the error set: above it a bound of rounding is no help.
+_USEFUL = 2.0**-20
+_CELLS = 256
 
 
 def memory_sizes(design: QPVDesign) -> dict[str, int]:
@@ -90,8 +96,10 @@ class _Equations:
 
     design: QPVDesign
 
-    def model(self, state: ca.SX, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Right-hand side and output for an augmented state."""
+    def model(
+        self, state: ca.SX, u: ca.SX, theta: ca.SX, w: ca.SX | None = None
+    ) -> tuple[ca.SX, ca.SX]:
+        """Right-hand side and output for an augmented state, w at its middle where not given."""
         plant = self.design.plant
         n = len(plant.x)
         names = [s.name for s in measured_schedule(plant)]
@@ -102,7 +110,7 @@ class _Equations:
             u,
             ca.DM.zeros(0),
             state[n:],
-            ca.DM(self.design.w_centre),
+            ca.DM(self.design.w_centre) if w is None else w,
             ca.DM.zeros(0),
             ca.vertcat(*rho) if rho else ca.DM.zeros(0),
         )
@@ -206,10 +214,10 @@ class _Sizes:
         )
 
 
-def _inside_region(sizes: _Sizes, offset: ca.SX, level: ca.SX) -> ca.SX:
-    """Whether offset + {e'P e <= level} lies in the ellipsoid X - c, by the triangle inequality."""
+def _inside_region(sizes: _Sizes, offset: ca.SX, reach: ca.SX) -> ca.SX:
+    """Whether offset + {e'P e <= reach^2} lies in the ellipsoid X - c: triangle inequality."""
     distance = ca.sqrt(_form(sizes.inverse_Q, offset))
-    return distance + ca.sqrt(level) * sizes.region <= 1.0
+    return distance + reach * sizes.region <= 1.0
 
 
 def build_core(design: QPVDesign) -> Core:
@@ -219,11 +227,12 @@ def build_core(design: QPVDesign) -> Core:
     is expected, which says nothing of V from then on: the bound begins anew.
     """
     n, m = len(design.plant.x), len(design.plant.output)
-    equations, sizes = _Equations(design), _Sizes.of(design)
+    equations, sizes, follow = _Equations(design), _Sizes.of(design), build_update(design)
+    added = allowance(design).value
 
     def run(seen: Seen) -> Known:
         state = ca.vertcat(seen.memory["xhat"], seen.memory["fhat"])
-        gain, scheduled = equations.gain(seen.u, seen.theta)
+        scheduled = equations.gain(seen.u, seen.theta)[1]
         expected = equations.model(state, seen.u, seen.theta)[1]
         y = seen.readings(expected)
         offset = state - ca.DM(design.region.c)
@@ -231,14 +240,14 @@ def build_core(design: QPVDesign) -> Core:
         if design.reset < 1.0:
             level = ca.fmin(level, _region_level(design, offset))
         certified = ca.logic_and(level <= 1.0, scheduled)
-        reach = ca.sqrt(level) if design.bounded else ca.SX(1)
+        reach = ca.sqrt(level) + added if design.bounded else ca.SX(1)
         consistent = ca.SX(1)
         for i in range(m):
             if np.isfinite(sizes.noise[i]):
                 allowed = reach * sizes.reach[i] + sizes.noise[i] + 2.0**-40 * ca.fabs(y[i])
                 fits = ca.fabs(y[i] - expected[i]) <= allowed
                 consistent = ca.logic_and(consistent, fits)
-        in_region = _inside_region(sizes, offset, level if design.bounded else ca.SX(0))
+        in_region = _inside_region(sizes, offset, reach if design.bounded else ca.SX(0))
         x = f = None
         if design.bounded:
             half = ca.DM(sizes.half) * reach
@@ -246,9 +255,7 @@ def build_core(design: QPVDesign) -> Core:
             found = Ends(state - half, state + half).where(certified, Ends.unbounded(state.numel()))
             x = Ends(found.lower[:n], found.upper[:n])
             f = Ends(found.lower[n:], found.upper[n:])
-        after = _runge_kutta(
-            lambda value: equations.rate(value, seen.u, y, seen.theta, gain), state, design.Ts
-        )
+        after = follow(state, seen.u, y, seen.theta)
         going = all_finite(after)
         after = select(going, after, state)
         moved = {"xhat": after[:n], "fhat": after[n:], "level": equations.next_level(level)}
@@ -317,6 +324,59 @@ def _region_level(design: QPVDesign, offset: ca.SX) -> ca.SX:
     rounding = 2.0**-44 * _length(design, offset) ** 2
     away = ca.sqrt(ca.fmax(_form(design.P, offset), 0.0) + rounding) + design.reset
     return away * away * _UP
+
+
+def build_update(design: QPVDesign) -> ca.Function:
+    """(state, u, y, theta) -> the estimates one sample later, by a Runge-Kutta step."""
+    equations, inputs = _Equations(design), _symbols(design.plant)
+    state = ca.SX.sym("state", len(design.P))
+    u, y, theta = inputs["u"], inputs["y"], inputs["theta"]
+    gain = equations.gain(u, theta)[0]
+    after = _runge_kutta(lambda value: equations.rate(value, u, y, theta, gain), state, design.Ts)
+    return ca.Function("update", [state, u, y, theta], [after], ["state", *inputs], ["after"])
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What rounding adds to the root of V over all steps, whether that is proved, and in one."""
+
+    value: float
+    proved: bool
+    rho: float = np.inf
+
+
+@functools.lru_cache(maxsize=8)
+def allowance(design: QPVDesign) -> Allowance:
+    """Bound what rounding of the steps adds to the root of V.
+
+    One step as it runs is off by delta, elementwise, from the Runge-Kutta step of real numbers, for
+    estimates of a state in X with an error in E. With V' <= rate (limit - V) the root of the bound
+    of V shrinks differences by exp(-rate Ts / 2) a step, so that
+
+        V^1/2 <= level^1/2 + rho / (1 - exp(-rate Ts / 2)) ,    rho = sup (delta'P delta)^1/2 .
+    """
+    plant, equations = design.plant, _Equations(design)
+    half = design.region.half_widths + 1.01 * np.sqrt(design.inverse_diagonal)
+    cells = cut_box(
+        design.region.c[:, None] + half[:, None] * [-1.0, 1.0],
+        max(1, min(16, int(_CELLS ** (1.0 / len(half))))),
+    )
+    ranges = {kind: finite_box(plant, kind).reshape(-1, 2) for kind in ("u", "rho", "w")}
+    ranges["theta"] = ranges.pop("rho")[[s.measured for s in plant.rho]]
+    box = {"state": cells, **{k: (v[:, :1], v[:, 1:]) for k, v in ranges.items()}}
+    inputs = {"state": ca.SX.sym("state", len(half)), **_symbols(plant)}
+    inputs["y"] = ca.SX.sym("w", len(plant.w))
+    shown = equations.model(inputs["state"], inputs["u"], inputs["theta"], inputs["y"])[1]
+    names = ["state", "u", "w", "theta"]
+    size = rounding_bound(ca.Function("y", [*inputs.values()], [shown], names, ["y"]), box)[
+        "y"
+    ].size
+    box["y"] = -size[:, None], size[:, None]
+    delta = rounding_bound(build_update(design), box)["after"].error
+    rho = float(np.sqrt(delta @ np.abs(design.P) @ delta)) * _UP
+    shrinks = -float(np.expm1(-0.5 * equations.level_rate()[0] * design.Ts))
+    value = rho / shrinks * _UP if shrinks > 0.0 else np.inf
+    return Allowance(value, True, rho) if value <= _USEFUL else Allowance(2.0**-40, False)
 
 
 def _runge_kutta(rate: Callable[[ca.SX], ca.SX], state: ca.SX, step: float) -> ca.SX:
