@@ -1,0 +1,323 @@
+"""Lifted intervals never miss an exact value, and are as narrow as the rules of the derivations."""
+
+import casadi as ca
+import mpmath as mp
+import numpy as np
+import pytest
+
+from obsynth.derive.intervals.graph import Node
+from obsynth.derive.intervals.program import Program, evaluate
+from obsynth.derive.intervals.rules import RULES
+from obsynth.designs.core import lifted
+from obsynth.designs.core.lifted import FAR, Lifted, Rounding, lift
+
+PRECISION = 400
+WHOLE, NEAR, UP, DOWN, OPEN = (-FAR, FAR), (-3.0, 5.0), (0.5, 3.0), (-3.0, -0.5), (-2.0, 0.0)
+SIGNS = (WHOLE, NEAR, UP, DOWN, OPEN, (0.0, 4.0))
+PAIRS = [(a, b) for a in SIGNS for b in SIGNS]
+TRUTHS = ((0.0, 1.0),)
+CHOICES = [(*TRUTHS, a, b) for a, b in ((NEAR, NEAR), (UP, DOWN), (WHOLE, WHOLE))]
+ROUNDED = [
+    *("add", "subtract", "multiply", "divide", "power_int", "power_const", "power", "sqrt"),
+    *("hypotenuse", "arctangent2", "exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh"),
+    *("asinh", "acosh", "atanh", "asin", "atan", "erf", "sine", "cosine", "tangent"),
+]
+
+
+def one(*ranges):
+    return [(r,) for r in ranges]
+
+
+# operation: the ranges of its operands for which it is tried, its value
+OPERATIONS = {
+    "add": (PAIRS, lambda a, b: a + b),
+    "subtract": (PAIRS, lambda a, b: a - b),
+    "multiply": (PAIRS, lambda a, b: a * b),
+    "divide": (PAIRS, lambda a, b: a / b),
+    "negate": (one(*SIGNS), lambda a: -a),
+    "twice": (one(*SIGNS), lambda a: 2 * a),
+    "sqrt": (one((0.0, 4.0), (0.0, FAR), UP), mp.sqrt),
+    "nonnegative": (one((0.0, 4.0), UP), lambda a: a),
+    "absolute": (one(*SIGNS), abs),
+    "minimum": (PAIRS, min),
+    "maximum": (PAIRS, max),
+    "meet": (PAIRS, lambda a, b: a),
+    "with_zero": (one(*SIGNS), lambda a: a),
+    "power_const": ([(r, (p, p)) for r in (UP, (0.0, 4.0)) for p in (1.5, 2.25, 0.3)], mp.power),
+    "power": ([(UP, NEAR), (UP, UP), ((0.01, 30.0), DOWN)], mp.power),
+    "select": (CHOICES, lambda c, a, b: a if c else b),
+    "if_else_zero": ([c[:2] for c in CHOICES], lambda c, a: a if c else mp.mpf(0)),
+    "less": (PAIRS, lambda a, b: mp.mpf(a < b)),
+    "less_equal": (PAIRS, lambda a, b: mp.mpf(a <= b)),
+    "boundary_weight": (PAIRS, lambda a, b: mp.mpf(a < b) if a != b else mp.mpf("0.5")),
+    "logical_not": ([TRUTHS], lambda a: mp.mpf(not a)),
+    "conjunction": ([TRUTHS * 2], min),
+    "disjunction": ([TRUTHS * 2], max),
+    "hypotenuse": (PAIRS, mp.hypot),
+    "arctangent2": ([(NEAR, UP), (UP, WHOLE), (DOWN, NEAR), (WHOLE, (0.5, FAR))], mp.atan2),
+    "exp": (one(NEAR, UP, DOWN, (-700.0, 700.0), WHOLE), mp.exp),
+    "expm1": (one(NEAR, UP, (-50.0, 50.0)), mp.expm1),
+    "log": (one(UP, (1e-300, FAR), (0.0, 4.0)), mp.log),
+    "log1p": (one(UP, (-0.9, 4.0), (0.0, FAR)), mp.log1p),
+    "sinh": (one(NEAR, UP, (-200.0, 200.0)), mp.sinh),
+    "cosh": (one(NEAR, UP, DOWN, (-200.0, 200.0)), mp.cosh),
+    "tanh": (one(NEAR, UP, WHOLE), mp.tanh),
+    "asinh": (one(NEAR, UP, WHOLE), mp.asinh),
+    "acosh": (one((1.0, 3.0), (1.0, FAR)), mp.acosh),
+    "atanh": (one((-0.9, 0.9), (0.2, 0.7)), mp.atanh),
+    "asin": (one((-1.0, 1.0), (0.2, 0.7)), mp.asin),
+    "atan": (one(NEAR, UP, WHOLE), mp.atan),
+    "erf": (one(NEAR, UP, WHOLE), mp.erf),
+    "sine": (one(NEAR, (0.2, 0.7), (-1e3, 1e3), WHOLE), mp.sin),
+    "cosine": (one(NEAR, (0.2, 0.7), (-1e3, 1e3), WHOLE), mp.cos),
+    "tangent": (one((-1.5, 1.5), (0.2, 0.7), (1.6, 4.7)), mp.tan),
+}
+POWERS = {n: (one(*SIGNS[1:]), lambda a, n=n: a**n) for n in (2, 3, 4, 5)}
+CASES = {**OPERATIONS, **{f"power_int {n}": case for n, case in POWERS.items()}}
+
+
+def test_every_form_is_tried():
+    assert {name.split()[0] for name in CASES} == set(lifted._FORMS)
+    assert set(ROUNDED) <= set(lifted._FORMS)
+
+
+def drawn(rng, ranges, count):
+    """Ends inside of ranges: anywhere, of any size, one number, whole range, near crests."""
+    low, high = np.clip(ranges, -1e40, 1e40)
+    shape = (2, count)
+    found = rng.uniform(low, high, shape) if high - low < 1e6 else rng.normal(0.0, 50.0, shape)
+    sizes = 10.0 ** rng.uniform(-30, 2, shape) * rng.choice([-1.0, 1.0], shape)
+    found = np.where(rng.uniform(size=count) < 0.2, sizes, found)
+    crests = 0.5 * np.pi * rng.integers(-12, 13, shape)
+    found = np.where(rng.uniform(size=shape) < 0.1, crests, found)
+    found = np.where(rng.uniform(size=shape) < 0.05, np.array([[low], [high]]), found)
+    if ranges == (0.0, 1.0):
+        found = np.round(np.abs(found)) % 2
+    found = np.sort(np.clip(found, low, high), axis=0)
+    return np.where(rng.uniform(size=count) < 0.1, found[:1], found)
+
+
+def code(op, number, ranges, rounding):
+    """One operation as a function of the ends of its operands."""
+    ends = [(ca.SX.sym("l"), ca.SX.sym("h")) for _ in ranges]
+    operands = [Lifted(*pair, *given) for pair, given in zip(ends, ranges, strict=True)]
+    found = lifted._Arithmetic(rounding).apply(Node(op, (), number), operands)
+    return ca.Function("f", [e for pair in ends for e in pair], [found.lower, found.upper])
+
+
+def run(function, boxes):
+    given = [end[None, :] for box in boxes for end in box]
+    return [np.array(v).ravel() for v in function(*given)]
+
+
+def points(rng, boxes):
+    """Corners of boxes and points inside of them, tuples of rows of numbers."""
+    for corner in range(2 ** len(boxes)):
+        yield [box[(corner >> i) & 1] for i, box in enumerate(boxes)]
+    for _ in range(2):
+        share = [rng.uniform(size=box.shape[1]) for box in boxes]
+        inner = [b[0] + s * (b[1] - b[0]) for b, s in zip(boxes, share, strict=True)]
+        yield [np.clip(v, *b) for v, b in zip(inner, boxes, strict=True)]
+
+
+def missed(case, count=10, rounding=None, seed=0):
+    """Return how many exact values are outside of a lifted operation, and the ends it gave."""
+    rng = np.random.default_rng(seed)
+    op, _, number = case.partition(" ")
+    tried, value = CASES[case]
+    outside, ends = 0, []
+    for ranges in tried:
+        boxes = [drawn(rng, r, count) for r in ranges]
+        if op == "meet":
+            boxes[1] = np.sort([np.clip(boxes[0][0], *ranges[1]), boxes[1][1]], axis=0)
+        low, high = run(code(op, int(number or 0), ranges, rounding or Rounding()), boxes)
+        ends.append((ranges, boxes, low, high))
+        truths = [
+            (b == 0.0) | (b == 1.0) for r, b in zip(ranges, boxes, strict=True) if r in TRUTHS
+        ]
+        assert all(t.all() for t in truths)
+        with mp.workprec(PRECISION):
+            for numbers in points(rng, boxes):
+                for k in range(count):
+                    given = [mp.mpf(float(v[k])) for v in numbers]
+                    if op == "divide" and given[1] == 0:
+                        continue
+                    if op == "meet" and not boxes[1][0][k] <= given[0] <= boxes[1][1][k]:
+                        continue
+                    if any(
+                        r in TRUTHS and g not in (0, 1) for r, g in zip(ranges, given, strict=True)
+                    ):
+                        continue
+                    try:
+                        exact = value(*given)
+                    except (ValueError, ZeroDivisionError):
+                        continue
+                    if abs(exact) < FAR:  # what is beyond counts as FAR
+                        outside += not low[k] <= exact <= high[k]
+    return outside, ends
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_exact_value_is_outside(case):
+    outside, _ = missed(case)
+    assert outside == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_ends_are_those_of_the_rules(case):
+    """To some units in the last place, wherever the rules know an end."""
+    op, _, number = case.partition(" ")
+    extra = (int(number),) if number else ()
+    for ranges, boxes, low, high in missed(case, seed=1)[1]:
+        with np.errstate(all="ignore"):
+            rule = RULES[op](*(tuple(b) for b in boxes), *extra)
+        apart = True if op != "divide" else (boxes[1][0] > 0) | (boxes[1][1] < 0)
+        for got, wanted in zip((low, high), rule, strict=True):
+            known = np.isfinite(wanted) & (np.abs(wanted) < FAR) & apart
+            size = np.maximum(np.abs(got), np.abs(wanted))
+            near = np.abs(got - wanted) <= 64 * 2.0**-53 * size + 1e-300
+            assert near[known].all(), ranges
+            assert known.any()
+
+
+class _NoStep(Rounding):
+    step = 0.0
+    tiny = 0.0
+
+
+@pytest.mark.parametrize("op", ROUNDED)
+def test_without_the_step_over_rounding_values_are_missed(op):
+    """Mutant: ends as floating point has them."""
+    assert missed("power_int 3" if op == "power_int" else op, rounding=_NoStep())[0] > 0
+
+
+def swapped(a, b):
+    """Mutant: where both signs are known the ends are taken the wrong way round."""
+    lower, upper = product(a, b)
+    known = (a.low >= 0.0 or a.high <= 0.0) and (b.low >= 0.0 or b.high <= 0.0)
+    return (upper, lower) if known else (lower, upper)
+
+
+def unlike(a, b):
+    """Mutant: the sign of the second factor is not asked."""
+    if a.low >= 0.0:
+        return a.lower * b.lower, a.upper * b.upper
+    return product(a, b)
+
+
+product = lifted._product
+
+
+def without_zero(self, args, low, high, n):
+    squares = [end * end for end in (args[0].lower, args[0].upper)]
+    return self.rounding.interval(ca.fmin(*squares), ca.fmax(*squares), low, high)
+
+
+@pytest.mark.parametrize("mutant", [swapped, unlike])
+def test_a_case_of_signs_that_is_wrong_is_seen(mutant, monkeypatch):
+    monkeypatch.setattr(lifted, "_product", mutant)
+    assert missed("multiply")[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("case", "name", "mutant"),
+    [
+        ("sine", "_may_cross", lambda self, a, phase: False),
+        ("cosine", "_crosses", lambda self, a, phase: ca.SX(0)),
+        ("power_int 2", "power_int", without_zero),
+        (
+            "subtract",
+            "subtract",
+            lambda self, a, low, high: lifted._Arithmetic.add(
+                self, [a[0], Lifted(-a[1].lower, -a[1].upper, -a[1].low, -a[1].high)], low, high
+            ),
+        ),
+    ],
+)
+def test_other_wrong_forms_are_seen(case, name, mutant, monkeypatch):
+    """Mutants: crests forgotten; no zero in a square; the ends of b not exchanged."""
+    monkeypatch.setattr(lifted._Arithmetic, name, mutant)
+    if name in lifted._FORMS:
+        monkeypatch.setitem(lifted._FORMS, name, mutant)
+    assert missed(case)[0] > 0
+
+
+# -- programs ----------------------------------------------------------------------------------
+
+UNARY = [
+    (ca.sin, mp.sin),
+    (ca.cos, mp.cos),
+    (ca.tanh, mp.tanh),
+    (ca.atan, mp.atan),
+    (ca.fabs, abs),
+    (lambda a: a * a, lambda a: a * a),
+    (lambda a: a**3, lambda a: a**3),
+    (lambda a: ca.sqrt(1 + a * a), lambda a: mp.sqrt(1 + a * a)),
+    (lambda a: ca.log(2 + ca.sin(a)), lambda a: mp.log(2 + mp.sin(a))),
+    (lambda a: ca.exp(ca.sin(a)), lambda a: mp.exp(mp.sin(a))),
+    (lambda a: a / (3 + ca.cos(a)), lambda a: a / (3 + mp.cos(a))),
+    (lambda a: 0.375 - 1.5 * a, lambda a: mp.mpf(0.375) - mp.mpf(1.5) * a),
+]
+BINARY = [
+    (lambda a, b: a + b, lambda a, b: a + b),
+    (lambda a, b: a - b, lambda a, b: a - b),
+    (lambda a, b: a * b, lambda a, b: a * b),
+    (ca.fmin, min),
+    (ca.fmax, max),
+    (lambda a, b: ca.if_else(a < b, 2 * a, b - 1), lambda a, b: 2 * a if a < b else b - 1),
+]
+
+
+def written(rng, depth):
+    """A random expression as CasADi and as mpmath functions of x."""
+    if depth == 0:
+        j = int(rng.integers(3))
+        return (lambda x: x[j]), (lambda x: x[j])
+    if rng.uniform() < 0.45:
+        (f, g), (a, b) = UNARY[rng.integers(len(UNARY))], written(rng, depth - 1)
+        return (lambda x: f(a(x))), (lambda x: g(b(x)))
+    f, g = BINARY[rng.integers(len(BINARY))]
+    (a, b), (c, d) = written(rng, depth - 1), written(rng, depth - 1)
+    return (lambda x: f(a(x), c(x))), (lambda x: g(b(x), d(x)))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_programs(seed):
+    """No value outside; ends within 1e-9 of those that the rules give for the same boxes."""
+    rng = np.random.default_rng(seed)
+    ranges, count = (NEAR, UP, (-2.0, 0.5)), 12
+    in_code, exact = zip(*(written(rng, 5) for _ in range(4)), strict=True)
+    x = ca.SX.sym("x", 3)
+    program = Program.from_casadi(ca.Function("p", [x], [f(x) for f in in_code]))
+    low, high = ca.SX.sym("low", 3), ca.SX.sym("high", 3)
+    variables = [Lifted(low[i], high[i], *r) for i, r in enumerate(ranges)]
+    found = lift(program, program.outputs, variables)
+    function = ca.Function(
+        "f",
+        [low, high],
+        [
+            ca.vertcat(*e)
+            for e in ([ca.SX(o.lower) for o in found], [ca.SX(o.upper) for o in found])
+        ],
+    )
+    boxes = np.array(
+        [
+            np.sort(
+                rng.uniform(*r, (2, count)) if k % 2 else np.array(r)[:, None] + np.zeros(count),
+                axis=0,
+            )
+            for k, r in enumerate(ranges)
+        ]
+    )
+    got = [np.array(v) for v in function(boxes[:, 0], boxes[:, 1])]
+    with np.errstate(all="ignore"):
+        rules = evaluate(program, boxes[:, 0], boxes[:, 1], list(range(len(found))))
+    for ends, wanted in zip(got, rules, strict=True):
+        size = np.abs(np.array(rules)).max(axis=0)
+        assert np.all(np.abs(ends - wanted) <= 1e-9 * (1.0 + size))
+    with mp.workprec(PRECISION):
+        for numbers in points(rng, list(boxes)):
+            for k in range(count):
+                given = [mp.mpf(float(v[k])) for v in numbers]
+                for i, value in enumerate(exact):
+                    assert got[0][i, k] <= value(given) <= got[1][i, k]
