@@ -16,12 +16,13 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
     lift,
 )
-from obsynth.designs.bounded_error.model import Derived, noise_box
+from obsynth.designs.bounded_error.model import Derived, Limits, noise_box
 from obsynth.designs.bounded_error.peak.design import prove_peak_claims
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
-from obsynth.designs.bounded_error.rounding import Limits, of_matrices, prove_rounding, step_error
+from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.lmi import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
@@ -242,7 +243,8 @@ def guarantee(design: UioDesign) -> Guarantee:
     names = (*design.plant.names("x"), *design.plant.names("f"))
     where = ", ".join(
         f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}"
-        for s in design.plant.x
+        for s, curved in zip(design.plant.x, curved_states(design.plant), strict=True)
+        if curved
     )
     noise = ", ".join(
         f"{name} in [{low:g}, {high:g}]"
@@ -254,13 +256,13 @@ def guarantee(design: UioDesign) -> Guarantee:
     )
     kind = "ellipsoidal" if isinstance(design.bound, EllipsoidBound) else "peak"
     claims = [
-        f"{', '.join(names)} lie inside the returned ({kind}) intervals at every k >= 0",
+        f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds",
     ]
     if design.plant.d:
         claims.append(f"whatever {', '.join(design.plant.names('d'))} does")
     assumptions = [
         f"the plant is {design.plant.name} in discrete time with Ts = {design.plant.Ts:g}",
-        f"state and estimate stay in the box: {where} [monitored: status bit 4]",
+        *([f"{where} [monitored in part: status bit 8]"] if where else []),
         "the first state and fault lie in the boxes given to memory0",
     ]
     if noise:

@@ -1,7 +1,7 @@
 """From a model to the numeric data of the method, structural conditions first."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,7 +10,9 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.record import Fading, PeakData, UioDesign
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import PlantClass
+from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -89,9 +91,34 @@ CLASS = PlantClass(
         "x": " has no finite range, so the Jacobian cannot be bounded; declare it with "
         "range=(lower, upper)",
     },
+    linear=True,
 )
 # Relative to the largest magnitude of each state: a few thousand roundings of one step.
 ROUNDING = 2.0**-40
+
+
+class Limits(NamedTuple):
+    """Where a bound goes on: boxes of states and their estimates, of faults, of inputs.
+
+    Shapes (n, 2), (n_f, 2), (n_u, 2). States on which a derivative depends keep to their ranges,
+    which the guarantee asks for anyway. Others, and faults, may leave theirs by its width on either
+    side, and where no range is declared `LARGEST_SIGNAL` stands for it.
+    """
+
+    x: FloatArray
+    f: FloatArray
+    u: FloatArray
+
+    @classmethod
+    def of(cls, plant: Plant) -> "Limits":
+        """Read the limits of a plant."""
+        x, f, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xfu")
+        return cls(np.where(curved_states(plant)[:, None], x, _wider(x)), _wider(f), u)
+
+
+def _wider(box: FloatArray) -> FloatArray:
+    wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
+    return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +198,7 @@ def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:
     2^-40 of the largest magnitude of the states (or 1), and the share of the
     unknown input that rounding leaves in the error.
     """
-    size = max(1.0, float(np.abs(model.box("x")).max()))
+    size = max(1.0, float(np.abs(finite_box(model, "x")).max()))
     d_box = model.box("d")
     share = residual * float(np.abs(d_box).sum()) * 2.0 if residual > 0 else 0.0
     return np.full(len(model.x) + len(model.f), ROUNDING * size + share)

@@ -13,21 +13,19 @@ All of it is at most `UioDesign.rounding`, which bounds and recursions count as 
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import ExactMatrix
 from obsynth.derive.structure.conditions import decouple
-from obsynth.designs.bounded_error.model import rounding_allowance
+from obsynth.designs.bounded_error.model import Limits, rounding_allowance
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.rounding import cut_box, rounding_bound
-from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
-from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import BoolArray, FloatArray
+from obsynth.designs.core.signals import finite_box
+from obsynth.symbolic.arrays import FloatArray
 
 CELLS = 256
 # Of the magnitude of the states: above it a bound is no help, and an assumption more honest.
@@ -36,38 +34,6 @@ USEFUL = 2.0**-30
 UP = 1.0 + 2.0**-40
 # What is stored above what was found, so that another library finds it proved too.
 ROOM = 1.0 + 2.0**-10
-
-
-class Limits(NamedTuple):
-    """Where rounding is bounded: boxes of states and their estimates, of faults, of inputs.
-
-    Shapes (n, 2), (n_f, 2), (n_u, 2). States on which a derivative depends keep to their ranges,
-    which the guarantee asks for anyway. Others, and faults, may leave theirs by its width on either
-    side, and where no range is declared `LARGEST_SIGNAL` stands for it.
-    """
-
-    x: FloatArray
-    f: FloatArray
-    u: FloatArray
-
-    @classmethod
-    def of(cls, plant: Plant) -> "Limits":
-        """Read the limits of a plant."""
-        x, f, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xfu")
-        return cls(np.where(_curved(plant)[:, None], x, _wider(x)), _wider(f), u)
-
-
-def _wider(box: FloatArray) -> FloatArray:
-    width = np.diff(box, axis=1)
-    return np.clip(box + width * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
-
-
-def _curved(plant: Plant) -> BoolArray:
-    """Tell on which states a derivative depends, (n,)."""
-    given = [ca.SX.sym(kind, len(plant.names(kind))) for kind in ("x", "u", "d", "f", "w")]
-    rows = ca.vertcat(*plant.function()(*given, ca.SX(0, 1), ca.SX(0, 1)))
-    slopes = ca.jacobian(rows, ca.vertcat(*given))
-    return np.array(ca.which_depends(ca.vec(slopes), given[0], 1, False), dtype=bool).ravel()
 
 
 def _through(design: UioDesign, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -173,7 +139,7 @@ def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
     that older designs have is then an assumption.
     """
     step = of_step(design)
-    size = max(1.0, float(np.abs(design.plant.box("x")).max()))
+    size = max(1.0, float(np.abs(finite_box(design.plant, "x")).max()))
     if np.all(step <= USEFUL * size):
         return step, True
     return rounding_allowance(design.plant, decouple(design.C, design.D).residual), False

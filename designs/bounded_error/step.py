@@ -1,4 +1,4 @@
-"""What runs: equations (10)-(12), half-width recursions (33)-(36) and their first values."""
+"""What runs: equations (10)-(12), half-width recursions (33)-(36) and how they begin."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.lmis import kept_coordinates
+from obsynth.designs.bounded_error.model import Limits
 from obsynth.designs.bounded_error.peak.design import peak_data
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.stepping import (
-    all_finite,
-    clip,
-    finite_or,
-    inside,
-    largest_level,
-    make_step,
-    select,
-    slices,
-    status_word,
-)
+from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
@@ -38,9 +32,6 @@ class RuntimeBound:
     The half widths are ``sqrt(reach s) + add`` if `root` is set (ellipsoids, eqs. (35)-(36), one s
     per component) and ``reach s + add`` otherwise (peak bounds, see `Fading`). Shapes: decay
     (k, k), offset (k,), reach (n + n_f, k), add (n + n_f,).
-
-    reset: value of s that holds whenever the state, the fault and their estimates lie in the
-        declared boxes; infinite where no such box is declared
     """
 
     decay: FloatArray
@@ -48,7 +39,6 @@ class RuntimeBound:
     reach: FloatArray
     add: FloatArray
     root: bool
-    reset: FloatArray
 
     def half_widths(self, s: FloatArray) -> FloatArray:
         """Return the half widths that belong to a value of s."""
@@ -66,46 +56,6 @@ def noise_offset(design: UioDesign) -> FloatArray:
     """Return the bound of ``E W2 w_k``, which separates e from zeta, shape (n,)."""
     bound: FloatArray = np.abs(design.E) @ (np.abs(design.W2) @ design.w_radius) * UP
     return bound
-
-
-class StartBox:
-    """Where the error can be at k = 0, as boxes of zeta, e and e_f.
-
-    z0 (n,)
-    x_range (n, 2)
-    fhat0 (n_f,)
-    f_range (n_f, 2)
-    """
-
-    def __init__(
-        self,
-        design: UioDesign,
-        z0: FloatArray,
-        x_range: FloatArray,
-        fhat0: FloatArray,
-        f_range: FloatArray,
-    ) -> None:
-        middle, radius = x_range.mean(axis=1), 0.5 * (x_range[:, 1] - x_range[:, 0])
-        reach = np.abs(design.T) @ (np.abs(middle) + radius) + np.abs(z0)
-        slack = 2.0**-44 * reach
-        spread = np.abs(design.T) @ radius + slack
-        centre = design.T @ middle - z0
-        noise = noise_offset(design)
-        self.zeta = (centre - spread, centre + spread)
-        self.e = (self.zeta[0] - noise, self.zeta[1] + noise)
-        self.e_f = (f_range[:, 0] - fhat0, f_range[:, 1] - fhat0)
-
-    def xi(self, design: UioDesign, error: str) -> tuple[FloatArray, FloatArray]:
-        """Box of the error coordinates, (lower, upper)."""
-        if error == "plain":
-            sides = self.e
-        else:
-            kept = kept_coordinates(design.T)
-            sides = (self.zeta[0][kept], self.zeta[1][kept])
-        return (
-            np.concatenate([sides[0], self.e_f[0]]),
-            np.concatenate([sides[1], self.e_f[1]]),
-        )
 
 
 def _component_map(design: UioDesign, bound: EllipsoidBound) -> list[int | None]:
@@ -131,8 +81,6 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
     add = design.rounding * UP
     if bound.error == "shifted":
         add[:n] += noise_offset(design)
-    reset = np.full(size, np.inf)
-    box = reset_box(design)
     for i, component in enumerate(_component_map(design, bound)):
         if component is None:
             continue
@@ -144,27 +92,7 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
         decay[i] = (1.0 - gamma) * (1.0 + rho) * UP
         offset[i] = (gamma * (1.0 + rho) + rho + rho**2) * UP
         scale[i] = bound.inverse_diagonal[component] * UP
-        if box is not None:
-            reset[i] = largest_level(P, *box.xi(design, bound.error))
-    return RuntimeBound(np.diag(decay), offset, np.diag(scale), add, True, reset)
-
-
-def reset_box(design: UioDesign) -> StartBox | None:
-    """Return the errors when state, fault and their estimates lie in their declared boxes."""
-    x_box, f_box = design.plant.box("x"), design.plant.box("f")
-    if not (np.isfinite(x_box).all() and np.isfinite(f_box).all()):
-        return None
-    if isinstance(design.bound, EllipsoidBound) and design.bound.error == "shifted":
-        # zeta has to lie in the range of T, which a missing measurement does not keep.
-        return None
-    width, f_width = np.diff(x_box)[:, 0], np.diff(f_box)[:, 0]
-    n, n_f = design.A.shape[0], design.rate.size
-    box = StartBox(design, np.zeros(n), np.zeros((n, 2)), np.zeros(n_f), np.zeros((n_f, 2)))
-    noise = noise_offset(design)
-    box.e = (-width, width)
-    box.zeta = (-width - noise, width + noise)
-    box.e_f = (-f_width, f_width)
-    return box
+    return RuntimeBound(np.diag(decay), offset, np.diag(scale), add, True)
 
 
 def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
@@ -177,72 +105,26 @@ def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) ->
         )
 
 
-def first_levels(design: UioDesign, box: StartBox) -> FloatArray:
-    """Return V_0 of every component's ellipsoid for a box of first errors, delta of (48)."""
-    bound = ellipsoid_of(design)
-    lower, upper = box.xi(design, bound.error)
-    levels = [largest_level(P, lower, upper) for P in bound.P]
-    components = _component_map(design, bound)
-    return np.array([0.0 if c is None else levels[bound.shape_of(c)] for c in components])
-
-
-def first_fading(design: UioDesign, box: StartBox) -> FloatArray:
-    """Return the first s of peak bounds for a box of first errors, see `Fading`."""
-    zeta, e_f = (np.max(np.abs(sides), axis=0) for sides in (box.zeta, box.e_f))
-    first: FloatArray = peak_data(design).fading.start @ np.concatenate([zeta, e_f]) * UP
-    return first
-
-
 def peak_runtime(design: UioDesign) -> RuntimeBound:
     """Return the recursion of what the first error adds to the peak bounds.
 
     Underflow of its products is far below the rounding that `add` counts a second time.
     """
     bound = peak_data(design)
-    fading, box = bound.fading, reset_box(design)
-    count = len(fading.G)
+    fading = bound.fading
     return RuntimeBound(
         decay=fading.G * UP,
-        offset=np.zeros(count),
+        offset=np.zeros(len(fading.G)),
         reach=fading.reach * UP,
         add=(bound.b[: len(fading.reach)] + design.rounding) * ROUND_UP,
         root=False,
-        reset=np.full(count, np.inf) if box is None else first_fading(design, box),
     )
-
-
-def memory_sizes(design: UioDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
-
-    ``z`` (10), ``fhat`` (12), ``bound`` (the s of `RuntimeBound`),
-    ``prediction`` (of the state, used when a measurement is missing) and
-    ``initialised`` (0 or 1).
-    """
-    n, n_f = len(design.A), len(design.rate)
-    ellipsoid = isinstance(design.bound, EllipsoidBound)
-    bound = n + n_f if ellipsoid else len(peak_data(design).fading.G)
-    return {"z": n, "fhat": n_f, "bound": bound, "prediction": n, "initialised": 1}
 
 
 def running_bound(design: UioDesign) -> RuntimeBound:
     """Return how the half widths of a design evolve."""
     ellipsoid = isinstance(design.bound, EllipsoidBound)
     return ellipsoid_runtime(design) if ellipsoid else peak_runtime(design)
-
-
-def first_memory(
-    design: UioDesign, start: Start, z0: ArrayLike | None = None
-) -> dict[str, ArrayLike]:
-    """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
-    x_box, z = start.x, design.T @ start.guess
-    if z0 is not None:
-        z = read_vector(z0, "z0", design.plant.names("x"))
-        if isinstance(design.bound, EllipsoidBound):
-            check_range_of_T(design, design.bound, z)
-    fhat = start.f.mean(axis=1)
-    box = StartBox(design, z, x_box, fhat, start.f)
-    first = first_levels if isinstance(design.bound, EllipsoidBound) else first_fading
-    return {"z": z, "fhat": fhat, "bound": first(design, box), "prediction": start.guess}
 
 
 def equations(design: UioDesign) -> ca.Function:
@@ -265,10 +147,11 @@ def equations(design: UioDesign) -> ca.Function:
     xhat = z - ca.DM(design.E) @ y
     innovation = y - C @ xhat
     # Outside the box the dynamics may not be defined (a level below zero); the
-    # estimate is clipped there so that the recursion stays finite. Inside, where
-    # the guarantee holds, clipping does nothing.
+    # estimate is clipped there so that the recursion stays finite, in coordinates that
+    # enter nonlinearly. Inside, where the bound holds, clipping does nothing.
+    box = np.where(curved_states(model)[:, None], model.box("x"), [-np.inf, np.inf])
     next_state = model.function()(
-        clip(xhat, model.box("x")),
+        clip(xhat, box),
         u,
         ca.DM.zeros(len(model.d)),
         fhat,
@@ -288,73 +171,115 @@ def equations(design: UioDesign) -> ca.Function:
     )
 
 
-def build_step(design: UioDesign) -> ca.Function:
-    """Build `Observer.step` of the bounded-error observer from its `equations`."""
-    bound = running_bound(design)
-    model, C, W2, w_centre = design.plant, design.C, design.W2, design.w_centre
-    n, n_u, n_f, m = len(model.x), len(model.u), len(model.f), C.shape[0]
-    layout = slices(memory_sizes(design))
-    memory = ca.SX.sym("memory", layout["initialised"].stop)
-    u, y = ca.SX.sym("u", n_u), ca.SX.sym("y", m)
-    z, fhat, s, prediction = (memory[layout[k]] for k in ("z", "fhat", "bound", "prediction"))
-    initialised = memory[layout["initialised"]] > 0.5
-    box, f_box = model.box("x"), model.box("f")
+def memory_sizes(design: UioDesign) -> dict[str, int]:
+    """Return the parts of the memory vector.
 
-    y_shifted = y - ca.DM(W2 @ w_centre)
-    y_finite, u_finite = all_finite(y), all_finite(u)
-    expected = ca.DM(C) @ prediction
-    y_used = finite_or(y_shifted, expected)
-    nominal = [0.0 if signal.nominal is None else float(signal.nominal) for signal in model.u]
-    u_used = finite_or(u, nominal)
+    ``z`` (10), ``fhat`` (12), ``bound`` (the s of `RuntimeBound`) and ``prediction`` (of the state,
+    which stands for a reading that is missing).
+    """
+    n, n_f = len(design.A), len(design.rate)
+    ellipsoid = isinstance(design.bound, EllipsoidBound)
+    bound = n + n_f if ellipsoid else len(peak_data(design).fading.G)
+    return {"z": n, "fhat": n_f, "bound": bound, "prediction": n}
 
-    xhat, innovation, next_state, z_next, fhat_next = equations(design)(z, fhat, u_used, y_used)
-    xhat_inside = inside(xhat, xhat, box)
-    fhat_inside = inside(fhat, fhat, f_box)
-    can_reset = ca.logic_and(xhat_inside, fhat_inside)
-    known = ca.logic_and(y_finite, all_finite(s))
-    again = ca.logic_and(y_finite, can_reset) if np.all(np.isfinite(bound.reset)) else ca.SX(0)
-    s_now = select(known, s, ca.SX(bound.reset))
-    have_bound = ca.logic_or(known, again)
-    inner = ca.sparsify(ca.DM(bound.reach)) @ s_now
-    estimate = ca.vertcat(xhat, fhat)
-    half = (ca.sqrt(inner) if bound.root else inner) * ROUND_UP + ca.DM(bound.add)
-    half = half + ULPS * ca.fabs(estimate)
-    valid = ca.logic_and(initialised, have_bound)
-    half = ca.vertcat(*(ca.if_else(valid, half[i], ca.inf) for i in range(n + n_f)))
-    x_lower, x_upper = xhat - half[:n], xhat + half[:n]
-    f_lower, f_upper = fhat - half[n:], fhat + half[n:]
 
-    allowed = ca.DM(np.abs(C)) @ half[:n] + ca.DM(np.abs(W2) @ design.w_radius)
-    consistent = ca.SX(1)
-    for i in range(m):
-        consistent = ca.logic_and(consistent, ca.fabs(innovation[i]) <= allowed[i])
-    status = status_word(
-        {
-            "not_initialised": ca.logic_not(initialised),
-            "non_finite_input": ca.logic_not(ca.logic_and(y_finite, u_finite)),
-            "outside_domain": ca.logic_not(
-                ca.logic_and(inside(x_lower, x_upper, box), xhat_inside)
-            ),
-            "void": ca.logic_not(consistent),
-            "fault_not_valid": ca.logic_not(valid),
+def first_memory(
+    design: UioDesign, start: Start, z0: ArrayLike | None = None
+) -> dict[str, ArrayLike]:
+    """Start at z_0 = T guess, or at a given z_0 as the paper does; y0 is not needed."""
+    z = design.T @ start.guess
+    if z0 is not None:
+        z = read_vector(z0, "z0", design.plant.names("x"))
+        if isinstance(design.bound, EllipsoidBound):
+            check_range_of_T(design, design.bound, z)
+    return {"z": z, "fhat": start.f.mean(axis=1), "prediction": start.guess}
+
+
+def shift(design: UioDesign, x: Ends) -> tuple[ca.SX, ca.SX]:
+    """Return middle and radius of T x for a box of states, rounded outwards, shapes (n, 1)."""
+    T, size = ca.DM(design.T), ca.DM(np.abs(design.T))
+    middle = 0.5 * x.lower + 0.5 * x.upper
+    radius = ca.fmax(x.upper - middle, middle - x.lower)
+    return T @ middle, size @ (radius + 2.0**-44 * (ca.fabs(middle) + radius))
+
+
+def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
+    """Return an s that holds for a state and a fault in boxes, around given z and fhat.
+
+    Peak bounds: one product, see `Fading`. Ellipsoids: the delta of (48), of which
+    ``reach' |P| reach`` is an upper bound.
+    """
+    middle, radius = shift(design, x)
+    z, fhat = kept["z"], kept["fhat"]
+    zeta = ca.fabs(middle - z) * UP + radius + 2.0**-44 * ca.fabs(z)
+    e_f = ca.fmax(f.upper - fhat, fhat - f.lower) * UP
+    if not isinstance(design.bound, EllipsoidBound):
+        return ca.DM(peak_data(design).fading.start * UP) @ ca.vertcat(zeta, e_f)
+    bound = design.bound
+    if bound.error == "plain":
+        reach = ca.vertcat((zeta + ca.DM(noise_offset(design))) * UP, e_f)
+    else:
+        reach = ca.vertcat(*(zeta[i] for i in kept_coordinates(design.T)), e_f)
+    levels = [ca.dot(reach, ca.DM(np.abs(P)) @ reach) * UP for P in bound.P]
+    components = _component_map(design, bound)
+    return ca.vertcat(*(0.0 if c is None else levels[bound.shape_of(c)] for c in components))
+
+
+def build_core(design: UioDesign) -> Core:
+    """Build what the observer knows of its own: `equations`, with half widths around them.
+
+    The next half widths hold while the estimates lie where Jacobians and rounding were bounded. A
+    missing reading moves the estimates like its prediction, and the half widths begin anew.
+    """
+    bound, move = running_bound(design), equations(design)
+    n, C, W2 = len(design.A), ca.DM(design.C), design.W2
+    offset, noise = ca.DM(W2 @ design.w_centre), ca.DM(np.abs(W2) @ design.w_radius)
+    limits, curved = Limits.of(design.plant), curved_states(design.plant)
+    reach, decay = (ca.sparsify(ca.DM(matrix)) for matrix in (bound.reach, bound.decay))
+
+    def pick(one: ca.SX, other: ca.SX) -> ca.SX:
+        return ca.vertcat(*(one[i] if curved[i] else other[i] for i in range(n)))
+
+    def run(seen: Seen) -> Known:
+        z, fhat, s, prediction = (seen.memory[part] for part in memory_sizes(design))
+        y = seen.readings(C @ prediction + offset) - offset
+        xhat, innovation, next_state, z_next, fhat_next = move(z, fhat, seen.u, y)
+        inner = reach @ s
+        half = (ca.sqrt(inner) if bound.root else inner) * ROUND_UP + ca.DM(bound.add)
+        half = half + ULPS * ca.fabs(ca.vertcat(xhat, fhat))
+        x = Ends(xhat - half[:n], xhat + half[:n])
+        f = Ends(fhat - half[n:], fhat + half[n:])
+        allowed = ca.fabs(C) @ half[:n] + noise
+        empty = ca.SX(0)
+        for i in range(allowed.numel()):
+            empty = ca.logic_or(empty, ca.fabs(innovation[i]) > allowed[i])
+        # a state on which a derivative depends is itself in its range by assumption
+        near = inside(pick(xhat, x.lower), pick(xhat, x.upper), limits.x)
+        sound = ca.logic_and(near, inside(fhat, fhat, limits.f))
+        return Known(
+            xhat,
+            fhat,
+            x,
+            f if fhat.numel() else None,
+            {
+                "z": z_next,
+                "fhat": fhat_next,
+                "bound": decay @ s + ca.DM(bound.offset),
+                "prediction": next_state,
+            },
+            sound=sound,
+            empty=empty,
+        )
+
+    def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
+        return {"bound": first_bound(design, x, f, kept)}
+
+    def place(x: Ends, f: Ends, kept: Parts) -> Parts:
+        middle, radius = shift(design, x)
+        return {
+            "z": Ends(middle - radius, middle + radius).nearest(kept["z"]),
+            "fhat": f.nearest(kept["fhat"]),
+            "prediction": x.nearest(kept["prediction"]),
         }
-    )
 
-    s_next = ca.sparsify(ca.DM(bound.decay)) @ s_now + ca.DM(bound.offset)
-    s_next = select(
-        ca.logic_and(have_bound, u_finite), s_next, ca.SX(np.full(len(bound.reset), np.inf))
-    )
-    moved = ca.vertcat(z_next, fhat_next, s_next, next_state, 1)
-    return make_step(
-        {"memory": memory, "u": u, "y": y},
-        {
-            "memory": select(initialised, moved, memory),
-            "xhat": xhat,
-            "fhat": fhat,
-            "x_lower": x_lower,
-            "x_upper": x_upper,
-            "f_lower": f_lower,
-            "f_upper": f_upper,
-            "status": status,
-        },
-    )
+    return Core(run, begin, place)

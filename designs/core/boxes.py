@@ -48,6 +48,14 @@ class Ends:
             result = ca.logic_or(result, ca.logic_not(self.lower[i] <= self.upper[i]))
         return result
 
+    def nearest(self, value: ca.SX) -> ca.SX:
+        """Return the nearest point of the box; of zero for what is not a number."""
+        entries = []
+        for i in range(value.numel()):
+            number = ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0)
+            entries.append(ca.fmin(ca.fmax(number, self.lower[i]), self.upper[i]))
+        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+
     def where(self, condition: ca.SX, other: "Ends") -> "Ends":
         """Return this box where a condition holds, the other elsewhere."""
         return Ends(

@@ -227,6 +227,14 @@ def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
     return ca.vertcat(s["x"], s["f"], rest), known, ca.densify(rows), ca.densify(outputs), ranges
 
 
+def curved_states(plant: Plant) -> BoolArray:
+    """Return on which states a derivative depends, (n,): the others enter linearly."""
+    v, _, rows, outputs, _ = _symbols(plant)
+    slopes = ca.jacobian(ca.vertcat(rows, outputs), v)
+    found = ca.which_depends(ca.vec(slopes), v[: len(plant.x)], 1, False)
+    return np.array(found, dtype=bool).reshape(-1)
+
+
 def covered_inputs(plant: Plant) -> BoolArray:
     """Return which inputs have to stay in their range: those that enter in no constant way."""
     v, known, rows, outputs, _ = _symbols(plant)

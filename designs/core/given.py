@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import StructureError
+from obsynth.designs.core.equations import curved_states
 from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -174,6 +175,7 @@ class PlantClass:
     discretised: whether a discretisation stands for the continuous plant that it was made from
     forbids: kind of signal -> why the method has none of it and what to do instead
     finite: kind of signal -> why each of it needs a finite range and how to declare it
+    linear: whether states that enter linearly, on which no derivative depends, need none
     needs: kind of signal -> why at least one is needed
     faults: roles of the faults that the method estimates
     """
@@ -183,6 +185,7 @@ class PlantClass:
     discretised: bool = False
     forbids: Mapping[str, str] = field(default_factory=dict)
     finite: Mapping[str, str] = field(default_factory=dict)
+    linear: bool = False
     needs: Mapping[str, str] = field(default_factory=dict)
     faults: tuple[Role, ...] = (Role.ACTUATOR_FAULT, Role.PROCESS_FAULT)
 
@@ -200,8 +203,10 @@ class PlantClass:
                 condition="faults in the dynamics",
             )
         for kind, clause in self.finite.items():
-            loose = tuple(s.name for s in getattr(plant, kind) if not s.bounded)
-            self._refuse(kind, loose, clause)
+            loose = np.array([not s.bounded for s in getattr(plant, kind)], dtype=bool)
+            if kind == "x" and self.linear and loose.any():
+                loose &= curved_states(plant)
+            self._refuse(kind, tuple(np.array(plant.names(kind))[loose].tolist()), clause)
         for kind, clause in self.needs.items():
             if not getattr(plant, kind):
                 raise StructureError(

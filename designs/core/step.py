@@ -110,7 +110,8 @@ class Step:
         kept = {name: self.part[name] for name in self.guard.shared}
         if self.core.place is None:
             return kept
-        placed = self.core.place(*boxes, kept)
+        X, F = _declared(boxes[0], self.reset[0]), self._faults(boxes[1])
+        placed = self.core.place(X, F, kept)
         both = ca.logic_and(*copies)
         return {name: select(both, placed[name], kept[name]) for name in kept}
 
@@ -130,6 +131,10 @@ class Step:
         now = contractor.drift(F).meet(self.ranges[1]).where(have, F)
         return X, now, before
 
+    def _faults(self, F: Ends) -> Ends:
+        """Return faults within their ranges, which a core begins from even if they are no cut."""
+        return F if "ranges" in self.contractor.cuts else F.meet(self.reset[1])
+
     def _copy(self, end: str, have: ca.SX, sets: tuple[Ends, Ends, Before], kept: Parts) -> _Copy:
         """Run the core of one copy on its sets."""
         core, contractor, delay = self.core, self.contractor, self.guard.delay
@@ -138,7 +143,7 @@ class Step:
         own = {name: self.part[name + end] for name in names}
         begins = self.part["begin" + end] > 0.5
         X = _declared(X, self.reset[0]).where(begins, X)
-        begun = core.begin(X, now, kept)
+        begun = core.begin(X, self._faults(now), kept)
         own = {name: select(begins, begun[name], own[name]) for name in names}
         seen = Seen({**kept, **own}, self.u_used, self.theta_used, self.y_clean, self.used)
         known = core.run(seen)
@@ -200,8 +205,8 @@ class Step:
         outputs = {
             "memory": select(initialised, memory, self.memory),
             # estimates of a core without sets are promised for states and faults of any size
-            "xhat": old.known.xhat if old.known.x is None else _inside(xhat, X),
-            "fhat": old.known.fhat if old.known.f is None else _inside(fhat, F),
+            "xhat": old.known.xhat if old.known.x is None else X.nearest(xhat),
+            "fhat": old.known.fhat if old.known.f is None else F.nearest(fhat),
             "x_lower": _open(X.lower, -1.0),
             "x_upper": _open(X.upper, 1.0),
             "f_lower": _open(F.lower, -1.0),
@@ -280,15 +285,6 @@ def _declared(X: Ends, declared: Ends) -> Ends:
     lower = [ca.if_else(X.lower[i] > -HUGE, X.lower[i], declared.lower[i]) for i in rows]
     upper = [ca.if_else(X.upper[i] < HUGE, X.upper[i], declared.upper[i]) for i in rows]
     return Ends(ca.vertcat(*lower), ca.vertcat(*upper))
-
-
-def _inside(value: ca.SX, box: Ends) -> ca.SX:
-    """Return the nearest point of a box; its middle for what is not a number."""
-    entries = []
-    for i in range(value.numel()):
-        number = ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0)
-        entries.append(ca.fmin(ca.fmax(number, box.lower[i]), box.upper[i]))
-    return ca.vertcat(*entries) if entries else ca.SX(0, 1)
 
 
 def _open(ends: ca.SX, sign: float) -> ca.SX:

@@ -25,6 +25,7 @@ from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.designs.bounded_error.synthesis import largest_gamma, synthesise
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def bound_peak(design: UioDesign) -> UioDesign:
 
 def _widest_start(design: UioDesign) -> FloatArray:
     """Bounds of ``|zeta_0|`` for a state anywhere in its box, and one step of every fault."""
-    width = np.diff(design.plant.box("x"))[:, 0]
+    width = np.diff(finite_box(design.plant, "x"))[:, 0]
     return np.concatenate([np.abs(design.T) @ width, design.rate])
 
 

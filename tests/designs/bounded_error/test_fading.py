@@ -5,6 +5,7 @@ import time
 from dataclasses import replace
 from fractions import Fraction
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,7 +20,8 @@ from obsynth.designs.bounded_error.peak.fading import contracts, fade, prove_fad
 from obsynth.designs.bounded_error.peak.system import peak_system
 from obsynth.designs.bounded_error.peak.transient import transient
 from obsynth.designs.bounded_error.record import Fading, Modes
-from obsynth.designs.bounded_error.step import running_bound
+from obsynth.designs.bounded_error.step import first_bound, running_bound
+from obsynth.designs.core.boxes import Ends
 
 # -- how long, how soon ------------------------------------------------------------------------
 
@@ -29,9 +31,12 @@ def test_tanks_settle_as_soon_as_their_slowest_mode(peak, tank):
 
     One exponential for all, as it was: 3800, for f1 3366.
     """
-    bound, b = running_bound(peak.certificate.design), peak.half_widths
-    s = peak.memory0(tank.box("x").mean(axis=1), f_range=[(-10, 10)] * 2)
-    s = s[peak.memory_layout["bound"]]
+    design, b = peak.certificate.design, peak.performance["core_half_widths"]
+    memory = peak.memory0(tank.box("x").mean(axis=1))
+    kept = {part: ca.SX(memory[peak.memory_layout[part]]) for part in ("z", "fhat")}
+    faults = Ends.of(np.array([(-10.0, 10.0)] * 2))
+    s = np.array(ca.evalf(first_bound(design, Ends.of(tank.box("x")), faults, kept))).ravel()
+    bound = running_bound(design)
     widths = []
     for _ in range(4000):
         widths.append(bound.half_widths(s))

@@ -10,7 +10,8 @@ from tapes import NUMPY, tape
 
 import obsynth as ob
 from obsynth.designs.bounded_error.claims import claims, covers, guarantee
-from obsynth.designs.bounded_error.rounding import Limits, of_matrices, of_step
+from obsynth.designs.bounded_error.model import Limits
+from obsynth.designs.bounded_error.rounding import of_matrices, of_step
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.rounding import cut_box, rounding_bound
 
