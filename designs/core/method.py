@@ -8,6 +8,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from inspect import signature
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
@@ -69,6 +70,8 @@ class Contract(Generic[D]):
     shared: parts of the memory that estimates are made of, or a function of the design
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
+    settle: of a design, half widths of the sets that its core begins from, and a number of calls
+        or None: how many calls its bounds take to settle, or that number, and its half widths then
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """
@@ -88,6 +91,7 @@ class Contract(Generic[D]):
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
+    settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray]] | None = None
     quiet: bool = False
 
     def to_record(self, design: Any) -> dict[str, Any]:
@@ -156,6 +160,7 @@ class Contract(Generic[D]):
             plant.Ts if plant.Ts is not None else design.Ts,
             getattr(design, "precision", "double"),
             self.shared(design) if callable(self.shared) else self.shared,
+            None if self.settle is None else partial(self.settle, design),
         )
 
     def layout(self, design: Any) -> dict[str, slice]:
@@ -197,8 +202,8 @@ class Method:
     A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
 
     horizon: N, number of calls after which a set that was begun anew takes over from an older one:
-        nothing that happened more than 2 N calls ago matters to what is returned. By default 400,
-        and in continuous time as many as the slowest sets take to settle
+        nothing that happened more than 2 N calls ago matters to what is returned. By default as
+        many as the method's own sets take to settle, or 400
     recovery: number of calls after a void one that the status marks as recovering
     cuts: what the returned sets are cut with beside the method's own, of ``"ranges"``,
         ``"strips"``, ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()``
