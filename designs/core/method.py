@@ -25,7 +25,7 @@ from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitore
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import plain
 from obsynth.designs.core.step import Step
-from obsynth.designs.core.stepping import extended, fill, slices
+from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -85,8 +85,7 @@ class Contract(Generic[D]):
     numbers: Callable[[D], Numbers]
     memory: Callable[[D], Mapping[str, int]]
     first: Callable[..., Mapping[str, ArrayLike]]
-    core: Callable[[D], Core] | None = None
-    step: Callable[[D], ca.Function] | None = None
+    core: Callable[[D], Core]
     shared: tuple[str, ...] | Callable[[D], tuple[str, ...]] = ()
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
@@ -116,35 +115,23 @@ class Contract(Generic[D]):
         design: Any = certificate.require().design
         plant: Plant = design.plant
         numbers, guard = self.numbers(design), self.guard(design)
-        if self.core is None:
-            assert self.step is not None
-            step, half_widths, performance = (
-                self.step(design),
-                numbers.half_widths,
-                numbers.performance,
-            )
-            promised = self.guarantee(design)
-        else:
-            step = Step(guard, self.core(design)).build()
-            half_widths, performance = guard.widths(numbers.half_widths), dict(numbers.performance)
-            if numbers.half_widths is not None:
-                performance["core_half_widths"] = numbers.half_widths
-            promised = monitored(self.guarantee(design), guard)
+        performance = dict(numbers.performance)
+        if numbers.half_widths is not None:
+            performance["core_half_widths"] = numbers.half_widths
+        layout = guard.layout()
         ode = None if self.ode is None else self.ode(design)
-        if ode is not None and self.core is not None:
-            ode = extended(ode, self.memory(design), self.layout(design), YOUNG)
         return Observer(
             method=self.name,
             model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
-            step=step,
-            memory_layout=self.layout(design),
+            step=Step(guard, self.core(design)).build(),
+            memory_layout=layout,
             gains=numbers.gains,
             performance=performance,
-            half_widths=half_widths,
+            half_widths=guard.widths(numbers.half_widths),
             certificate=certificate,
-            guarantee=promised,
+            guarantee=monitored(self.guarantee(design), guard),
             fault_delay=self.fault_delay,
-            ode=ode,
+            ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,
             searched=numbers.searched,
         )
@@ -165,7 +152,7 @@ class Contract(Generic[D]):
 
     def layout(self, design: Any) -> dict[str, slice]:
         """Return which entries of the memory hold what."""
-        return slices(self.memory(design)) if self.core is None else self.guard(design).layout()
+        return self.guard(design).layout()
 
     def start(
         self,
@@ -184,11 +171,9 @@ class Contract(Generic[D]):
                 f"memory0 of {self.name} takes {more}; it knows no {option!r}", option=option
             )
         given = Start.read(design.plant, guess, x_range, f_range, y0)
-        parts = self.first(design, given, **options)
-        if self.core is not None:
-            f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
-            parts = self.guard(design).first(parts, given.x, f_box)
-        return fill(self.layout(design), parts)
+        guard, parts = self.guard(design), self.first(design, given, **options)
+        f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
+        return fill(guard.layout(), guard.first(parts, given.x, f_box))
 
 
 CONTRACTS: dict[str, Contract[Any]] = {}
