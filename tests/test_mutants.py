@@ -11,7 +11,11 @@ sys.path.insert(0, str(TOOL.parent))
 
 from mutation import changes, pick  # noqa: E402
 
-LISTS = tomllib.loads((TOOL.parent / "mutants.toml").read_text())
+LISTS = {
+    key: entries
+    for name in ("mutants.toml", "guards.toml")
+    for key, entries in tomllib.loads((TOOL.parent / name).read_text()).items()
+}
 SOURCE = '''
 def bound(lower, upper, loss):
     """Say 1.0 + 2.0."""
@@ -76,7 +80,7 @@ def test_files_and_reasons_of_the_list_exist():
     for entry in (*LISTS["mutant"], *LISTS["guard"]):
         for name in (entry["file"], *entry["tests"]):
             assert (ROOT / name.split("::")[0]).is_file(), name
-    for entry in LISTS.get("equivalent", []):
+    for entry in LISTS["equivalent"]:
         leave = next(set(g.get("leave", ())) for g in LISTS["guard"] if g["file"] == entry["file"])
         found = changes((ROOT / entry["file"]).read_text(), leave)
         assert any(change.fits(entry) for change in found), entry

@@ -1,12 +1,12 @@
 """Plant mistakes in what guarantees rest on, one at a time, and print those that no test sees.
 
 ``mutants.toml`` beside this file lists mistakes (a file, the text that is changed, what it becomes,
-the tests that have to fail), and the files in which `mutation` makes more of them, each with its
-tests and the functions left aside because they only steer or show. What is made follows from the
+the tests that have to fail), ``guards.toml`` the files in which `mutation` makes more of them, each
+with its tests and what is left aside because it only steers or shows. What is made follows from the
 words of the source and the seed alone. A test that hangs has seen its mutant. Mutants that change
 nothing say why; they are counted and not planted.
 
-    python tools/mutants.py                   # all listed ones, four made in every file
+    python tools/mutants.py                   # all listed ones, some made in every file
     python tools/mutants.py derive/rigour     # in files whose name has these words
     python tools/mutants.py derive/rigour/interval.py --each 20 --seed 7
 """
@@ -23,9 +23,10 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ HEAVY = (
     *("numpy", "scipy.optimize", "scipy.linalg", "sympy", "casadi", "mpmath", "flint", "clarabel"),
     *("pytest", "hypothesis"),
 )
+LISTS = [Path(__file__).with_name(name) for name in ("mutants.toml", "guards.toml")]
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
 
 
@@ -99,9 +101,14 @@ class Job:
         return "/".join(self.file.split("/")[:2]) if self.file.count("/") > 1 else "codegen"
 
 
+def read(files: Iterable[Path]) -> dict[str, Any]:
+    """Return what some lists hold together."""
+    return dict(ChainMap(*(tomllib.loads(file.read_text()) for file in files)))
+
+
 def listed(lists: dict[str, Any]) -> Iterator[Job]:
     """Mutants that are written down."""
-    for entry in lists["mutant"]:
+    for entry in lists.get("mutant", []):
         source, was, becomes = (HERE / entry["file"]).read_text(), entry["was"], entry["becomes"]
         if source.count(was) != 1:
             raise SystemExit(f"{was!r} does not stand once in {entry['file']}")
@@ -111,14 +118,14 @@ def listed(lists: dict[str, Any]) -> Iterator[Job]:
         yield Job(tuple(entry["tests"]), entry["file"], text, str(line), says, why)
 
 
-def made(lists: dict[str, Any], each: int, seed: int) -> Iterator[Job]:
+def made(lists: dict[str, Any], each: int | None, seed: int) -> Iterator[Job]:
     """Mutants made in the guarded files, some of every file."""
     reasons = lists.get("equivalent", [])
     for guard in lists.get("guard", []):
         source, file = (HERE / guard["file"]).read_text(), guard["file"]
         chosen = pick(changes(source, set(guard.get("leave", ()))), seed, file)
         mine = [entry for entry in reasons if entry["file"] == file]
-        for change, _ in zip(chosen, range(each), strict=False):
+        for change in islice(chosen, each or guard.get("each", 3)):
             why = next((entry["why"] for entry in mine if change.fits(entry)), "")
             where = f"{change.line} {change.function}"
             says = f"[{change.kind}] {change.was} -> {change.becomes}   in: {change.text}"
@@ -204,15 +211,15 @@ def main(arguments: list[str] | None = None) -> int:
     form = argparse.RawTextHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("words", nargs="?", default="", help="in the file's name")
-    parser.add_argument("--each", type=int, default=4, help="made in every file")
+    parser.add_argument("--each", type=int, help="made in every file, or as listed")
     parser.add_argument("--seed", type=int, default=0, help="which are made")
     parser.add_argument("--most", type=int, default=10**6, help="mutants at most")
     parser.add_argument("--minutes", type=float, default=60.0, help="none is planted later")
     parser.add_argument("--trust", action="store_true", help="the tests pass with none planted")
     parser.add_argument("--workers", type=int, default=2, help="copies of the checkout")
-    parser.add_argument("--list", type=Path, default=Path(__file__).parent / "mutants.toml")
+    parser.add_argument("--list", type=Path, nargs="*", default=LISTS, help="instead of ours")
     asked = parser.parse_args(arguments)
-    began, lists = time.monotonic(), tomllib.loads(asked.list.read_text())
+    began, lists = time.monotonic(), read(asked.list)
     everything = [*listed(lists), *made(lists, asked.each, asked.seed)]
     chosen = [job for job in everything if asked.words in job.file][: asked.most]
     told = [job for job in chosen if job.why]

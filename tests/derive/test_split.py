@@ -238,6 +238,18 @@ def test_signals_that_enter_nonlinearly_are_named(extra, symbol):
     assert caught.value.row == "x2"
 
 
+def test_a_signal_with_a_constant_slope_that_jumps_is_not_linear():
+    """Both branches have the slope 1; mutant: what is left over not looked at."""
+
+    def jump(s):
+        return sp.Piecewise((s["d"] + 1, s["d"] > 0), (s["d"] - 1, True))
+
+    plant = make(bad_dynamics(jump))
+    with pytest.raises(StructureError, match="do not enter the row of x2 linearly") as caught:
+        split(plant, at=([0, 0], [0]))
+    assert caught.value.symbol == "d"
+
+
 @pytest.mark.parametrize(
     ("output", "symbol"),
     [

@@ -6,12 +6,14 @@ from fractions import Fraction
 import casadi as ca
 import numpy as np
 import pytest
+import sympy as sp
 
 from obsynth.derive import Status, UnboundedError, jacobian_bounds, split
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
 from obsynth.derive.constants.lipschitz import _inner, lipschitz
 from obsynth.derive.errors import DerivationError
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.symbolic import Plant, plants
 
 
@@ -230,6 +232,11 @@ def test_unbounded_slopes_are_refused():
     plant.outputs([h])
     with pytest.raises(UnboundedError, match="h in"):
         lipschitz(plant)
+    entries = matrix_entries({(0, 0): -sp.sqrt(h).diff(h)}, plant)
+    with pytest.raises(UnboundedError, match="h in") as caught:
+        entries.ranges(1e-6, "fast")
+    low, high = caught.value.sub_box["h"]
+    assert low == 0.0 < high
 
 
 def test_gamma_has_to_be_a_number(parts):

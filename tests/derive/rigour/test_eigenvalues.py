@@ -107,3 +107,15 @@ def test_the_perron_bound_holds_exactly(monkeypatch):
     assert 3.0 <= perron_bound(matrices)[0] <= 3.0 * (1 + 1e-13)
     monkeypatch.setattr(symmetric, "gamma_bound", lambda n: -(2.0**-44))
     assert any(perron_refuted(seed) for seed in range(5))
+
+
+def test_the_bound_of_a_nonnegative_matrix_holds_its_row_sums():
+    """a + b is the eigenvalue of [a b; b a]; mutant: the sum of a row rounded to nearest."""
+    a, b = np.random.default_rng(0).uniform(0.1, 1.0, (2, 300))
+    matrices = np.moveaxis(np.array([[a, b], [b, a]]), -1, 0)
+    for x, y, bound in zip(a, b, perron_bound(matrices), strict=True):
+        assert (
+            Fraction(x) + Fraction(y)
+            <= Fraction(bound)
+            <= Fraction(x + y) * (1 + Fraction(1, 10**14))
+        )

@@ -9,6 +9,7 @@ from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.filter_bank.claims import claims, covers
 from obsynth.designs.filter_bank.model import read
 from obsynth.designs.filter_bank.record import BankDesign
+from obsynth.designs.filter_bank.widths import steady_half_widths
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +87,19 @@ def test_a_measured_state_may_grow_by_itself():
     plant.dynamics([a + b + f, a - b])
     plant.outputs([a])
     assert read(plant, None).hidden == [1]
+
+
+def test_steady_widths_do_not_depend_on_the_sign_of_a_coupling():
+    """a + a^2 and its negative drive the unmeasured state alike; mutant: one end of the slopes."""
+    found = []
+    for sign in (1, -1):
+        plant = ob.Plant("driven")
+        a, b = plant.states("a b", range=[(0, 1), (-1, 1)])
+        (f,) = plant.faults("f", range=(-1, 1))
+        (w,) = plant.disturbances("w", bound=0.01)
+        plant.dynamics([-a + b / 5 + f, -b + sign * (a + a**2)])
+        plant.outputs([a + w])
+        record = ob.FilterBank().design(plant).certificate.record
+        found.append(steady_half_widths(BankDesign.from_record(record)))
+    assert found[0] == pytest.approx(found[1], rel=1e-12)
+    assert found[0][1] > 0.03
