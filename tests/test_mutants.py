@@ -117,7 +117,7 @@ def run(*arguments):
 def test_mistakes_are_planted_caught_and_told(tmp_path):
     """A flipped sign, a change of nothing, and one with a reason."""
     (tmp_path / "list.toml").write_text(QUICK)
-    done = run("--list", tmp_path / "list.toml", "--trust", "--workers", 1)
+    done = run("--list", tmp_path / "list.toml", "--workers", 1)
     assert done.returncode == 1, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     assert "caught by" in lines[0] and "SURVIVES" in lines[1]

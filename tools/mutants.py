@@ -3,8 +3,9 @@
 ``mutants.toml`` beside this file lists mistakes (a file, the text that is changed, what it becomes,
 the tests that have to fail), ``guards.toml`` the files in which `mutation` makes more of them, each
 with its tests and what is left aside because it only steers or shows. What is made follows from the
-words of the source and the seed alone. A test that hangs has seen its mutant. Mutants that change
-nothing say why; they are counted and not planted.
+words of the source and the seed alone. A test that hangs has seen its mutant; one that fails is run
+once with nothing planted, where it has to pass. Mutants that change nothing say why; they are
+counted and not planted.
 
     python tools/mutants.py                   # all listed ones, some made in every file
     python tools/mutants.py derive/rigour     # in files whose name has these words
@@ -23,9 +24,9 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections import ChainMap, Counter
+from collections import ChainMap, Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ HEAVY = (
     *("pytest", "hypothesis"),
 )
 LISTS = [Path(__file__).with_name(name) for name in ("mutants.toml", "guards.toml")]
+# Seconds after which a run of tests counts as one that hangs.
+LIMIT = 300.0
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
 
 
@@ -84,7 +87,6 @@ class Job:
 
     where, says: place and change of the mistake, for people
     why: reason for which no test can see it
-    limit: seconds after which it counts as seen
     """
 
     tests: tuple[str, ...]
@@ -93,7 +95,6 @@ class Job:
     where: str = ""
     says: str = ""
     why: str = ""
-    limit: float = 600.0
 
     @property
     def room(self) -> str:
@@ -118,18 +119,19 @@ def listed(lists: dict[str, Any]) -> Iterator[Job]:
         yield Job(tuple(entry["tests"]), entry["file"], text, str(line), says, why)
 
 
-def made(lists: dict[str, Any], each: int | None, seed: int) -> Iterator[Job]:
-    """Mutants made in the guarded files, some of every file."""
+def made(lists: dict[str, Any], each: int | None, seed: int) -> Iterator[tuple[int, Job]]:
+    """Mutants made in the guarded files with their number in their file."""
     reasons = lists.get("equivalent", [])
     for guard in lists.get("guard", []):
         source, file = (HERE / guard["file"]).read_text(), guard["file"]
         chosen = pick(changes(source, set(guard.get("leave", ()))), seed, file)
         mine = [entry for entry in reasons if entry["file"] == file]
-        for change in islice(chosen, each or guard.get("each", 3)):
+        for number, change in enumerate(islice(chosen, each or guard.get("each", 3))):
             why = next((entry["why"] for entry in mine if change.fits(entry)), "")
             where = f"{change.line} {change.function}"
             says = f"[{change.kind}] {change.was} -> {change.becomes}   in: {change.text}"
-            yield Job(tuple(guard["tests"]), file, change.apply(source), where, says, why)
+            job = Job(tuple(guard["tests"]), file, change.apply(source), where, says, why)
+            yield number, job
 
 
 def copied(place: Path) -> Path:
@@ -172,17 +174,17 @@ def begin(place: Path, job: Job, watch: Watch) -> int:
 
 
 def run(
-    places: list[Path], jobs: Iterable[Job], watch: Watch
+    places: list[Path], jobs: deque[Job], watch: Watch
 ) -> Iterator[tuple[Job, int, float, str]]:
     """Run jobs, one in every copy at a time; yield return code (-1: too long), seconds, output.
 
-    Where a test has failed, its name is the output.
+    Where a test has failed, its name is the output. Jobs may be added in between.
     """
-    free, left = list(places), iter(jobs)
+    free = list(places)
     running: dict[int, tuple[Job, Path, str, float]] = {}
     while True:
-        while free and (job := next(left, None)):
-            place = free.pop()
+        while free and jobs:
+            place, job = free.pop(), jobs.popleft()
             right = (place / job.file).read_text() if job.file else ""
             running[begin(place, job, watch)] = job, place, right, time.monotonic()
         if not running:
@@ -191,7 +193,7 @@ def run(
         for child, (job, place, right, since) in list(running.items()):
             ended, status = os.waitpid(child, os.WNOHANG)
             spent = time.monotonic() - since
-            if not ended and spent < job.limit:
+            if not ended and spent < LIMIT:
                 continue
             code = os.waitstatus_to_exitcode(status) if ended else -1
             # what the tests have started ends with them
@@ -215,37 +217,38 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="which are made")
     parser.add_argument("--most", type=int, default=10**6, help="mutants at most")
     parser.add_argument("--minutes", type=float, default=60.0, help="none is planted later")
-    parser.add_argument("--trust", action="store_true", help="the tests pass with none planted")
     parser.add_argument("--workers", type=int, default=2, help="copies of the checkout")
     parser.add_argument("--list", type=Path, nargs="*", default=LISTS, help="instead of ours")
     asked = parser.parse_args(arguments)
     began, lists = time.monotonic(), read(asked.list)
-    everything = [*listed(lists), *made(lists, asked.each, asked.seed)]
+    found = made(lists, asked.each, asked.seed)
+    everything = [*listed(lists), *(job for _, job in sorted(found, key=lambda f: f[0]))]
     chosen = [job for job in everything if asked.words in job.file][: asked.most]
     told = [job for job in chosen if job.why]
     for name in HEAVY:
         importlib.import_module(name)
-    alive, table = [], Counter((job.room, "explained") for job in told)
+    late, alive, table = 0, [], Counter((job.room, "explained") for job in told)
     with tempfile.TemporaryDirectory() as name:
         places = [copied(Path(name) / str(k)) for k in range(asked.workers)]
-        watch = Watch()
-        files = sorted({test for job in chosen if not job.why for test in job.tests})
-        for job, code, _, output in run(
-            places, [Job((f,)) for f in files if not asked.trust], watch
-        ):
-            if code:
-                raise SystemExit(f"{job.tests[0]} fails with nothing planted: {output[-3000:]}")
-
-        def jobs() -> Iterator[Job]:
-            for job in chosen:
-                if not job.why and time.monotonic() - began < 60.0 * asked.minutes:
-                    known = [s for t, s in watch.seconds.items() if t.split("::")[0] in job.tests]
-                    yield job if asked.trust else replace(job, limit=20.0 + 5.0 * sum(known))
-
-        for job, code, spent, output in run(places, jobs(), watch):
+        watch, sound = Watch(), set[str]()
+        jobs = deque(job for job in chosen if not job.why)
+        for job, code, spent, output in run(places, jobs, watch):
             if code not in (-1, 0, 1, 2):
                 raise SystemExit(f"{' '.join(job.tests)} did not run:\n{output[-3000:]}")
-            word = {0: "SURVIVES", -1: "too long"}.get(code, f"caught by {output.split('::')[-1]}:")
+            if not job.file and code:
+                raise SystemExit(f"{job.tests[0]} fails with nothing planted")
+            if time.monotonic() - began > 60.0 * asked.minutes:
+                late += len(jobs)
+                jobs.clear()
+            if not job.file:
+                continue
+            test = output if code == 1 and output in watch.seconds else ""
+            if test and test not in sound:
+                # what catches has to pass where nothing is planted
+                sound.add(test)
+                jobs.appendleft(Job((test,)))
+            by = f"caught by {test.split('::')[-1] or 'the import'}:"
+            word = {0: "SURVIVES", -1: "too long"}.get(code, by)
             alive += [job] if code == 0 else []
             table[job.room, "planted"] += 1
             table[job.room, "survive"] += code == 0
@@ -262,7 +265,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"survives: {job.file}:{job.where} {job.says}")
     for job in told:
         print(f"changes nothing: {job.file}:{job.where} {job.says}: {job.why}")
-    late = len(chosen) - len(told) - sum(table[r, "planted"] for r in {r for r, _ in table})
     print(f"{late} not planted for want of time" if late else f"{time.monotonic() - began:.0f} s")
     return 1 if alive else 0
 
