@@ -182,6 +182,6 @@ def _names(observer: Observer) -> tuple[str, ...]:
 
 
 def half_widths(observer: Observer) -> Any:
-    """Return the half widths of states, then faults; infinite where nothing is guaranteed."""
-    widths = observer.half_widths
+    """Return the method's own half widths of states, then faults; infinite without a guarantee."""
+    widths = observer.performance.get("core_half_widths")
     return np.full(len(_names(observer)), np.inf) if widths is None else widths

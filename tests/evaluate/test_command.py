@@ -93,7 +93,7 @@ def test_check_proves_a_design_from_its_file(given_peak, tmp_path):
     text = said(result)
     assert "every claim proved again" in text
     assert "Guaranteed:" in text
-    assert "[monitored: status bit 4]" in text
+    assert "[monitored in part: status bit 8]" in text
 
 
 def test_check_refuses_a_bound_a_tenth_of_a_per_cent_too_small(given_peak, tmp_path):
