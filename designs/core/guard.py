@@ -164,9 +164,9 @@ def monitored(guarantee: Guarantee, guard: Guard) -> Guarantee:
     at_once = [s for s, low in zip(plant.x, limits, strict=True) if s.bounded and low == -np.inf]
     if at_once:
         assumptions.append(
-            f"{', '.join(s.name for s in at_once)} is in its declared range at the instants at "
-            f"which sets begin anew: after a void one or an input that is missing, after a missing "
-            f"reading if nothing else bounds it, and every {N} calls"
+            f"{', '.join(s.name for s in at_once)} inside of declared ranges at the instants at "
+            "which sets begin anew: after a void one or an input that is missing, after a missing "
+            f"reading if nothing else bounds them, and every {N} calls"
         )
     if loose:
         assumptions.append(

@@ -6,6 +6,7 @@ import numpy as np
 
 from obsynth.derive.rigour import UNIT, exact, nearest
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import LARGEST_SIGNAL
 from obsynth.designs.interval.model import IntervalModel
@@ -138,12 +139,10 @@ def numbers(design: IntervalDesign) -> Numbers:
 
 def guarantee(design: IntervalDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
-    plant = design.plant
-    claims = [f"{', '.join(plant.names('x'))} lie inside the returned intervals at every k >= 0"]
+    plant, claims = design.plant, []
     if plant.f:
-        faults = ", ".join(plant.names("f"))
-        claims.append(f"{faults} of the instant before: inside the intervals at every k >= 1")
-    free = (*plant.names("f"), *plant.names("d"))
+        claims.append(f"{', '.join(plant.names('f'))}: of the instant before, from k = 1 on")
+    free = (*(s.name for s in plant.f if not s.bounded), *plant.names("d"))
     if free:
         claims.append(f"for all values of {', '.join(free)}, however fast they change")
     claims.append(f"all of this with the step evaluated in IEEE {design.precision} precision")
@@ -159,13 +158,14 @@ def guarantee(design: IntervalDesign) -> Guarantee:
     ]
     if plant.rho or plant.p:
         assumptions.append(ranges(*plant.rho, *plant.p))
-    for signals, seen in (
-        (held, "monitored: status bit 4"),
-        (watched, IN_PART),
-        (plant.w, IN_PART),
-    ):
-        if signals:
-            assumptions.append(f"{ranges(*signals)} [{seen}]")
+    bounded = [s for s in plant.f if s.bounded]
+    if held:
+        assumptions.append(f"{ranges(*held)} [monitored: status bit 4]")
+    assumptions += [f"{ranges(*some)} [{IN_PART}]" for some in (watched, bounded, plant.w) if some]
+    slow = [(s.name, 0.0 if s.constant else s.rate) for s in plant.f]
+    moves = ", ".join(f"{name} by {rate:g}" for name, rate in slow if rate is not None)
+    if moves and "rates" in Watch.of(design.options).cuts:
+        assumptions.append(f"from call to call {moves} at most [{IN_PART}]")
     assumptions += [
         "the half widths hold in the limit while states and inputs keep to their ranges "
         f"(up to {LARGEST_SIGNAL:g} where none is declared)",

@@ -473,11 +473,27 @@ def test_sylvester_gains(example):
         )
 
 
-def test_the_guarantee_names_its_assumptions(designs):
+def test_the_guarantee_names_its_assumptions(designs, two_faults):
+    """What is cut with the range of a fault does not hold for all of its values."""
     text = str(designs["d1"].guarantee)
-    for words in ("rho1 in [-1, 1]", "memory0", "for all values of f", "IEEE double", "bit 8"):
+    for words in ("rho1 in [-1, 1]", "memory0", "f in [-1, 1]", "IEEE double", "bit 8"):
         assert words in text
+    assert "for all values" not in text
+    assert "x1, x2, x3 inside of declared ranges at the instants" in text
+    assert "for all values of f, d" in str(ob.IntervalObserver().design(two_faults).guarantee)
     assert "interval_observer" in str(designs["d1"])
+
+
+def test_a_rate_is_an_assumption_where_it_cuts():
+    p = ob.Plant("slow")
+    (x,) = p.states("x", range=(-1, 1))
+    (f,) = p.faults("f", rate=0.25)
+    (w,) = p.disturbances("w", bound=0.01)
+    p.dynamics([x / 2 + f], Ts=1)
+    p.outputs([x + w])
+    said = "from call to call f by 0.25 at most"
+    assert said in str(ob.IntervalObserver().design(p).guarantee)
+    assert said not in str(ob.IntervalObserver(cuts=()).design(p).guarantee)
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
