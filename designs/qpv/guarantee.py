@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.designs.core.certificate import Guarantee
+from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import about_centre
 from obsynth.designs.qpv.claims import undisturbed
@@ -15,10 +16,11 @@ from obsynth.designs.qpv.step import allowance, measured_schedule
 def numbers(design: QPVDesign) -> Numbers:
     """Return the gains L1, L2, ... at the vertices of the scheduling, (52), and what they reach."""
     widths = None
-    if design.noise is not None:
-        widths = np.sqrt(design.inverse_diagonal) * (1.0 + 2.0**-40 + allowance(design).value)
-    elif not design.plant.w:
-        widths = np.zeros(len(design.P))
+    if design.bounded:
+        # without disturbances the bound shrinks for as long as a copy is kept at least
+        calls = 0 if design.noise is not None else Watch.of(design.options).horizon
+        left = float(np.exp(-0.5 * design.alpha * design.Ts * calls)) * (1.0 + 2.0**-40)
+        widths = np.sqrt(design.inverse_diagonal) * (left + allowance(design).value)
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
     return Numbers(gains, _performance(design), widths, ("eta",))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import QPV
 from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
+from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi import Problem
 from obsynth.designs.qpv.claims import claims, covers
@@ -39,6 +40,8 @@ from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+_SETTLED = 20.0
+"""Time constants of the bound of V for which a copy is kept by default."""
 ETA = Number(0.0, at_most=1.0, because="1 / eta enlarges the polytopes, so it lies in (0, 1]")
 DECAY = Number(at_least=0.0, because="a decay rate is not negative")
 ORDER = Number(at_least=2.0, because="the order s of the relaxation is an integer from 2 on")
@@ -274,4 +277,7 @@ class QPVObserver(Method):
         check_faults(setting.data, setting.sets, model.form.names)
         if setting.printed:
             raise printed_refusal(setting, gains)
-        return synthesise(setting, self.options(), gains, self.Ts)
+        design = synthesise(setting, self.options(), gains, self.Ts)
+        rate = design.alpha if design.noise is None else design.noise.rate
+        seconds = min(_SETTLED / rate, MOST_CALLS * design.Ts) if rate > 0.0 else 0.0
+        return replace(design, options=self.settling(seconds, design.Ts)) if seconds else design

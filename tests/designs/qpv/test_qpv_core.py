@@ -1,5 +1,7 @@
 """How the bound of V begins, where estimates are placed, and runs with gaps in what is measured."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -165,3 +167,27 @@ def test_nothing_is_known_of_V_behind_a_missing_reading(noiseless):
         widths.append(f_high - f_low)
         x = 5.0 + (x - 5.0) * np.exp((f - 1.0) * Ts)
     assert widths[-1] < 0.7 * max(widths)
+
+
+def test_half_widths_hold_when_a_copy_has_taken_over(noiseless):
+    """Without disturbances a set is as old as a copy is, no older.
+
+    Mutants: half widths of zero; the decay of V in place of its root's.
+    """
+    contract, N = noiseless.certificate.contract, 150
+    design = noiseless.certificate.design
+    design = replace(design, options={**design.options, "horizon": N, "cuts": ()})
+    observer = contract.certify(design, "lmi").observer()
+    memory, x, f, widths = observer.memory0([5.0]), 5.02, 0.02, []
+    for _ in range(4 * N + 5):
+        memory, *said = observer.step(memory, 5.0 * (1.0 - f), x)
+        low, high, f_low, f_high = (float(v) for v in said[2:6])
+        assert low <= x <= high
+        assert f_low <= f <= f_high
+        widths.append([high - low, f_high - f_low])
+        x = 5.0 + (x - 5.0) * np.exp((f - 1.0) * design.Ts)
+    half = 0.5 * np.array(widths)
+    assert (half[N:] <= observer.half_widths).all()
+    # of E at the start, had the region not told more
+    full = np.sqrt(np.diag(np.linalg.inv(design.P)))
+    np.testing.assert_allclose(half[N] / half[1], observer.half_widths / full, rtol=0.01)
