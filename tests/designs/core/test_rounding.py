@@ -194,3 +194,35 @@ def test_numbers_that_stand_for_others_count():
     assert 0 < seen <= bound(third, *at(0.0, 0.0), "double")[0]
     quarter = one(lambda a, b: ca.fmax(a, 0.25))
     assert bound(quarter, *at(0.0, 0.0), "double")[0] == 0.0
+
+
+def product_with_sign(v):
+    return v * ca.sign(v)
+
+
+KINKS = {
+    "a kink": (lambda c: ca.if_else(c < 1, c, 0.5 + c / 2), 2e-6),
+    "two kinks": (lambda c: ca.if_else(c < 0.5, c, ca.if_else(c <= 1, 0.25 + c / 2, 0.75)), 2e-6),
+    "a sign": (lambda c: product_with_sign(c - 1.0), 2e-6),
+    "a slope": (lambda c: ca.if_else(c < 1, 0.0, 9.0 * (c - 1.0) * c**4), 2e-3),
+    "a jump": (lambda c: ca.if_else(c < 1, c, 1.0 + c), 1.01),
+    "a jump down": (lambda c: ca.if_else(c < 1, c, -5.0 - c), 7.01),
+}
+
+
+@pytest.mark.parametrize("kink", KINKS)
+def test_comparisons_are_taken_apart(kink):
+    """Branches that meet cost little, a jump costs itself; at points where rounding decides.
+
+    Mutants: no cells where a comparison is wrong, the range or the error of one branch alone.
+    """
+    formula, limit = KINKS[kink]
+    function = one(lambda a, b: formula(a * b * 0.37))
+    lo, hi = np.array([[-1.0], [1.0]]), np.array([[3.0], [2.0]])
+    found = bound(function, lo, hi, "single")[0]
+    rng = np.random.default_rng(0)
+    b = rng.uniform(1.5, 2, 600).astype(np.float32)
+    near = np.where(rng.random(600) < 0.3, rng.uniform(0, 1.6, 600), rng.choice([0.5, 1, 1], 600))
+    a = (near / (0.37 * b.astype(float))).astype(np.float32)
+    seen = errors(function, [np.array([a, b], dtype=float)], "single").max()
+    assert seen <= found <= limit
