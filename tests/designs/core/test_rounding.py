@@ -204,7 +204,7 @@ KINKS = {
     "a kink": (lambda c: ca.if_else(c < 1, c, 0.5 + c / 2), 2e-6),
     "two kinks": (lambda c: ca.if_else(c < 0.5, c, ca.if_else(c <= 1, 0.25 + c / 2, 0.75)), 2e-6),
     "a sign": (lambda c: product_with_sign(c - 1.0), 2e-6),
-    "a slope": (lambda c: ca.if_else(c < 1, 0.0, 9.0 * (c - 1.0) * c**4), 2e-3),
+    "a slope": (lambda c: ca.if_else(c < 1, 1.0, 1.0 + 9.0 * (c - 1.0) * c**4), 2e-3),
     "a jump": (lambda c: ca.if_else(c < 1, c, 1.0 + c), 1.01),
     "a jump down": (lambda c: ca.if_else(c < 1, c, -5.0 - c), 7.01),
 }
