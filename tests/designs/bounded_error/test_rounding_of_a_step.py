@@ -248,3 +248,32 @@ def test_a_plant_that_no_bound_is_found_for_keeps_its_assumption():
     assert all(claim.holds for claim in named.values())
     assert "assumed" in named["rounding"].statement
     assert "not proved" in guarantee(design).assumptions[-1]
+
+
+def test_the_step_runs_the_equations_that_are_proved(peak):
+    """Bit for bit. Mutant: a step that forms T f + K nu in another order."""
+    step, layout = build(peak)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        x = rng.uniform(*peak.plant.box("x").T)
+        y = x[:3] + rng.normal(size=3) * 0.01
+        z, fhat = x + peak.E @ y, rng.normal(size=2)
+        memory = np.zeros(step.numel_in(0))
+        parts = {"z": z, "fhat": fhat, "initialised": 1.0, "prediction": x}
+        boxes = {"x_lower": x - 1, "x_upper": x + 1, "f_lower": fhat - 1, "f_upper": fhat + 1}
+        for name, value in (parts | boxes).items():
+            memory[layout[name]] = value
+            if name + "_2" in layout:
+                memory[layout[name + "_2"]] = value
+        u = rng.uniform(0, 20, 2)
+        after = np.array(step(memory, u, y)[0]).ravel()
+        _, _, _, z_next, fhat_next = (np.array(v).ravel() for v in equations(peak)(z, fhat, u, y))
+        np.testing.assert_array_equal(after[layout["z"]], z_next)
+        np.testing.assert_array_equal(after[layout["fhat"]], fhat_next)
+
+
+def build(design):
+    """The step of a design and the parts of its memory."""
+    contract = ob.BoundedErrorUIO.CONTRACT
+    observer = contract.certify(design, "lmi").observer()
+    return observer.step, observer.memory_layout
