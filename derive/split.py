@@ -11,6 +11,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.linear_parts import IdentityProof, constant_columns, prove_identity
+from obsynth.derive.algebra.sizes import LARGEST_ROW, size
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
@@ -271,6 +272,9 @@ def _matrices(
         for symbol, value in zip(_symbols(model, kind), values, strict=True)
     }
     if linear == "jacobian":
+        if any(size(row) > LARGEST_ROW for row in rows):
+            # g takes up what these doubles are off
+            return _slopes(model, point)
         symbolic = (
             sp.Matrix(rows).jacobian(x),
             sp.Matrix(rows).jacobian(u) if u else sp.zeros(len(x), 0),
@@ -306,3 +310,18 @@ def _matrices(
                 filled[i, j] = at_point(matrix[i, j], i, j, signals)
         result.append(filled)
     return result[0], result[1]
+
+
+def _slopes(model: Plant, point: Equilibrium) -> tuple[FloatArray, FloatArray]:
+    """Differentiate a plant numerically at the point of operation."""
+    sx = model.sx()
+    arguments = [sx.x, sx.u, sx.d, sx.f, sx.w, sx.p, sx.rho]
+    zeros = [np.zeros(kind.numel()) for kind in (sx.d, sx.f, sx.w)]
+    slopes = ca.Function("slopes", arguments, [ca.jacobian(sx.rhs, v) for v in (sx.x, sx.u)])
+    A, B = (np.array(part) for part in slopes(point.x, point.u, *zeros, point.p, point.rho))
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        raise DerivationError(
+            "the derivatives are not finite at the point of operation; choose another with at=, or "
+            "linear='terms'"
+        )
+    return A, B

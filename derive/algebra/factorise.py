@@ -19,6 +19,8 @@ from dataclasses import dataclass
 
 import sympy as sp
 
+from obsynth.derive.algebra.sizes import LARGEST_ROW, is_short, simplified, size
+
 _LARGEST_SUM = 200
 
 
@@ -26,6 +28,8 @@ def cancel_common_factors(
     expression: sp.Expr, may_vanish: Callable[[sp.Expr], bool]
 ) -> sp.Expr | None:
     """Cancel what numerators have in common with denominators that may be zero."""
+    if size(expression) > LARGEST_ROW:
+        return None
     found = _cancelled(expression, may_vanish)
     return None if found == expression else found
 
@@ -96,7 +100,12 @@ def _opaque(expression: sp.Expr, known: dict[sp.Expr, sp.Dummy]) -> sp.Expr:
 
 
 def expand_terms(expression: sp.Expr) -> list[sp.Expr]:
-    """List the additive terms of an expression; functions, roots and denominators stay whole."""
+    """List the additive terms of an expression; functions, roots and denominators stay whole.
+
+    What would be too long when it is multiplied out stays as it is.
+    """
+    if not is_short(expression):
+        return list(sp.Add.make_args(expression))
     known: dict[sp.Expr, sp.Dummy] = {}
     expanded = sp.expand(_opaque(sp.sympify(expression), known))
     back = {dummy: original for original, dummy in known.items()}
@@ -121,6 +130,8 @@ def _vanishes(term: sp.Expr, symbol: sp.Symbol) -> bool:
 
 def _linear_form(term: sp.Expr, states: Sequence[sp.Symbol]) -> Divisor | None:
     """Find the homogeneous linear form through which alone a term depends on the states."""
+    if size(term) > LARGEST_ROW:
+        return None
     present = [k for k, s in enumerate(states) if term.has(s)]
     for atom in sorted(term.atoms(sp.Function, sp.Pow), key=sp.default_sort_key):
         for argument in atom.args:
@@ -135,7 +146,7 @@ def _linear_form(term: sp.Expr, states: Sequence[sp.Symbol]) -> Divisor | None:
             z = sp.Dummy(real=True)
             first, slope = coefficients[0]
             rest = form - slope * states[first]
-            replaced = sp.simplify(term.subs(states[first], (z - rest) / slope))
+            replaced = simplified(term.subs(states[first], (z - rest) / slope))
             if not replaced.has(*states) and _vanishes(replaced, z):
                 return Divisor(form, tuple(coefficients))
     return None
@@ -194,12 +205,9 @@ def factorise(
     return Factorisation(columns[:, :n], columns[:, n:], offset, linear[:, :n], linear[:, n:])
 
 
-_LARGEST = 3000
-
-
 def products_to_sums(expression: sp.Expr) -> sp.Expr | None:
     """Write products of sines and cosines as sums, in every part where that is possible."""
-    if not _has_products(expression) or expression.count_ops() > _LARGEST:
+    if size(expression) > LARGEST_ROW or not _has_products(expression):
         return None
     result = _rewritten(expression)
     return None if result == expression else result

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.sizes import LARGEST_ROW, simplified, size, text
+from obsynth.derive.algebra.sizes import symbols as symbols_of
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import round_number, substitute
@@ -42,19 +44,31 @@ def constant_columns(
     """Matrix M of rows = M symbols + (something free of the symbols)."""
     exact = sp.zeros(rows.rows, len(symbols))
     values = model.constant_values
-    for i, row in enumerate(rows):
+    for i, typed in enumerate(rows):
+        present = [symbol for symbol in symbols if symbol in symbols_of(typed)]
+        if not present:
+            continue
+        if size(typed) > LARGEST_ROW:
+            raise StructureError(
+                f"the row of {row_names[i]} has {size(typed):,} parts, too many to prove that the "
+                f"{what} {present[0]} enters it linearly with a constant coefficient; write it "
+                "shorter, or discretise with the Euler method",
+                symbol=str(present[0]),
+                row=row_names[i],
+            )
+        row = substitute(typed, {})
         for j, symbol in enumerate(symbols):
-            if not row.has(symbol):
+            if symbol not in present:
                 continue
             slope = sp.diff(row, symbol)
             if slope.free_symbols - set(values):
-                slope = sp.simplify(slope)
+                slope = simplified(slope)
             others = sorted(str(s) for s in slope.free_symbols - set(values))
             if others:
                 raise StructureError(
                     f"the {what} {symbol} enters the row of {row_names[i]} with the coefficient "
-                    f"{slope}, which depends on {', '.join(others)}; it has to enter linearly with "
-                    "a constant coefficient",
+                    f"{text(slope)}, which depends on {', '.join(others)}; it has to enter "
+                    "linearly with a constant coefficient",
                     symbol=str(symbol),
                     row=row_names[i],
                     coefficient=slope,

@@ -9,6 +9,7 @@ from typing import Any
 import sympy as sp
 
 from obsynth.derive.algebra.secants import quotients
+from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, size
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 NUMERIC = "numerically zero at 60 digits"
@@ -17,34 +18,29 @@ _DIGITS = 60
 _WORKING = 100
 _POINTS = 6
 _TRIES = 40
-# Beyond this size cancel and simplify take minutes, and numbers are the better evidence.
-_LARGEST_CANCEL = 3000
-_LARGEST_EXPONENTIAL = 1000
+# Beyond these sizes a proof takes minutes, and numbers are the better evidence.
+_LARGEST_CANCEL = 6000
+_LARGEST_EXPONENTIAL = 2000
 _LARGEST_NUMERATOR = 3000
 _LARGEST_POWER = 8
-_LARGEST_SIMPLIFY = 600
+_LARGEST_NUMERIC = 100_000
 _GRID = 10**6
 
 
 def is_zero(expression: sp.Expr) -> str:
-    """Prove that an expression is identically zero, without looking at numbers; empty where not."""
+    """Prove that an expression is identically zero; empty where that fails."""
     expression = sp.sympify(expression)
     if expression == 0:
         return "syntactic"
+    if not is_short(expression) or expression.has(sp.nan, sp.zoo):
+        return ""
     expression = sp.expand(expression)
     if expression == 0:
         return "expand"
-    if expression.has(sp.nan, sp.zoo):
-        return ""
     if expression.is_number and abs(expression.evalf(30)) > sp.Float("1e-20"):
         return ""
-    for name, attempt in (("cancel", sp.cancel), ("simplify", sp.simplify)):
-        try:
-            if attempt(expression) == 0:
-                return name
-        except (sp.PolynomialError, NotImplementedError):
-            continue
-    return ""
+    found = _prove(expression, exponentials=False)
+    return "" if found == NUMERIC else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,30 +79,33 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
     expression = sp.sympify(expression)
     if expression == 0:
         return "syntactic"
-    expression = sp.expand(quotients(expression))
-    if expression == 0:
-        return "expand"
-    known = _positive(expression, box)
-    signed = sp.expand(expression.xreplace(known))
-    if signed == 0:
-        return "expand"
-    terms = list(sp.Add.make_args(signed))
-    values = _values(terms, {known.get(s, s): bounds for s, bounds in box.items()})
+    known: dict[sp.Symbol, sp.Symbol] = {}
+    if is_short(expression):
+        expression = sp.expand(quotients(expression))
+        if expression == 0:
+            return "expand"
+        known = _positive(expression, box)
+        expression = sp.expand(expression.xreplace(known))
+        if expression == 0:
+            return "expand"
+    parts = list(sp.Add.make_args(expression))
+    values = _values(parts, {known.get(s, s): bounds for s, bounds in box.items()})
     if values is None or not _vanish(values):
         return ""
-    return max((_prove(sp.Add(*group)) for group in _groups(terms, values)), key=_ORDER.index)
+    return max((_prove(sp.Add(*group)) for group in _groups(parts, values)), key=_ORDER.index)
 
 
-def _prove(expression: sp.Expr) -> str:
-    """Prove what numbers say is zero."""
+def _prove(expression: sp.Expr, exponentials: bool = True) -> str:
+    """Prove that an expanded expression is zero, as far as its length allows."""
     if expression == 0:
         return "expand"
+    length = size(expression) if is_short(expression) else _LARGEST_NUMERIC
     for name, attempt, limit in (
         ("cancel", _cancel, _LARGEST_CANCEL),
-        ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL),
-        ("simplify", sp.simplify, _LARGEST_SIMPLIFY),
+        ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL if exponentials else 0),
+        ("simplify", sp.simplify, LARGEST_SIMPLIFY),
     ):
-        if expression.count_ops() > limit or _size_over_one(expression) > _LARGEST_NUMERATOR:
+        if length > limit or _size_over_one(expression) > _LARGEST_NUMERATOR:
             continue
         try:
             if attempt(expression) == 0:
@@ -197,9 +196,14 @@ def _points(symbols: list[sp.Symbol], box: Box) -> Iterator[list[sp.Rational]]:
 
 def _values(terms: list[sp.Expr], box: Box) -> list[list[Any]] | None:
     """Values of terms at random points of the box, to 100 digits; None where there are too few."""
+    if any(size(term) > _LARGEST_NUMERIC for term in terms):
+        return None
     mpmath: Any = import_module("mpmath")
     symbols = sorted(set().union(*(term.free_symbols for term in terms)), key=str)
-    function = sp.lambdify(symbols, terms, "mpmath", cse=True)
+    try:
+        function = sp.lambdify(symbols, terms, "mpmath", cse=True)
+    except NotImplementedError:
+        return None
     found: list[list[Any]] = []
     with mpmath.workdps(_WORKING):
         for point in _points(symbols, box):

@@ -7,6 +7,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import cancel_common_factors, products_to_sums
+from obsynth.derive.algebra.sizes import LARGEST_ROW, size, symbols
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
@@ -21,7 +22,7 @@ from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
 Entry = tuple[int, int]
 _SAMPLES = 96
 # Expanding a longer entry costs more than the zeros it may show.
-_LONG = 500
+_LONG = 1000
 _KINDS = ("x", "u", "p", "rho", "d", "f", "w")
 # Two forms of a row are compared on boxes of this share of the ranges.
 _SHARE, _BOXES = 0.25, 24
@@ -82,7 +83,6 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
     jacobian, quotients = _differentiated(model, rhs, columns, constants)
     linear = None if part is None else (part.A if kind == "x" else part.B)
     wrt_symbols = [s.symbol for s in getattr(model, kind)]
-    symbolic = sp.Matrix(rows).jacobian(wrt_symbols) if wrt_symbols else sp.zeros(len(rows), 0)
     quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
     places, values, shifts, shift_symbols = [], [], [], []
     expressions: dict[Entry, sp.Expr] = {}
@@ -93,7 +93,7 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
             if not present and offset == 0.0:
                 continue
             value = jacobian[i, j] if present else ca.SX(0)
-            exact = substitute(symbolic[i, j], model.constant_values)
+            exact = _exact_entry(rows[i], wrt_symbols[j], f"J{i + 1}_{j + 1}", model)
             if offset != 0.0:
                 symbol = ca.SX.sym(f"a{i + 1}{j + 1}")
                 shifts.append((offset, offset))
@@ -101,7 +101,7 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
                 value, exact = value - symbol, exact - rational(offset)
             if part is not None:
                 exact = exact.subs(quiet)
-            if exact.count_ops() < _LONG:
+            if size(exact) < _LONG:
                 exact = sp.expand(exact)
             if exact == 0:
                 continue
@@ -134,6 +134,14 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
         expressions,
         quotients,
     )
+
+
+def _exact_entry(row: sp.Expr, symbol: sp.Symbol, name: str, model: Plant) -> sp.Expr:
+    """Differentiate a row exactly; of one that is too long, say only what it depends on."""
+    if size(row) > LARGEST_ROW:
+        signals = symbols(row) - set(model.constant_values)
+        return sp.Function(name)(*sorted(signals, key=str))
+    return substitute(sp.diff(substitute(row, {}), symbol), model.constant_values)
 
 
 def _all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:
@@ -173,6 +181,8 @@ def _preferred_rows(
         return bool(lower[0, 0] <= 0.0 <= upper[0, 0])
 
     for i, typed in enumerate(rows):
+        if size(typed) > LARGEST_ROW:
+            continue
         row = typed
         shorter = cancel_common_factors(substitute(typed, {}), may_vanish)
         if shorter is not None:

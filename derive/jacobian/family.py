@@ -19,6 +19,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.algebra.sizes import expanded, simplified
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import UNIT_ROUNDOFF, round_number, up
@@ -429,9 +430,9 @@ class _Prover:
     def _accept(self, entry: Entry, coefficients: dict[Entry, sp.Expr]) -> AffineDependence | None:
         combined = sum((c * self.entries[e] for e, c in coefficients.items()), sp.Integer(0))
         difference = self.entries[entry] - combined
-        rest = sp.expand(difference)
+        rest = expanded(difference)
         if rest.free_symbols & self.variables:
-            rest = sp.simplify(rest)
+            rest = simplified(rest)
             if rest.free_symbols & self.variables:
                 return None
         proof = is_zero(difference - rest)

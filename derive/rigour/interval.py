@@ -6,8 +6,9 @@ step of ``nextafter`` encloses the exact result. Zeros that are exact stay exact
 of ``-5e-324`` in place of 0 would leave the domain of a square root.
 
 ``nan`` in either end stands for "nothing is known": it propagates through every operation here and
-is turned into the whole line by whoever reads the result. It arises from ``0 * inf``, from
-operands outside a domain and from a division by an interval with zero inside.
+is turned into the whole line by whoever reads the result. It arises from operands outside a domain
+and from a division by an interval with zero inside. An infinite end stands for numbers without
+limit, of which overflow makes some, never for infinity itself.
 
 Doubles rounded to a chosen side.
 
@@ -125,17 +126,24 @@ _LARGEST = sp.Integer(int(sys.float_info.max))
 
 def rational(value: float) -> sp.Rational:
     """Return the rational number that a double is."""
+    if not math.isfinite(value):
+        raise DerivationError(f"{value} is no rational number: it is not finite", value=value)
     fraction = Fraction(float(value))
     return sp.Rational(fraction.numerator, fraction.denominator)
 
 
+def exact(expression: sp.Expr) -> sp.Expr:
+    """Write floats as the rationals they are; arithmetic with floats would round and overflow."""
+    floats = {number: sp.Rational(number) for number in expression.atoms(sp.Float)}
+    return expression.xreplace(floats) if floats else expression
+
+
 def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """Put exact numbers in place of symbols; floats of the user become the rational they are."""
-    result = sp.sympify(expression)
-    if present := {s: values[s] for s in result.free_symbols if s in values}:
+    """Put exact numbers in place of symbols; floats of the user become the rationals they are."""
+    result = exact(sp.sympify(expression))
+    if present := {s: exact(values[s]) for s in result.free_symbols if s in values}:
         result = result.subs(present)
-    floats = {number: rational(float(number)) for number in result.atoms(sp.Float)}
-    return result.xreplace(floats) if floats else result
+    return result
 
 
 def round_number(number: sp.Expr) -> tuple[float, float]:
@@ -212,6 +220,7 @@ Interval = tuple[FloatArray, FloatArray]
 
 _INF = np.inf
 _EPS = float(np.finfo(float).eps)
+_MOST = float(np.finfo(float).max)
 
 
 def point(value: float) -> Interval:
@@ -221,8 +230,12 @@ def point(value: float) -> Interval:
 
 
 def widen(a: Interval, ulps: int) -> Interval:
-    """Push both ends outwards by a number of units in the last place."""
-    lo, hi = a
+    """Push both ends outwards by a number of units in the last place.
+
+    An infinite end stands for numbers without limit, never for infinity itself: what overflows is
+    at least about the largest double.
+    """
+    lo, hi = np.minimum(a[0], _MOST), np.maximum(a[1], -_MOST)
     return down(lo - ulps * _EPS * np.abs(lo)), up(hi + ulps * _EPS * np.abs(hi))
 
 
@@ -267,15 +280,28 @@ def subtract(a: Interval, b: Interval) -> Interval:
 
 def twice(a: Interval) -> Interval:
     """Return 2 a, exact apart from overflow."""
-    return 2.0 * a[0], 2.0 * a[1]
+    return np.minimum(2.0 * a[0], _MOST), np.maximum(2.0 * a[1], -_MOST)
+
+
+def _corners(operation: Callable[..., FloatArray], a: Interval, b: Interval) -> Interval:
+    """Smallest and largest of what an operation makes of the ends; 0 inf and inf / inf count as 0.
+
+    The one is the limit of zeros, the other lies between the values at the remaining ends.
+    """
+    corners = [operation(x, y) for x in a for y in b]
+    lo, hi = (end(end(*corners[:2]), end(*corners[2:])) for end in (np.minimum, np.maximum))
+    unclear = np.isnan(lo)
+    if unclear.any():
+        unclear &= ~(np.isnan(a[0]) | np.isnan(a[1]) | np.isnan(b[0]) | np.isnan(b[1]))
+        corners = [np.where(unclear & np.isnan(c), 0.0, c) for c in corners]
+        lo, hi = (end(end(*corners[:2]), end(*corners[2:])) for end in (np.minimum, np.maximum))
+    return lo, hi
 
 
 def multiply(a: Interval, b: Interval) -> Interval:
     """Return a * b for independent operands."""
     (al, ah), (bl, bh) = a, b
-    p, q, r, s = al * bl, al * bh, ah * bl, ah * bh
-    lo = np.minimum(np.minimum(p, q), np.minimum(r, s))
-    hi = np.maximum(np.maximum(p, q), np.maximum(r, s))
+    lo, hi = _corners(np.multiply, a, b)
     return (
         _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
         _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),
@@ -285,9 +311,7 @@ def multiply(a: Interval, b: Interval) -> Interval:
 def divide(a: Interval, b: Interval) -> Interval:
     """Return a / b; a divisor with zero at one end gives a half line, with zero inside nothing."""
     (al, ah), (bl, bh) = np.broadcast_arrays(*a), np.broadcast_arrays(*b)
-    p, q, r, s = al / bl, al / bh, ah / bl, ah / bh
-    lo = np.minimum(np.minimum(p, q), np.minimum(r, s))
-    hi = np.maximum(np.maximum(p, q), np.maximum(r, s))
+    lo, hi = _corners(np.divide, (al, ah), (bl, bh))
     lo, hi = (
         _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
         _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),

@@ -8,6 +8,9 @@ Factors that cancel: x**2/sqrt(x) is x sqrt(x), which has no division and is def
 CasADi differentiates x**(5/2) = x**2 sqrt(x) by the product rule, and the quotient by a root that
 comes out of it has no bound where the root is zero. Products and quotients are therefore seen as
 powers, in halves, of what they are made of.
+
+Exponentials that saturate: e/(c + k e) with e = exp(z) is 1/(c exp(-z) + k), which is narrower and
+does not overflow. Derivatives of logistic functions are such products.
 """
 
 from __future__ import annotations
@@ -64,7 +67,7 @@ def factors(graph: Graph, index: int) -> Factors:
 def _apart(graph: Graph, index: int) -> Factors:
     node = graph.nodes[index]
     if index in graph.constants:
-        return Factors(constants=[(index, 1)])
+        return Factors() if graph.exact(index) == 1.0 else Factors(constants=[(index, 1)])
     if node.op == "negate":
         return Factors(-1.0).times(factors(graph, node.args[0]), 1)
     if node.op == "twice":
@@ -92,22 +95,55 @@ def cancelled(graph: Graph, a: int, b: int, power: int) -> int | None:
         for factor, half in second.halves.items()
         if half * power * first.halves.get(factor, 0) < 0
     ]
-    if not common:
-        return None
     product = first.times(second, power)
+    if not _saturate(graph, product.halves) and not common:
+        return None
     if any(not product.halves[factor] and factor in product.roots for factor in common):
         # all that would be left of a root is that its operand may not be negative
         return None
+    return _rebuilt(graph, product, product.halves)
+
+
+def _rebuilt(graph: Graph, product: Factors, halves: dict[int, int]) -> int:
+    """Return the number and the constants of a product, times powers."""
     sides: dict[int, list[int]] = {1: [], -1: []}
     for node, side in product.constants:
         sides[side].append(node)
-    for factor, half in product.halves.items():
+    for factor, half in halves.items():
         if half:
             sides[1 if half > 0 else -1] += _powers(graph, factor, abs(half), product.roots)
     if product.number != 1.0:
         sides[1].append(graph.number(product.number, product.number))
     top, bottom = (_product(graph, sides[side]) for side in (1, -1))
     return graph.plain("divide", [top, bottom]) if sides[-1] else top
+
+
+def _saturate(graph: Graph, halves: dict[int, int]) -> bool:
+    """Divide sums c + k e below a product by the exponentials e above it."""
+    changed = False
+    for e in [k for k, half in halves.items() if half > 1 and graph.nodes[k].op == "exp"]:
+        for total in [k for k, half in halves.items() if half < -1]:
+            for c, share in _splits(graph, total):
+                product = factors(graph, share)
+                if c not in graph.constants or product.halves != {e: 2}:
+                    continue
+                whole = min(halves[e], -halves[total]) // 2
+                inverse = graph.plain("exp", [_negate(graph, [graph.nodes[e].args[0]])])
+                parts = [_multiply(graph, [c, inverse]), _rebuilt(graph, product, {})]
+                saturated = _add(graph, parts)
+                halves[e] -= 2 * whole
+                halves[total] += 2 * whole
+                halves[saturated] = halves.get(saturated, 0) - 2 * whole
+                changed = True
+    return changed
+
+
+def _splits(graph: Graph, index: int) -> list[tuple[int, int]]:
+    node = graph.nodes[index]
+    if node.op != "add":
+        return []
+    a, b = node.args
+    return [(a, b), (b, a)]
 
 
 def _powers(graph: Graph, factor: int, half: int, roots: set[int]) -> list[int]:

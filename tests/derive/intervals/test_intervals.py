@@ -322,6 +322,11 @@ def test_equal_enclosures_of_constants_do_not_cancel():
             {"sine", "sqrt", "multiply", "divide"},
         ),
         (ca.sign(X[0]) * X[0], {"sign", "absolute"}),
+        # exp(-z) in place of exp(z) over a sum with it, once for every power
+        (
+            X[1] * ca.exp(X[0]) / (3 + 2 * ca.exp(X[0])) ** 2,
+            {"exp", "twice", "add", "power_int", "negate", "multiply", "divide"},
+        ),
         (ca.if_else(X[0] < X[1], X[0], X[1]), {"less", "logical_not", "if_else_zero", "select"}),
         (ca.jacobian(ca.fmin(X[0], X[1]), X[0]), {"less_equal", "add", "boundary_weight"}),
     ],

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.derive import Status, StructureError, UnboundedError, jacobian_bounds
+from obsynth.derive import (
+    Status,
+    StructureError,
+    UnboundedError,
+    jacobian_bounds,
+    split,
+)
 from obsynth.symbolic import Plant
+from obsynth.symbolic.errors import ObsynthError
 
 R = sp.Rational
 
@@ -96,6 +103,54 @@ def test_slopes_whose_squares_are_no_doubles(top):
     assert sp.Float(float(found.max[0, 0]), 30) >= sp.exp(sp.Rational(top)).evalf(30)
     assert found.max[0, 0] == pytest.approx(np.exp(top), rel=1e-12)
     assert str(found.dependences[0]).startswith("m21 = 0.5 m11")
+
+
+@pytest.mark.parametrize(
+    ("row", "limits", "low", "high"),
+    [
+        (lambda x, y: 1 / (1 + sp.exp(-1000 * x)), (-10, 10), 0.0, 250.0),
+        (lambda x, y: y / (1 + sp.exp(-x)), [(-1e5, 1e5), (-2, 1)], -0.5, 0.25),
+        (lambda x, y: 1 / (3 + 2 * sp.exp(500 * x)), (-10, 10), -125 / 3, 0.0),
+        (lambda x, y: sp.exp(x) / (7 + sp.exp(x)) - x, (-700, 700), -1.0, -0.75),
+        (lambda x, y: 1 / (1 + sp.exp((x - y) / sp.Float(0.003))), (-9, 9), -250 / 3, 0.0),
+    ],
+)
+def test_logistic_terms_saturate(row, limits, low, high):
+    """Mutants: the lower end of an overflow is unknown; e/(c + k e) stays, or swaps c and k."""
+    assert slope(row, limits) == pytest.approx((low, high), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("row", "low", "high"),
+    [
+        ("9e307*x**2/4", 0.0, 1.125e307),
+        ("c*x + c*y", 1e308, 1e308),
+        ("sin(c*x)/c", -1.0, 1.0),
+        ("a*b*x + y", 1e308, 1e308),
+    ],
+)
+def test_coefficients_near_the_largest_double(row, low, high):
+    plant = Plant("large")
+    plant.states("x y", range=(0, sp.Rational(1, 4)))
+    plant.params("a b c", [1e154, 1e154, 1e308])
+    plant.dynamics([row, "-y"])
+    plant.outputs(["x"])
+    found = jacobian_bounds(plant, effort="fast")
+    assert (found.min[0, 0], found.max[0, 0]) == pytest.approx((low, high), rel=1e-12)
+
+
+@pytest.mark.parametrize("row", ["1e308*x**2", "2*c*x", "a*c*x"])
+def test_coefficients_beyond_the_largest_double_are_refused(row):
+    """Mutant: values are put in before floats are rationals (OverflowError)."""
+    plant = Plant("too large")
+    plant.states("x", range=(0, sp.Rational(1, 4)))
+    plant.params("a c", [1e154, 1e308])
+    plant.dynamics([row])
+    plant.outputs(["x"])
+    with pytest.raises(ObsynthError, match=r"overflow|CasADi form inf"):
+        jacobian_bounds(plant, effort="fast")
+    with pytest.raises(ObsynthError, match=r"no equilibrium|E\+\d+ is not finite"):
+        split(plant, linear="jacobian")
 
 
 def test_no_pole_where_the_diagonal_is_left_out():

@@ -172,13 +172,90 @@ def test_a_jump_inside_is_told_and_none_where_there_is_none(name):
             assert rough == (max(map(abs, a)) >= least)
 
 
-def test_what_one_end_does_not_know_is_not_known():
-    """The cube of 1e150 overflows: no lower end, an infinite upper one. Mutant: one end asked."""
+@pytest.mark.parametrize("end", [0, 1])
+def test_what_one_end_does_not_know_is_not_known(monkeypatch, end):
+    """A rule that knows one end only. Mutant: one end asked."""
+
+    def rule(a):
+        known = list(a)
+        known[end] = np.full_like(a[end], np.nan)
+        return known[0], known[1]
+
+    monkeypatch.setitem(RULES, "sinh", rule)
+    x = ca.SX.sym("x")
+    program = Program.from_casadi(ca.Function("f", [x], [ca.sinh(x)]))
+    lower, upper = evaluate(program, np.array([[1.0]]), np.array([[2.0]]))
+    assert (lower[0, 0], upper[0, 0]) == (-np.inf, np.inf)
+
+
+def test_a_cube_that_overflows_has_a_lower_end():
     x = ca.SX.sym("x")
     program = Program.from_casadi(ca.Function("cube", [x], [x**3]))
+    lower, upper = evaluate(program, np.array([[1e150]]), np.array([[1e150]]))
+    assert 1.79e308 < lower[0, 0] < upper[0, 0] == np.inf
+
+
+def beyond(rng):
+    """An end, and exact numbers inside near it: past the largest double where it is infinite."""
+    sign = Fraction(int(rng.choice([-1, 1])))
+    kind = rng.integers(4)
+    if kind == 0:
+        return float(sign) * np.inf, [sign * Fraction(2) ** int(k) for k in (0, 1023, 1024, 2100)]
+    value = float(sign) * float(rng.choice([0.0, 1.0, rng.random() * 2.0 ** rng.integers(-900, 3)]))
+    value = float(np.clip(value, -1.5, 1.5)) * 2.0**1023 if kind == 1 else value
+    return value, [Fraction(value)]
+
+
+@pytest.mark.parametrize("name", ["add", "subtract", "multiply", "divide", "twice", "power_int"])
+def test_an_infinite_end_is_no_number_but_what_lies_beyond_all_of_them(name):
+    """Mutants: 2 * 1e308 at least inf; nan for 0 * inf; inf / inf counted as 1."""
+    rng = np.random.default_rng(5)
+    exactly = {
+        "add": lambda x, y: x + y,
+        "subtract": lambda x, y: x - y,
+        "multiply": lambda x, y: x * y,
+        "divide": lambda x, y: x / y,
+        "twice": lambda x, _: 2 * x,
+        "power_int": lambda x, _: x**3,
+    }[name]
+    operands = {"twice": 1, "power_int": 1}.get(name, 2)
+    known = 0
+    for _ in range(800):
+        points, boxes = [], []
+        for _ in range(2):
+            (one, near), (other, far) = beyond(rng), beyond(rng)
+            if abs(one) == np.inf and one == other:
+                other, far = 0.0, [Fraction(0)]
+            lo, hi = sorted((one, other))
+            inside = [p for p in near + far if lo <= p <= hi]
+            points.append(inside + [Fraction(0)] * (lo <= 0.0 <= hi))
+            boxes.append(interval(lo, hi))
+        with np.errstate(all="ignore"):
+            arguments = [*boxes[:operands], *([3] if name == "power_int" else [])]
+            lo, hi = ends(getattr(arithmetic, name)(*arguments))
+        if np.isnan(lo) or np.isnan(hi):
+            assert name == "divide", "only a quotient may be unknown"
+            assert boxes[1][0][0] <= 0.0 <= boxes[1][1][0]
+            continue
+        known += 1
+        assert lo < np.inf
+        assert hi > -np.inf
+        for x in points[0]:
+            for y in points[1]:
+                if name != "divide" or y:
+                    assert lo <= exactly(x, y) <= hi
+    assert known > 200
+
+
+@pytest.mark.parametrize("name", ["exp", "expm1", "sinh", "cosh"])
+def test_functions_that_overflow_exceed_nearly_all_doubles(name):
+    """Mutant: the lower end of what overflows is not known."""
     with np.errstate(all="ignore"):
-        lower, upper = evaluate(program, np.array([[1e150]]), np.array([[1e150]]))
-    assert (lower[0, 0], upper[0, 0]) == (-np.inf, np.inf)
+        lo, hi = ends(RULES[name](interval(800, 9000)))
+        inverse = ends(arithmetic.divide(interval(1, 1), RULES[name](interval(0.5, 9000))))
+    assert np.finfo(float).max * (1 - 1e-14) < lo < np.inf
+    assert hi == np.inf
+    assert inverse == pytest.approx((0.0, 1.0 / float(getattr(np, name)(0.5))), rel=1e-14)
 
 
 def test_a_pole_between_two_neighbouring_doubles_is_never_missed():

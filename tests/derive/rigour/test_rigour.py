@@ -4,6 +4,7 @@ Doubles are drawn over many orders of magnitude, zeros, equal ends and numbers n
 included, and judged by fractions. Without its outward step every law is broken.
 """
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -355,3 +356,16 @@ def test_doubles_in_expressions_become_the_rationals_they_are():
     found = substitute(0.1 * x + c, {c: sp.Rational(1, 3)})
     assert found == rational(0.1) * x + sp.Rational(1, 3)
     assert rational(0.1) != sp.Rational(1, 10)
+
+
+def test_products_of_doubles_are_not_rounded_on_the_way():
+    """Mutant: values are put in before floats are rationals, so that SymPy rounds their product."""
+    x, a, b = sp.symbols("x a b")
+    values = {a: sp.Float(0.1), b: sp.Float(0.3)}
+    assert substitute(a * b * x, values) == rational(0.1) * rational(0.3) * x
+    largest = {a: sp.Float(1e308), b: sp.Float(1e308)}
+    assert substitute(2 * a * b * x, largest) == 2 * rational(1e308) ** 2 * x
+    with pytest.raises(DerivationError, match="too large for a double"):
+        round_number(substitute(2 * a, largest))
+    with pytest.raises(DerivationError, match="inf is no rational number"):
+        rational(math.inf)
