@@ -18,8 +18,14 @@ from sympy.core.relational import Relational
 
 from obsynth.derive.algebra.zero_test import is_zero, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
+from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
-from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries, sample_entries
+from obsynth.derive.jacobian.entries import (
+    JacobianEntries,
+    all_variables,
+    jacobian_entries,
+    sample_entries,
+)
 from obsynth.derive.jacobian.family import (
     AffineDependence,
     AffineFamily,
@@ -32,6 +38,7 @@ from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.sxmodel import runge_kutta
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 _STEPS = (sp.floor, sp.ceiling, sp.Mod)
@@ -45,9 +52,14 @@ def refuse_jumps(model: Plant) -> None:
     Off its switching surfaces a row is smooth or has kinks. Two of them meet in no more than edges,
     round which every path leads: it is enough that the limits from both sides and the value on the
     surface agree, provably, on every surface by itself, with all switches that it moves together.
+    A step of a discretisation is as continuous as the derivatives, wherever it evaluates them.
     """
     kinds = ("x", "u", "d", "f", "w", "p", "rho")
     box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    if model.continuous is not None:
+        model, step = model.continuous, model
+        if step.discretisation != "euler" and model.rhs.has(*_CORNERS, sp.atan2):
+            box |= _stages(model, step)
     held = {symbol: rational(low) for symbol, (low, high) in box.items() if low == high}
     for name, row in zip(model.names("x"), model.rhs, strict=True):
         surface = _jump(substitute(row, model.constant_values).xreplace(held), box)
@@ -61,6 +73,25 @@ def refuse_jumps(model: Plant) -> None:
                 surface=surface,
                 condition="continuity",
             )
+
+
+def _stages(model: Plant, step: Plant) -> Box:
+    """Enclose the states at which a Runge-Kutta step evaluates the derivatives."""
+    sx = model.sx(constants="symbol")
+    points: list[ca.SX] = []
+
+    def rates(x: ca.SX) -> ca.SX:
+        points.append(x)
+        return ca.substitute(sx.rhs, sx.x, x)
+
+    runge_kutta(rates, sx.x, step.Ts)
+    variables, box = all_variables(model)
+    function = ca.Function("stages", [variables, sx.c], [ca.densify(ca.horzcat(*points))])
+    constants = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
+    ends = evaluate(Program.from_casadi(function, {1: constants}), box[:, :1], box[:, 1:])
+    lower, upper = (end.reshape(len(points), -1) for end in ends)
+    sides = zip(lower.min(axis=0), upper.max(axis=0), strict=True)
+    return dict(zip((s.symbol for s in model.x), sides, strict=True))
 
 
 def _jump(row: sp.Expr, box: Box) -> sp.Expr | None:

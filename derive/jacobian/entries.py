@@ -144,7 +144,8 @@ def _exact_entry(row: sp.Expr, symbol: sp.Symbol, name: str, model: Plant) -> sp
     return substitute(sp.diff(substitute(row, {}), symbol), model.constant_values)
 
 
-def _all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:
+def all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:
+    """Return all signals of a plant but its constants, and their ranges."""
     sx = model.sx(constants="symbol")
     variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
     return variables, np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
@@ -154,7 +155,7 @@ def _differentiated(
     model: Plant, rhs: ca.SX, columns: ca.SX, constants: list[tuple[float, float]]
 ) -> tuple[ca.SX, Quotients | None]:
     """Jacobian, through quotients with removable singularities where there are some."""
-    variables, box = _all_variables(model)
+    variables, box = all_variables(model)
     extra = model.sx(constants="symbol").c
     found = remove_singularities(ca.densify(rhs), variables, extra, box, constants)
     if found is None:
@@ -170,7 +171,7 @@ def _preferred_rows(
     rows, rhs = list(model.rhs), ca.vertsplit(sx.rhs)
     columns = ca.vertcat(sx.x, sx.u)
     signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
-    variables, box = _all_variables(model)
+    variables, box = all_variables(model)
     elements = ca.vertsplit(ca.vertcat(variables, sx.c))
     symbols = dict(zip((s.symbol for s in signals), elements, strict=True))
 
@@ -208,7 +209,7 @@ def _ends(box: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _agree(row: sp.Expr, written: ca.SX, symbols: dict[sp.Symbol, ca.SX], model: Plant) -> bool:
     """Compare a row as the user wrote it with its other form, at random points."""
-    variables, box = _all_variables(model)
+    variables, box = all_variables(model)
     values = [(symbols[s], nearest_double(v)) for s, v in model.constant_values.items()]
     numbers = [ca.DM(value) for _, value in values]
     plain = ca.substitute([written], [symbol for symbol, _ in values], numbers)[0]

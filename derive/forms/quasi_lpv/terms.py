@@ -66,7 +66,7 @@ def _numbers(model: Plant, kind: str, values: Any) -> tuple[sp.Expr, ...]:
     listed = list(np.ravel(np.asarray(values, dtype=object)))
     exact = []
     for value in listed:
-        number = sp.sympify(value) if isinstance(value, sp.Expr | int) else rational(float(value))
+        number = sp.sympify(value if isinstance(value, sp.Expr | int) else float(value))
         exact.append(rational(float(number)) if number.is_Float else number)
     if len(exact) != len(names) or not all(n.is_finite and n.is_real for n in exact):
         raise DerivationError(

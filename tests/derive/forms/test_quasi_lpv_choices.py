@@ -80,7 +80,10 @@ def test_a_preference_that_is_not_there_is_refused_with_what_is(product, prefer,
         quasi_lpv(product, prefer=prefer)
 
 
-@pytest.mark.parametrize("centre", ["middle", [1, 2, 3], ([1, 2], [0]), ([1, 2, np.nan], [0]), 5])
+@pytest.mark.parametrize(
+    "centre",
+    ["middle", [1, 2, 3], ([1, 2], [0]), ([1, 2, np.nan], [0]), ([1, 2, np.inf], [0]), 5],
+)
 def test_a_centre_that_is_none_is_refused(product, centre):
     with pytest.raises(DerivationError, match="centre"):
         quasi_lpv(product, centre=centre)

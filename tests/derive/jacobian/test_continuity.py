@@ -1,11 +1,12 @@
 """Jumps of the dynamics are refused by name, kinks are bounded by both slopes."""
 
+import casadi as ca
 import numpy as np
 import pytest
 import sympy as sp
 
 from obsynth.derive import StructureError, UnboundedError, jacobian_bounds
-from obsynth.derive.jacobian.bounds import _jump
+from obsynth.derive.jacobian.bounds import _jump, refuse_jumps
 from obsynth.symbolic import Plant
 
 half = sp.Rational(1, 2)
@@ -209,3 +210,52 @@ def test_a_quotient_that_is_not_continued_is_refused(text):
     assert plant.rhs[0].has(sp.Piecewise)
     with pytest.raises(StructureError, match="sinc, phi1 or tanhc"):
         jacobian_bounds(plant)
+
+
+def stepped(row, method):
+    plant = Plant("stepped")
+    plant.states("x y", range=(-1, 1))
+    plant.params("c", 1)
+    plant.dynamics([row, "-y"])
+    plant.outputs(["x"])
+    return plant.discretise(method, sp.Rational(1, 100))
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "sign(x - y)*(sqrt(1/10) - sqrt(abs(x - y) + 1/10))",
+        "piecewise((-x**3, x*y > 0), (-x**3 - x*y, True))",
+        "-x + piecewise((y, y > 0), (y/2, True)) + max(x, y**2)",
+    ],
+)
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_a_step_is_as_continuous_as_its_derivatives(row, method):
+    """Nested in a Runge-Kutta step their surfaces cannot be solved for a symbol."""
+    refuse_jumps(stepped(row, method))
+
+
+def test_a_jump_that_only_a_stage_meets_is_refused():
+    """Mutants: the box of the states alone; the last stage left out; h/2 in place of h."""
+    row = "c + piecewise((0, x < {}), (1, True))"
+    refuse_jumps(stepped(row.format("1.0101"), "rk4"))
+    refuse_jumps(stepped(row.format("1.0099"), "euler"))
+    refuse_jumps(stepped("c", "rk4"))
+    for at in ("0.999", "1.004", "1.0099"):
+        with pytest.raises(StructureError, match=r"row of x may jump where .*x.* = 0"):
+            refuse_jumps(stepped(row.format(at), "rk4"))
+    with pytest.raises(StructureError, match="may jump where x - y = 0"):
+        refuse_jumps(stepped("sign(x - y)", "euler"))
+
+
+def test_the_bounds_of_a_step_with_a_nested_surface_hold():
+    plant = stepped("sign(x - y)*(sqrt(1/10) - sqrt(abs(x - y) + 1/10))", "rk4")
+    found = jacobian_bounds(plant, effort="fast")
+    step = ca.Function("step", [plant.sx().x], [plant.sx().rhs])
+    rng = np.random.default_rng(2)
+    for _ in range(300):
+        a, b = rng.uniform(-1, 1, (2, 2))
+        b = a + (b - a) * 10.0 ** rng.uniform(-4, 0)
+        change = np.array(step(a) - step(b)).ravel()
+        ends = np.sort([found.min[0] * (a - b), found.max[0] * (a - b)], axis=0).sum(axis=1)
+        assert ends[0] - 1e-12 <= change[0] <= ends[1] + 1e-12
