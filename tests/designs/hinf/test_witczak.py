@@ -385,6 +385,7 @@ def test_a_changed_sector_is_not_certified(change, claim, designs):
 @pytest.mark.parametrize(
     "change",
     [
+        lambda r: r["bound"]["printed"].__setitem__(0, -1e-3),
         lambda r: r["bound"]["printed"].__setitem__(1, -1e-3),
         lambda r: r["gains"].update(D=[[0.5, 0.0]]),
         lambda r: r["bound"].update(decay=0.1),
