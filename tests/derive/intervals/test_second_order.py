@@ -369,6 +369,15 @@ def test_what_is_not_known_of_a_constant_is_not_lost(at_once, bent):
     assert moved.upper[1] >= -alone.attained_lower[0]
 
 
+@pytest.mark.parametrize(
+    "roof",
+    [-ca.fabs(X[0] - 0.3), X[1] - 2 * ca.fabs(X[0] + X[1] - 0.3), ca.fmin(X[0], 0.6 - X[0])],
+)
+def test_what_has_a_kink_is_not_split_into_facets(exactly, at_once, roof):
+    """Mutant: second derivatives that are not known taken for zero, and the roof for convex."""
+    assert not wrong_bounds(exactly, roof, ROOM)
+
+
 def test_terms_of_the_mean_value_form_hold_the_exact_products():
     """Mutants: the radius, or its product with the slope, rounded to nearest."""
     rng = np.random.default_rng(0)
