@@ -18,6 +18,7 @@ import importlib
 import importlib.util
 import json
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -41,8 +42,9 @@ HEAVY = (
     *("pytest", "hypothesis"),
 )
 LISTS = [Path(__file__).with_name(name) for name in ("mutants.toml", "guards.toml")]
-# Seconds after which a run of tests counts as one that hangs.
-LIMIT = 300.0
+# Seconds of the processor and of the clock after which a run of tests counts as one that hangs, and
+# bytes that it may take: an endless loop may grow.
+BUSY, LIMIT, MEMORY = 120, 600.0, 2**33
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
 
 
@@ -155,6 +157,8 @@ def begin(place: Path, job: Job, watch: Watch) -> int:
     try:
         os.setsid()
         os.chdir(place)
+        resource.setrlimit(resource.RLIMIT_CPU, (BUSY, BUSY + 10))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         output = os.open("output.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(output, 1)
         os.dup2(output, 2)
@@ -196,6 +200,7 @@ def run(
             if not ended and spent < LIMIT:
                 continue
             code = os.waitstatus_to_exitcode(status) if ended else -1
+            code = -1 if code in (-signal.SIGXCPU, -signal.SIGKILL) else code
             # what the tests have started ends with them
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child, signal.SIGKILL)
