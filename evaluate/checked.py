@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
-from obsynth.designs.detection.detector import FaultDetector
+from obsynth.designs.detection.detector import FaultDetector, core_of
 from obsynth.evaluate.domain import outside_box
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
@@ -127,16 +127,25 @@ def finite(values: FloatArray, names: tuple[str, ...]) -> None:
         )
 
 
+def state_box(observer: Observer | FaultDetector) -> FloatArray:
+    """Return the ranges of the states, (n, 2): a region of the design, else those declared."""
+    box: FloatArray = np.asarray(observer.model.box("x"), dtype=float)
+    core = core_of(observer)
+    region = None if core is None else core.domain
+    return box if region is None else np.where(np.isfinite(region), region, box)
+
+
 def broken_assumptions(
-    model: Plant, scenario: Scenario, truths: Mapping[str, FloatArray]
+    observer: Observer | FaultDetector, scenario: Scenario, truths: Mapping[str, FloatArray]
 ) -> tuple[str, ...]:
-    """Say which bounds of the observer's discrete model a run did not keep.
+    """Say which ranges and rates of the observer's discrete model a run did not keep.
 
     truths: every group of signals, (N + 1, n) each. Rates are per step, with a relative slack of
     1e-9, because differences of sampled ramps carry rounding errors.
     """
-    said: list[str] = []
-    for group in ("x", "w", "d", "u", "f", "rho"):
+    model = observer.model
+    said = outside_box(truths["x"], state_box(observer), model.names("x"), "range")
+    for group in ("w", "d", "u", "f", "rho"):
         said += outside_box(truths[group], model.box(group), model.names(group), "range")
     said += outside_box(truths["y"], model.output_ranges, model.output_names, "sensor's range")
     faults = truths["f"]

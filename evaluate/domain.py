@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.detection.comparison import RECOVERING, VOID, Void, find_voids
+from obsynth.designs.detection.comparison import RECOVERING, VOID, Void, find_voids, list_voids
 from obsynth.symbolic.arrays import FloatArray
 
-_LISTED = 5
 _WORDS = {
     1: "not initialised: no measurement has been processed yet",
     2: "an input or scheduling variable was not finite: the sets start anew",
@@ -86,8 +85,7 @@ class Domain:
             else f"x is inside the box at {int(self.x_inside.sum())} of {n} instants, "
             f"xhat at {int(self.xhat_inside.sum())}"
         )
-        more = len(self.voids) - _LISTED
-        voids = [*map(str, self.voids[:_LISTED]), *([f"{more} more such stretches"] * (more > 0))]
+        voids = list_voids(self.voids)
         return "\n".join([head, *self.left, *map(str, self.status), *voids])
 
     def _repr_html_(self) -> str:

@@ -67,7 +67,7 @@ def joint(
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
     truths = {"x": x, "y": y, **fields}
-    broken = broken_assumptions(observer.model, scenario, truths)
+    broken = broken_assumptions(observer, scenario, truths)
     return Run.collect(
         model=model,
         observer=observer,

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.comparison import list_voids
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.evaluate.checked import state_box
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.table import Table
@@ -116,7 +118,7 @@ class Run:
             status=status,
             names=names,
             units=units,
-            box=np.asarray(model.box("x"), dtype=float),
+            box=state_box(observer),
             half_widths=None if half_widths is None else np.asarray(half_widths, dtype=float),
             fault_delay=int(observer.fault_delay),
             model=model.name,
@@ -247,7 +249,7 @@ class Run:
         title = f"{self.scenario}, seed {self.seed}, {len(self.t)} instants{since}"
         columns = ["signal", "inside", "rms error", "half width at k = 0", "at the end"]
         columns += [] if self.alarm is None else ["first alarm [s]"]
-        said = (*self.outside, *self.domain.voids[:LISTED], *self.violations)
+        said = (*self.outside, *list_voids(self.domain.voids), *self.violations)
         note = "; ".join(map(str, said))
         return Table(title, columns, rows, note=note)
 

@@ -158,7 +158,7 @@ def _loop(
         scenario=scenario.name,
         seed=int(seed),
         truth=truth.description,
-        outside=(*truth.outside, *broken_assumptions(observer.model, scenario, truths)),
+        outside=(*truth.outside, *broken_assumptions(observer, scenario, truths)),
         t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
         truths=truths,
         claims=dict(zip(function.name_out()[1:], logs, strict=True)),

@@ -12,6 +12,7 @@ from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
+LISTED = 5
 VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
 
 
@@ -178,7 +179,7 @@ class Detection:
             lines += [f"{name}: {n} instants of alarm {words}" for name, n in count.items() if n]
         if not any(self.false_alarms.values()):
             lines.append("no false alarm")
-        lines += [f"some assumption failed: {void}" for void in self.violations]
+        lines += [f"some assumption failed: {void}" for void in list_voids(self.violations)]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -270,6 +271,12 @@ def stretches(there: BoolArray) -> list[tuple[int, int]]:
 def _first_run(there: BoolArray, length: int) -> int | None:
     """Return where `length` values True in a row are complete for the first time."""
     return next((a + length - 1 for a, b in stretches(there) if b - a + 1 >= length), None)
+
+
+def list_voids(voids: Sequence[Void]) -> list[str]:
+    """Say of the first few when they were, of the others how many."""
+    more = [f"{len(voids) - LISTED} more such stretches"] if len(voids) > LISTED else []
+    return [*map(str, voids[:LISTED]), *more]
 
 
 def find_voids(status: NDArray[np.int64]) -> tuple[Void, ...]:

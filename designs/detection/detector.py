@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Certificate, Guarantee
+from obsynth.designs.core.core import Core
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.comparison import Detection, RunLike, compare
@@ -173,13 +174,20 @@ class FaultDetector:
     def smallest_detectable(self) -> FloatArray | None:
         """Magnitude (n_f,) from which on an alarm is promised in the steady state: 2 w.
 
-        Infinite for a fault without bounds; None where the method does not predict its steady
-        widths. See the notes of the class for the conditions.
+        Of the mean, for methods that enclose one. Infinite for a fault without bounds and where
+        no fault of its declared range is as large; None where the method does not predict its
+        steady widths. See the notes of the class for the conditions.
         """
         if self.half_widths is None:
             return None
         widths = np.asarray(self.half_widths, dtype=np.float64)[len(self.model.x) :]
-        return 2.0 * widths
+        largest = np.abs(np.asarray(self.model.box("f"), dtype=np.float64)).max(axis=1)
+        return np.where(2.0 * widths < largest, 2.0 * widths, np.inf)
+
+    @cached_property
+    def _of_mean(self) -> bool:
+        core = core_of(self.observer)
+        return core is not None and core.mean_fault
 
     @cached_property
     def decide(self) -> ca.Function:
@@ -267,9 +275,10 @@ class FaultDetector:
         ]
         for i, (name, count) in enumerate(zip(names, self.counts, strict=True)):
             if smallest is not None and np.isfinite(smallest[i]):
+                whose = f"of the mean of {name}" if self._of_mean else f"of {name}"
                 claims.append(
-                    f"in the steady state abs({name}) > {smallest[i]:.6g} at {count} consecutive "
-                    "samples that count raises its alarm"
+                    f"in the steady state a magnitude {whose} above {smallest[i]:.6g} at {count} "
+                    "consecutive samples that count raises its alarm"
                 )
         claims.append(
             "a void sample (status bit 8) proves that some assumption failed since the last void "
@@ -337,9 +346,9 @@ class FaultDetector:
                 "give a run of its observer.",
                 faults=tuple(run.names["f"]),
             )
-        # Without predicted widths the interval may be that of a mean, which a fault enters slowly.
+        # A fault enters its mean slowly: nothing is promised for its present value.
         width = None
-        if self.half_widths is not None:
+        if self.half_widths is not None and not self._of_mean:
             width = np.asarray(run.f_upper - run.f_lower, dtype=np.float64)
         return compare(
             self.alarms(run.f_lower, run.f_upper, run.status),
@@ -359,9 +368,19 @@ class FaultDetector:
         smallest = self.smallest_detectable
         for i, (signal, count) in enumerate(zip(self.model.f, self.counts, strict=True)):
             unit = f" {signal.unit}" if signal.unit else ""
-            size = "not predicted" if smallest is None else f"above {smallest[i]:.4g}{unit}"
-            lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}")
+            size = "of no size" if smallest is None else f"above {smallest[i]:.4g}{unit}"
+            mean = " for the mean" if self._of_mean else ""
+            lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}{mean}")
         return "\n".join(lines)
+
+
+def core_of(observer: Any) -> Core | None:
+    """Return the core of an observer's step; None for a stand-in without a certificate."""
+    contract = getattr(getattr(observer, "certificate", None), "contract", None)
+    if contract is None or contract.core is None:
+        return None
+    core: Core = contract.core(observer.certificate.design)
+    return core
 
 
 def _bounded_faults(observer: Observer) -> NDArray[np.bool_]:

@@ -180,6 +180,11 @@ def build_ode(design: BankDesign) -> ca.Function:
         hidden = [corners.rate(i, o, low, high, own=ends[i]) for i in design.hidden]
         if hidden:
             rates[f"hidden_{side}"] = ca.vertcat(*hidden)
+        # What a measured state may be without a reading: these ends drift apart, never too near.
+        own = [parts[f"shown_{side}"][k] for k in range(len(design.outputs))]
+        pairs = zip(design.outputs.tolist(), own, strict=True)
+        moves = [corners.rate(i, o, low, high, own=end) for i, end in pairs]
+        rates[f"shown_{side}"] = ca.vertcat(*moves)
         drift = []
         for j, i in enumerate(design.fault_rows.tolist()):
             balance = corners.rate(i, o, low, high, faults=False)

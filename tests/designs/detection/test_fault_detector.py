@@ -333,7 +333,7 @@ def test_guarantee_and_text():
     claims = detector.guarantee.claims
     assert claims[0] == "f inside"
     assert any("alarm of g proves that" in c and "at 4 samples" in c for c in claims)
-    assert any("abs(f) > 0.15 at 1 consecutive samples" in c for c in claims)
+    assert any("a magnitude of f above 0.15 at 1 consecutive samples" in c for c in claims)
     assert any("status bit 8" in c and "some assumption failed" in c for c in claims)
     assert "g: alarm after 4 samples, promised above 0.15" in str(detector)
     assert detector.method == "differences with fault_detector"
@@ -361,11 +361,17 @@ def test_refusals():
         FaultDetector(observer).detect(replace(run, fault_delay=0))
 
 
+@pytest.fixture(scope="module")
+def settled_peak(tank_split, tank_bounds):
+    """A horizon that lets the bounds settle: the predicted widths are those of an old copy."""
+    return ob.BoundedErrorUIO(bounds="peak", horizon=5000).design(tank_split, tank_bounds)
+
+
 @pytest.mark.parametrize("persistence", [1, 3])
 @pytest.mark.parametrize("name", ["FS1", "FS2"])
-def test_quadruple_tank(peak, tank, name, persistence):
+def test_quadruple_tank(settled_peak, tank, name, persistence):
     """Peak bounds of Buciakowski's plant: ramps are found when promised, and told apart."""
-    detector = ob.FaultDetector(peak, persistence=persistence)
+    detector = ob.FaultDetector(settled_peak, persistence=persistence)
     run = ob.simulate(tank, detector, ob.scenarios.quadruple_tank(name))
     found = detector.detect(run)
     np.testing.assert_array_equal(found.alarm, run.alarm)
@@ -379,9 +385,11 @@ def test_quadruple_tank(peak, tank, name, persistence):
         assert event.promised is not None
         assert event.alarm <= event.promised
         if event.onset > 3000:
-            # Long after the transient the ramp of 0.05 V/s is promised at the predicted size.
-            level = abs(run.f[event.promised, ("f1", "f2").index(event.fault)])
-            assert smallest[event.fault] < level
+            # Long after the transient the ramp of 0.05 V/s is promised at the predicted size, or
+            # before it where the interval is narrower than predicted.
+            at = event.promised, ("f1", "f2").index(event.fault)
+            level = abs(run.f[at])
+            assert run.f_upper[at] - run.f_lower[at] < level
             assert level <= smallest[event.fault] + 0.05 * (persistence + 1)
 
 
@@ -397,7 +405,6 @@ def test_quadruple_tank_detector_in_c(peak, tmp_path):
         assert project.comparison.vectors == 2000
 
 
-@pytest.mark.xfail(strict=False, reason="the step of the peak bounds forgets the glitch")
 @pytest.mark.parametrize("size", [10.0, 100.0, 1e4, 1e20])
 def test_a_glitch_of_one_sensor_raises_no_false_alarm(peak, tank, size):
     """y1 is wrong at one sample of a calm run: the violation is reported, no fault.
@@ -413,9 +420,8 @@ def test_a_glitch_of_one_sensor_raises_no_false_alarm(peak, tank, size):
     _, y = (np.array(v) for v in truth(x, u, *zeros))
     y[0, at] += size
     near = np.column_stack([x - 1, x + 1])
-    *_, lower, upper, status, alarm = detector.step.mapaccum(steps)(
-        detector.memory0(x, x_range=near), u, y
-    )
+    many = detector.step.mapaccum("many", steps, {"allow_duplicate_io_names": True})
+    *_, lower, upper, status, alarm = many(detector.memory0(x, x_range=near), u, y)
     status = np.array(status).ravel().astype(int)
     run = SimpleNamespace(
         names={"f": tank.names("f")},

@@ -58,7 +58,7 @@ def test_a_delay_of_the_bounds_that_is_forgotten_shows(interval):
     forgetful = ob.FaultDetector(replace(interval, fault_delay=0))
     steps = 90
     faults = np.zeros((steps + 1, 1))
-    faults[40:80] = 2.0
+    faults[40:80] = 0.99
     base = ob.scenarios.interval_example(0, steps)
     scenario = ob.Scenario(**{**vars(base), "faults": faults})
     run = ob.simulate(interval.model, forgetful, scenario)
@@ -88,12 +88,33 @@ def test_three_tanks_delays(bank, engine):
     assert all(event.isolated for event in found.events)
     # The bank encloses a weighted mean, so nothing is promised for the present value.
     assert [event.promised for event in found.events] == [None, None]
-    assert detector.smallest_detectable is None
+    assert np.isinf(detector.smallest_detectable).all()
     later = ob.FaultDetector(bank, persistence=11).detect(run)
     # The noise pulls single intervals back over zero, so eleven in a row take much longer.
     for name, delay in later.delays.items():
         assert delay >= found.delays[name] + 0.1 - 1e-9
     assert not (later.alarm & ~found.alarm).any()
+
+
+def test_a_mean_is_promised_as_such(bank):
+    """A short fault above the smallest detectable mean need not be seen, and is not promised.
+
+    Mutants: `_of_mean` false; a promise of faults that are larger than declared.
+    """
+    narrow = ob.FaultDetector(ob.FilterBank(Ts=0.01).design(ob.plants.three_tanks()))
+    smallest = narrow.smallest_detectable
+    assert (smallest < 6e-5).all()
+    assert any("of the mean of theta1 above" in claim for claim in narrow.guarantee.claims)
+    scenario = ob.scenarios.three_tanks(end=21.0)
+    faults = np.zeros_like(scenario.faults)
+    faults[2000:2010, 0] = 8e-5
+    scenario = ob.Scenario(**{**vars(scenario), "faults": faults})
+    run = ob.simulate(ob.plants.three_tanks(), narrow, scenario, substeps=1)
+    (event,) = narrow.detect(run).events
+    assert event.promised is None and event.alarm is None
+    wide = ob.FaultDetector(bank)
+    assert not any("in the steady state" in claim for claim in wide.guarantee.claims)
+    assert "promised above inf" in str(wide)
 
 
 def test_a_mean_outlasts_its_fault(bank):
@@ -111,7 +132,7 @@ def test_a_mean_outlasts_its_fault(bank):
 
 def faulty_step(steps=90):
     base = ob.scenarios.interval_example(0, steps)
-    return ob.Scenario(**{**vars(base), "faults": np.full((steps + 1, 1), 2.0)})
+    return ob.Scenario(**{**vars(base), "faults": np.full((steps + 1, 1), 0.99)})
 
 
 SCENARIOS = {
