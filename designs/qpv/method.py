@@ -34,7 +34,14 @@ from obsynth.designs.qpv.model import (
 from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
-from obsynth.designs.qpv.step import build_core, build_ode, first_memory, memory_sizes, shared
+from obsynth.designs.qpv.step import (
+    build_core,
+    build_ode,
+    first_memory,
+    found_again,
+    memory_sizes,
+    shared,
+)
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -279,5 +286,6 @@ class QPVObserver(Method):
             raise printed_refusal(setting, gains)
         design = synthesise(setting, self.options(), gains, self.Ts)
         rate = design.alpha if design.noise is None else design.noise.rate
-        seconds = min(_SETTLED / rate, MOST_CALLS * design.Ts) if rate > 0.0 else 0.0
-        return replace(design, options=self.settling(seconds, design.Ts)) if seconds else design
+        most = MOST_CALLS * design.Ts
+        seconds = min(_SETTLED / rate, most) if rate > 0.0 and found_again(design) else most
+        return replace(design, options=self.settling(seconds, design.Ts))

@@ -293,6 +293,13 @@ def build_core(design: QPVDesign) -> Core:
     return Core(run, begin, place, domain=domain, bridges=True)
 
 
+def found_again(design: QPVDesign) -> bool:
+    """Whether the bound of V begins below 1 from the declared ranges, around their middle."""
+    boxes = [design.plant.box(kind).reshape(-1, 2) for kind in ("x", "f")]
+    reach = 0.5 * np.diff(np.vstack(boxes), axis=1)[:, 0]
+    return design.reset < 1.0 or bool(reach @ np.abs(design.P) @ reach <= 1.0)
+
+
 def shared(design: QPVDesign) -> tuple[str, ...]:
     """Return what both copies have in common: the level too where no set follows from it."""
     return ("xhat", "fhat") if design.bounded else ("xhat", "fhat", "level")
