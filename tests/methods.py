@@ -118,6 +118,7 @@ METHODS = {
         spoilt=(("bound", "mu"), 0.999, "lmi"),
         option={"mu": 0.0},
         gains=("K", "F", "H", "D"),
+        detects=False,
     ),
     "interval_observer": Entry(
         ob.IntervalObserver(),
