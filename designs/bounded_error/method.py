@@ -26,7 +26,7 @@ from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read,
 from obsynth.designs.bounded_error.peak.design import bound_peak, design_peak
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
-from obsynth.designs.bounded_error.step import build_core, first_memory, memory_sizes
+from obsynth.designs.bounded_error.step import build_core, first_memory, memory_sizes, settling
 from obsynth.designs.bounded_error.synthesis import (
     EllipsoidSolution,
     Objective,
@@ -130,6 +130,7 @@ class BoundedErrorUIO(Method):
         memory=memory_sizes,
         first=first_memory,
         quiet=True,
+        settle=settling,
         core=build_core,
         shared=("z", "fhat", "prediction"),
     )

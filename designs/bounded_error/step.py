@@ -23,6 +23,8 @@ ROUND_UP = 1.0 + 2.0**-50
 ULPS = 2.0**-50
 # Above the relative rounding error of the few dozen operations of each formula below.
 UP = 1.0 + 2.0**-44
+SETTLED = 0.01
+MOST_CALLS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +127,31 @@ def running_bound(design: UioDesign) -> RuntimeBound:
     """Return how the half widths of a design evolve."""
     ellipsoid = isinstance(design.bound, EllipsoidBound)
     return ellipsoid_runtime(design) if ellipsoid else peak_runtime(design)
+
+
+def settling(
+    design: UioDesign, box: FloatArray, calls: int | None = None
+) -> tuple[int, FloatArray]:
+    """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
+
+    They begin from boxes of half widths `box`, around estimates that are as near as the limits say;
+    with `calls` given, the half widths after so many.
+    """
+    bound, n = running_bound(design), len(design.A)
+    steady = bound.steady
+    near = steady * (1.0 + SETTLED)
+    ends = np.column_stack([-box, box])
+    # the truth may be at one end of its box, and the estimate beyond the other
+    z = near[:n] + noise_offset(design) + np.abs(design.T) @ box[:n]
+    kept = {"z": ca.SX(ca.DM(z)), "fhat": ca.SX(ca.DM(near[n:] + box[n:]))}
+    first = first_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), kept)
+    s = np.array(ca.evalf(first)).ravel()
+    k = 0
+    while k < (MOST_CALLS if calls is None else calls):
+        if calls is None and np.all(bound.half_widths(s) <= near):
+            break
+        s, k = bound.decay @ s + bound.offset, k + 1
+    return k, bound.half_widths(s) * (1.0 + 2.0**-30)
 
 
 def equations(design: UioDesign) -> ca.Function:

@@ -21,8 +21,8 @@ the assumptions hold after v. Until then a violation that contradicts nothing ma
 Estimates need no second copy: a core is begun around whatever its estimate is.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -41,6 +41,7 @@ from obsynth.symbolic.arrays import FloatArray
 HORIZON = 400
 """N where nothing else is said."""
 MOST_CALLS = 10**9
+_LATE = 2
 YOUNG = "_2"
 """What the names of the younger copy's parts of the memory end with."""
 
@@ -49,12 +50,13 @@ YOUNG = "_2"
 class Watch:
     """Options of the guard, the same for every method.
 
-    horizon: N, calls after which a copy of sets and bounds takes over from an older one
+    horizon: N, calls after which a copy of sets and bounds takes over from an older one; None:
+        as many as the core's bounds take to settle
     recovery: N_rec, calls for which the status says that the sets are recovering
     cuts: parts of the contractor that are used
     """
 
-    horizon: int
+    horizon: int | None
     recovery: int
     cuts: tuple[Cut, ...]
 
@@ -62,16 +64,17 @@ class Watch:
     def of(cls, options: Mapping[str, object]) -> "Watch":
         """Read what a design stores, or refuse it."""
         horizon, recovery, cuts = (options.get(name) for name in ("horizon", "recovery", "cuts"))
-        horizon = HORIZON if horizon is None else horizon
+        given = HORIZON if horizon is None else horizon
         named: Any = CUTS if cuts is None else cuts
         known = isinstance(named, list | tuple) and all(name in CUTS for name in named)
-        counts = [n for n in (horizon, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
+        counts = [n for n in (given, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
         if not known or len(counts) < 2:
             raise CertificateError(
                 f"the stored design cannot be read: horizon {horizon!r}, recovery {recovery!r} and "
                 f"cuts {cuts!r} are no options of the guard"
             )
-        return cls(counts[0], counts[1], tuple(c for c in CUTS if c in named))
+        found = None if horizon is None else counts[0]
+        return cls(found, counts[1], tuple(c for c in CUTS if c in named))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,7 @@ class Guard:
     delay: of the fault interval, 0 or 1
     Ts: from one call to the next
     shared: parts of the memory that estimates are made of, which both copies have in common
+    settle: of the method, see `Contract`
     """
 
     plant: Plant
@@ -92,6 +96,7 @@ class Guard:
     Ts: float
     precision: str = "double"
     shared: tuple[str, ...] = ()
+    settle: Callable[[FloatArray, int | None], tuple[int, FloatArray]] | None = None
 
     @property
     def discrete(self) -> bool:
@@ -134,17 +139,43 @@ class Guard:
         """What the data say by themselves."""
         return Contractor(self.plant, self.Ts, self.watch.cuts, self.precision)
 
+    @cached_property
+    def settled(self) -> tuple[int, FloatArray | None]:
+        """N, and the half widths of a core that began N calls ago; None where that is not known.
+
+        A core begins from what one instant says: ranges, strips, the inversion, two calls late
+        where a fault has no declared range.
+        """
+        horizon = self.watch.horizon
+        if self.settle is not None:
+            unbounded = np.full(len(self.plant.x) + len(self.plant.f), np.inf)
+            cuts = tuple(cut for cut in self.contractor.cuts if cut != "image")
+            begun = replace(self.contractor, cuts=cuts).half_widths(unbounded, self.delay)
+            n, declared = len(self.plant.x), np.diff(self.plant.box("f").reshape(-1, 2), axis=1)
+            begun[n:] = np.minimum(begun[n:] + self.contractor.rates, 0.5 * declared[:, 0])
+            if np.isfinite(begun).all():
+                late = _LATE if horizon is None else min(_LATE, horizon - 1)
+                calls, widths = self.settle(begun, None if horizon is None else horizon - late)
+                return calls + late, widths
+        return HORIZON if horizon is None else horizon, None
+
+    @property
+    def horizon(self) -> int:
+        """N."""
+        return self.settled[0]
+
     def widths(self, core: FloatArray | None) -> FloatArray | None:
         """Return steady half widths of the returned sets from the core's; None without any."""
         n, n_f = len(self.plant.x), len(self.plant.f)
         own = np.full(n + n_f, np.inf) if core is None else core
+        own = own if self.settled[1] is None else self.settled[1]
         found = self.contractor.half_widths(own, self.delay)
         return found if np.isfinite(found).any() else None
 
 
 def monitored(guarantee: Guarantee, guard: Guard) -> Guarantee:
     """Add what the guard makes of a method's guarantee, and where it ends."""
-    plant, N = guard.plant, guard.watch.horizon
+    plant, N = guard.plant, guard.horizon
     claims = [
         "the returned sets hold the state and the faults at every instant k for which the "
         "assumptions held at all instants after the last void one (status bit 8), or from the "

@@ -8,6 +8,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from inspect import signature
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
@@ -24,7 +25,7 @@ from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitore
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import plain
 from obsynth.designs.core.step import Step
-from obsynth.designs.core.stepping import extended, fill, slices
+from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -69,6 +70,8 @@ class Contract(Generic[D]):
     shared: parts of the memory that estimates are made of, or a function of the design
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
+    settle: of a design, half widths of the sets that its core begins from, and a number of calls
+        or None: how many calls its bounds take to settle, or that number, and its half widths then
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """
@@ -82,12 +85,12 @@ class Contract(Generic[D]):
     numbers: Callable[[D], Numbers]
     memory: Callable[[D], Mapping[str, int]]
     first: Callable[..., Mapping[str, ArrayLike]]
-    core: Callable[[D], Core] | None = None
-    step: Callable[[D], ca.Function] | None = None
+    core: Callable[[D], Core]
     shared: tuple[str, ...] | Callable[[D], tuple[str, ...]] = ()
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
+    settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray]] | None = None
     quiet: bool = False
 
     def to_record(self, design: Any) -> dict[str, Any]:
@@ -112,35 +115,23 @@ class Contract(Generic[D]):
         design: Any = certificate.require().design
         plant: Plant = design.plant
         numbers, guard = self.numbers(design), self.guard(design)
-        if self.core is None:
-            assert self.step is not None
-            step, half_widths, performance = (
-                self.step(design),
-                numbers.half_widths,
-                numbers.performance,
-            )
-            promised = self.guarantee(design)
-        else:
-            step = Step(guard, self.core(design)).build()
-            half_widths, performance = guard.widths(numbers.half_widths), dict(numbers.performance)
-            if numbers.half_widths is not None:
-                performance["core_half_widths"] = numbers.half_widths
-            promised = monitored(self.guarantee(design), guard)
+        performance = dict(numbers.performance)
+        if numbers.half_widths is not None:
+            performance["core_half_widths"] = numbers.half_widths
+        layout = guard.layout()
         ode = None if self.ode is None else self.ode(design)
-        if ode is not None and self.core is not None:
-            ode = extended(ode, self.memory(design), self.layout(design), YOUNG)
         return Observer(
             method=self.name,
             model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
-            step=step,
-            memory_layout=self.layout(design),
+            step=Step(guard, self.core(design)).build(),
+            memory_layout=layout,
             gains=numbers.gains,
             performance=performance,
-            half_widths=half_widths,
+            half_widths=guard.widths(numbers.half_widths),
             certificate=certificate,
-            guarantee=promised,
+            guarantee=monitored(self.guarantee(design), guard),
             fault_delay=self.fault_delay,
-            ode=ode,
+            ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,
             searched=numbers.searched,
         )
@@ -156,11 +147,12 @@ class Contract(Generic[D]):
             plant.Ts if plant.Ts is not None else design.Ts,
             getattr(design, "precision", "double"),
             self.shared(design) if callable(self.shared) else self.shared,
+            None if self.settle is None else partial(self.settle, design),
         )
 
     def layout(self, design: Any) -> dict[str, slice]:
         """Return which entries of the memory hold what."""
-        return slices(self.memory(design)) if self.core is None else self.guard(design).layout()
+        return self.guard(design).layout()
 
     def start(
         self,
@@ -179,11 +171,9 @@ class Contract(Generic[D]):
                 f"memory0 of {self.name} takes {more}; it knows no {option!r}", option=option
             )
         given = Start.read(design.plant, guess, x_range, f_range, y0)
-        parts = self.first(design, given, **options)
-        if self.core is not None:
-            f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
-            parts = self.guard(design).first(parts, given.x, f_box)
-        return fill(self.layout(design), parts)
+        guard, parts = self.guard(design), self.first(design, given, **options)
+        f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
+        return fill(guard.layout(), guard.first(parts, given.x, f_box))
 
 
 CONTRACTS: dict[str, Contract[Any]] = {}
@@ -197,8 +187,8 @@ class Method:
     A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
 
     horizon: N, number of calls after which a set that was begun anew takes over from an older one:
-        nothing that happened more than 2 N calls ago matters to what is returned. By default 400,
-        and in continuous time as many as the slowest sets take to settle
+        nothing that happened more than 2 N calls ago matters to what is returned. By default as
+        many as the method's own sets take to settle, or 400
     recovery: number of calls after a void one that the status marks as recovering
     cuts: what the returned sets are cut with beside the method's own, of ``"ranges"``,
         ``"strips"``, ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()``

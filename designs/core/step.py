@@ -174,7 +174,7 @@ class Step:
 
     def build(self) -> ca.Function:
         """Assemble the function."""
-        N, age = float(self.guard.watch.horizon), self.part["age"]
+        N, age = float(self.guard.horizon), self.part["age"]
         have = age > 0.5
         both = have, ca.logic_and(have, ca.fabs(age - N) > 0.5)
         sets = [self._sets(end, one) for end, one in zip(("", YOUNG), both, strict=True)]
@@ -222,7 +222,7 @@ class Step:
 
     def _moved(self, old: _Copy, young: _Copy, void: ca.SX) -> dict[str, ca.SX]:
         """Return the parts of the next memory."""
-        N, age = float(self.guard.watch.horizon), self.part["age"] + 1.0
+        N, age = float(self.guard.horizon), self.part["age"] + 1.0
         going = ca.logic_and(ca.logic_not(void), ca.logic_and(self.finite, self.covered))
         over = age >= 2.0 * N - 0.5
         turn = ca.logic_or(over, ca.fabs(age - N) < 0.5)
