@@ -11,6 +11,7 @@ with y = C x + W2 w + delta,
 All of it is at most `UioDesign.rounding`, which bounds and recursions count as a disturbance.
 """
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -132,11 +133,12 @@ def _outward(box: FloatArray) -> FloatArray:
     return np.stack([box[:, 0] - slack, box[:, 1] + slack], axis=1)
 
 
+@functools.lru_cache(maxsize=8)
 def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
     """Return what the allowance has to hold of one step, (n + n_f,), and whether it is proved.
 
-    Where a comparison or a jump decides within rounding, the bound may be of no use; the allowance
-    that older designs have is then an assumption.
+    Where branches of several states meet, the bound may be of no use; 2^-40 of the largest state is
+    then assumed.
     """
     step = of_step(design)
     size = max(1.0, float(np.abs(finite_box(design.plant, "x")).max()))

@@ -250,6 +250,21 @@ def test_a_plant_that_no_bound_is_found_for_keeps_its_assumption():
     assert "not proved" in guarantee(design).assumptions[-1]
 
 
+def test_kinks_in_one_state_are_proved():
+    """Mutant: comparisons that are not taken apart."""
+    plant = ob.Plant("kinks")
+    x, z = plant.states("x z", range=(-5, 5))
+    plant.disturbances("w", bound=0.1)
+    kink = sp.Piecewise((x / 4, x > 1), (x / 3 - sp.Rational(1, 12), True))
+    plant.dynamics([kink, z / 3 + x / 7 + sp.Abs(z) / 50 + sp.sign(x) * x / 90], Ts=1)
+    plant.outputs([x, z])
+    design, _ = designed(plant, gamma=0.05)
+    named = {claim.name: claim for claim in claims(design)}
+    assert named["rounding"].holds
+    assert "assumed" not in named["rounding"].statement
+    assert design.rounding.max() < 1e-13
+
+
 def test_the_step_runs_the_equations_that_are_proved(peak):
     """Bit for bit. Mutant: a step that forms T f + K nu in another order."""
     step, layout = build(peak)
