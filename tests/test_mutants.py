@@ -80,6 +80,8 @@ def test_files_and_reasons_of_the_list_exist():
     for entry in (*LISTS["mutant"], *LISTS["guard"]):
         for name in (entry["file"], *entry["tests"]):
             assert (ROOT / name.split("::")[0]).is_file(), name
+    for entry in LISTS["mutant"]:
+        assert (ROOT / entry["file"]).read_text().count(entry["was"]) == 1, entry["was"]
     for entry in LISTS["equivalent"]:
         leave = next(set(g.get("leave", ())) for g in LISTS["guard"] if g["file"] == entry["file"])
         found = changes((ROOT / entry["file"]).read_text(), leave)
