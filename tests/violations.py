@@ -24,9 +24,10 @@ CALM = "calm"
 SETTLED, LATEST, SPARE = 150, 40, 150
 """Samples before anything is broken, further ones within which it begins, and may last."""
 LENGTHS = (1, 1, 1, 2, 5, 10)
-FLAGS = 2 | 4 | 8 | 16
-"""Bits that say that something is wrong now. 32: a measurement was missing, which breaks nothing;
-64: something was wrong before, and what breaks meanwhile may go unnoticed."""
+FLAGS = 2 | 4 | 8
+"""Bits that say that something is wrong now. 16: there is no interval of the fault yet; 32: a
+measurement was missing, which breaks nothing; 64: something was wrong before, and what breaks
+meanwhile may go unnoticed."""
 
 
 @dataclass(frozen=True, eq=False)

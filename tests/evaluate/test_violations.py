@@ -97,7 +97,7 @@ def test_the_counts():
     miss[[161, 163, 164], 1] = True
     status[[160, 163], 1] = 8  # one flag before the end, one behind it
     miss[[161, 162], 2] = True
-    status[162:166, 2] = [32, 64, 32, 96]  # left out, recovering: no flags
+    status[162:166, 2] = [32, 64, 80, 96]  # left out, no fault yet, recovering
     status[161, 3] = 4
     miss[161, 3] = True  # flagged, so not counted
     status[170, 3] = 64
