@@ -14,6 +14,9 @@ import obsynth as ob
 from obsynth.codegen import find_compiler
 from obsynth.derive import DerivationError
 from obsynth.designs import STATUS
+from obsynth.designs.interval.claims import claims
+from obsynth.designs.interval.decoupling import shaped
+from obsynth.designs.interval.record import IntervalDesign
 
 BOX = np.tile([0.5, 1.5], (3, 1))
 
@@ -286,6 +289,13 @@ def test_memory0_says_what_is_wrong(designs):
         designs["d1"].memory0(np.ones(3), x_range=[[1, 0]] * 3)
 
 
+def test_no_numbers_are_no_zeros():
+    """Mutant: an empty gain taken for one of zeros."""
+    assert shaped([], (0, 3), "L").shape == (0, 3)
+    with pytest.raises(ob.ObsynthError, match=r"L has to be finite with shape \(2, 1\)"):
+        shaped([], (2, 1), "L")
+
+
 # -- proofs and storage -----------------------------------------------------------------------
 
 
@@ -295,6 +305,17 @@ def test_every_claim_is_proved_from_the_record(case, designs):
     names = {claim.name for claim in certificate}
     assert {"decoupling", "stability", "rounding", "model", "vertices"} <= names
     assert ("nonnegative" in names) == (case in ("b2", "c2"))
+
+
+def test_a_transformation_with_a_negative_entry_is_no_proof(designs):
+    """One coordinate turned around turns signs of R; mutant: the claim holds whatever R is."""
+    design = IntervalDesign.from_record(designs["c2"].certificate.record)
+    P = design.P.copy()
+    P[0] *= -1.0
+    turned = replace(design, P=P)
+    assert turned.least_entry < 0.0 <= design.least_entry + 1e-9
+    claim = next(claim for claim in claims(turned) if claim.name == "nonnegative")
+    assert not claim.holds
 
 
 def test_a_stored_design_is_read_as_it_was(two_faults, tmp_path):
