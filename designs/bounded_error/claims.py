@@ -285,11 +285,8 @@ def _on_rounding(design: UioDesign) -> Iterator[str]:
     listed = [
         f"{s.name} in [{a:g}, {b:g}]" for s, (a, b) in signals if (a, b) != (s.lower, s.upper)
     ]
-    where = f", and {', '.join(listed)}, estimates too" if listed else ""
-    yield (
-        f"inputs keep to their ranges{where}: there {said}, which is proved for IEEE doubles "
-        "rounded to nearest"
-    )
+    where = f"{', '.join(listed)}, estimates too: there " if listed else ""
+    yield f"{where}{said}, which is proved for IEEE doubles rounded to nearest"
 
 
 def _gains(design: UioDesign) -> dict[str, FloatArray]:

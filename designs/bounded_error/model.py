@@ -10,7 +10,7 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.record import Fading, PeakData, UioDesign
-from obsynth.designs.core.equations import curved_states
+from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
 from obsynth.symbolic import Plant
@@ -101,8 +101,9 @@ class Limits(NamedTuple):
     """Where a bound goes on: boxes of states and their estimates, of faults, of inputs.
 
     Shapes (n, 2), (n_f, 2), (n_u, 2). States on which a derivative depends keep to their ranges,
-    which the guarantee asks for anyway. Others, and faults, may leave theirs by its width on either
-    side, and where no range is declared `LARGEST_SIGNAL` stands for it.
+    which the guarantee asks for anyway, as do inputs that do not enter with constant factors.
+    Others, and faults, may leave theirs by its width on either side, and where no range is declared
+    `LARGEST_SIGNAL` stands for it.
     """
 
     x: FloatArray
@@ -113,7 +114,8 @@ class Limits(NamedTuple):
     def of(cls, plant: Plant) -> "Limits":
         """Read the limits of a plant."""
         x, f, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xfu")
-        return cls(np.where(curved_states(plant)[:, None], x, _wider(x)), _wider(f), u)
+        curved, held = curved_states(plant)[:, None], covered_inputs(plant)[:, None]
+        return cls(np.where(curved, x, _wider(x)), _wider(f), np.where(held, u, _wider(u)))
 
 
 def _wider(box: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.stepping import clip, inside
+from obsynth.designs.core.stepping import clip, inside, select
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
@@ -283,6 +283,7 @@ def build_core(design: UioDesign) -> Core:
         # a state on which a derivative depends is itself in its range by assumption
         near = inside(pick(xhat, x.lower), pick(xhat, x.upper), limits.x)
         sound = ca.logic_and(near, inside(fhat, fhat, limits.f))
+        sound = ca.logic_and(sound, inside(seen.u, seen.u, limits.u))
         return Known(
             xhat,
             fhat,
@@ -303,8 +304,13 @@ def build_core(design: UioDesign) -> Core:
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         middle, radius = shift(design, x)
+        z = Ends(middle - radius, middle + radius).nearest(kept["z"])
+        if isinstance(design.bound, EllipsoidBound) and design.bound.error == "shifted":
+            # a part of the box need not lie in the range of T, its middle and what was kept do
+            moved = ca.sum1(ca.fabs(z - kept["z"])) > 0.0
+            z = select(moved, middle, kept["z"])
         return {
-            "z": Ends(middle - radius, middle + radius).nearest(kept["z"]),
+            "z": z,
             "fhat": f.nearest(kept["fhat"]),
             "prediction": x.nearest(kept["prediction"]),
         }
