@@ -36,7 +36,7 @@ class Case:
 
     faults: (n_f,) half of the range in which faults jump
     constant: the guarantee speaks of constant faults
-    mean: forgetting rate where the fault's interval holds its discounted mean, 0 where the fault
+    means: forgetting rates where the fault's interval holds one of its discounted means
     """
 
     observer: ob.Observer
@@ -47,7 +47,7 @@ class Case:
     scheduling: Callable[[int], Any] = lambda k: []
     faults: Any = ()
     constant: bool = False
-    mean: float = 0.0
+    means: tuple[float, ...] = ()
     substeps: int | None = None
     memory: Mapping[str, Any] = field(default_factory=dict)
 
@@ -142,7 +142,7 @@ def of_method(name: str) -> Case:
         scheduling=lambda k: arrays["rho"][k % (scenario.steps + 1)],
         faults={"bounded_error_uio": [4.0, 4.0], "qpv_observer": [0.08]}.get(name, half),
         constant=name in ("set_adaptive_observer", "qpv_observer"),
-        mean=float(observer.record["filters"][0]) if name == "filter_bank" else 0.0,
+        means=tuple(observer.record["filters"]) if name == "filter_bank" else (),
         memory={"f_range": plant.box("f")} if name == "set_adaptive_observer" else {},
         substeps=None if observer.ode is None and plant.Ts is not None else 2,
     )
@@ -309,11 +309,12 @@ def record(case: Case, given: Trials) -> Record:
 
 def _age(case: Case, memory: Any) -> Any:
     """Return (B,): how many calls the mean in the fault's set goes back, from its response."""
-    if not case.mean:
+    if not case.means:
         return np.zeros(len(memory), dtype=int)
-    response = memory[:, case.observer.memory_layout["response"]][:, 0]
-    full = case.observer.record["gain"][0] / case.mean
-    return np.rint(-np.log1p(-response / full) / (case.mean * case.observer.model.Ts)).astype(int)
+    layout, rate = case.observer.memory_layout, case.means[0]
+    response = memory[:, layout["response"]][:, 0] * (memory[:, layout["begin"]][:, 0] < 0.5)
+    full = case.observer.record["gain"][0] / rate
+    return np.rint(-np.log1p(-response / full) / (rate * case.observer.model.Ts)).astype(int)
 
 
 def broken(case: Case, given: Trials, x: Any, f: Any) -> Any:
@@ -368,20 +369,25 @@ class Count:
 
 def missed(case: Case, seen: Record) -> Any:
     """Return (K, B): some set misses the truth, or a bound is no number."""
-    late, f = case.observer.fault_delay, seen.f
-    if case.mean:
-        later = np.exp(case.mean * case.observer.model.Ts * np.arange(len(f)))[:, None, None]
-        sums = np.concatenate([np.zeros_like(f[:1]), np.cumsum(later * f, axis=0)])
-        weights = np.concatenate([np.zeros((1, 1, 1)), np.cumsum(later, axis=0)])
-        k, b = np.arange(len(f))[:, None], np.arange(f.shape[1])
-        gone = weights[k, 0] - weights[k - seen.age, 0]
-        mean = (sums[k, b] - sums[k - seen.age, b]) / np.where(gone > 0.0, gone, 1.0)
-        f = np.where(gone > 0.0, mean, seen.f)
-    f = np.roll(f, late, axis=0)
-    good_f = (seen.f_lower <= f) & (f <= seen.f_upper)
+    late, good_f = case.observer.fault_delay, np.zeros(seen.f.shape, dtype=bool)
+    for f in [_mean(case, seen, rate) for rate in case.means] or [seen.f]:
+        f = np.roll(f, late, axis=0)
+        good_f |= (seen.f_lower <= f) & (f <= seen.f_upper)
     good_f[:late] = True
     good = ((seen.x_lower <= seen.x) & (seen.x <= seen.x_upper)).all(axis=2) & good_f.all(axis=2)
     return ~good
+
+
+def _mean(case: Case, seen: Record, rate: float) -> Any:
+    """Return (K, B, n_f): means since the sets began, the fault itself where they just did."""
+    f = seen.f
+    later = np.exp(rate * case.observer.model.Ts * np.arange(len(f)))[:, None, None]
+    sums = np.concatenate([np.zeros_like(f[:1]), np.cumsum(later * f, axis=0)])
+    weights = np.concatenate([np.zeros((1, 1, 1)), np.cumsum(later, axis=0)])
+    k, b = np.arange(len(f))[:, None], np.arange(f.shape[1])
+    gone = weights[k, 0] - weights[k - seen.age, 0]
+    mean = (sums[k, b] - sums[k - seen.age, b]) / np.where(gone > 0.0, gone, 1.0)
+    return np.where(gone > 0.0, mean, f)
 
 
 def counted(case: Case, given: Trials, seen: Record) -> dict[str, Count]:

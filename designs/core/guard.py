@@ -60,6 +60,11 @@ class Watch:
     recovery: int
     cuts: tuple[Cut, ...]
 
+    @property
+    def calls(self) -> int:
+        """N where a core does not say how long its bounds take to settle."""
+        return HORIZON if self.horizon is None else self.horizon
+
     @classmethod
     def of(cls, options: Mapping[str, object]) -> "Watch":
         """Read what a design stores, or refuse it."""
@@ -157,7 +162,7 @@ class Guard:
                 late = _LATE if horizon is None else min(_LATE, horizon - 1)
                 calls, widths = self.settle(begun, None if horizon is None else horizon - late)
                 return calls + late, widths
-        return HORIZON if horizon is None else horizon, None
+        return self.watch.calls, None
 
     @property
     def horizon(self) -> int:
@@ -173,11 +178,15 @@ class Guard:
         return found if np.isfinite(found).any() else None
 
 
-def monitored(guarantee: Guarantee, guard: Guard) -> Guarantee:
-    """Add what the guard makes of a method's guarantee, and where it ends."""
+def monitored(guarantee: Guarantee, guard: Guard, mean: bool) -> Guarantee:
+    """Add what the guard makes of a method's guarantee, and where it ends.
+
+    mean: whether fault intervals hold means, as the method's own claims say
+    """
     plant, N = guard.plant, guard.horizon
+    faults = "what is claimed of the faults" if mean else "the faults"
     claims = [
-        "the returned sets hold the state and the faults at every instant k for which the "
+        f"the returned sets hold the state and {faults} at every instant k for which the "
         "assumptions held at all instants after the last void one (status bit 8), or from the "
         "first call on if there was none, up to k",
         f"whatever happened up to an instant v, noticed or not: the returned sets hold them after "

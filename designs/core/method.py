@@ -115,21 +115,21 @@ class Contract(Generic[D]):
         design: Any = certificate.require().design
         plant: Plant = design.plant
         numbers, guard = self.numbers(design), self.guard(design)
+        core, layout = self.core(design), guard.layout()
         performance = dict(numbers.performance)
         if numbers.half_widths is not None:
             performance["core_half_widths"] = numbers.half_widths
-        layout = guard.layout()
         ode = None if self.ode is None else self.ode(design)
         return Observer(
             method=self.name,
             model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
-            step=Step(guard, self.core(design)).build(),
+            step=Step(guard, core).build(),
             memory_layout=layout,
             gains=numbers.gains,
             performance=performance,
             half_widths=guard.widths(numbers.half_widths),
             certificate=certificate,
-            guarantee=monitored(self.guarantee(design), guard),
+            guarantee=monitored(self.guarantee(design), guard, core.mean_fault),
             fault_delay=self.fault_delay,
             ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,
@@ -137,7 +137,7 @@ class Contract(Generic[D]):
         )
 
     def guard(self, design: Any) -> Guard:
-        """Return what watches over the core of a design."""
+        """Return what watches over the core of a design, in the ranges that it assumes."""
         plant: Plant = getattr(design, "assumed", design.plant)
         return Guard(
             plant,

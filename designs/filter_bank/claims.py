@@ -1,6 +1,7 @@
 """Proofs for the bank as it is stored, and that it speaks of the stored plant."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -57,9 +58,17 @@ def covers(design: BankDesign, fresh: BankModel) -> Iterator[Claim]:
 
 
 def numbers(design: BankDesign) -> Numbers:
-    """Return the rates of the filters, the slowest as decay, and steady half widths."""
-    decay = {"decay": float(design.filters.min())}
-    return Numbers({"filters": design.filters}, decay, steady_half_widths(design))
+    """Return the rates of the filters, the slowest as decay, and steady half widths.
+
+    ``mean_half_widths`` are those of the faults' intervals by filters, (n_f, n_l); any of them may
+    be returned.
+    """
+    performance: dict[str, Any] = {"decay": float(design.filters.min())}
+    found, half = steady_half_widths(design), None
+    if found is not None:
+        performance["mean_half_widths"] = found[1]
+        half = np.concatenate([found[0], found[1].max(axis=1)])
+    return Numbers({"filters": design.filters}, performance, half)
 
 
 def guarantee(design: BankDesign) -> Guarantee:
@@ -80,23 +89,23 @@ def guarantee(design: BankDesign) -> Guarantee:
         for name, (low, high) in zip(plant.names("w"), plant.box("w").tolist(), strict=True)
     )
     claims = [
-        f"[f_lower, f_upper] holds the mean of the fault since the start with the weights "
+        f"[f_lower, f_upper] holds a mean of the fault since the sets began, with the weights "
         f"exp(-{first:g} age), age in seconds, at every sample, however the fault moves; not its "
-        "present value. A constant fault is its own mean; without fault zero is never excluded",
-        f"the memory holds the same for every rate ({rates}), see bank_intervals: an alarm of any "
-        "of them is right",
+        f"present value. Where zero lies in it, but not in another filter's ({rates}), that one's "
+        "is returned, of the mean with its own rate. A constant fault is its own mean; without "
+        "fault since the sets began all means are zero, so zero is never excluded",
         f"{measured} lie in [x_lower, x_upper] at every sample",
     ]
     if hidden:
-        claims.insert(2, f"{hidden} too, whatever the faults do")
+        claims.append(f"{hidden} too, whatever the faults do")
     assumptions = [
         f"the plant is {plant.name} in continuous time, its inputs held between the samples "
         f"(Ts = {design.Ts:g} s)",
         f"the states stay in the region {where} at all times [monitored for {measured}: status "
-        "bit 4; after it the bank starts again from the region]",
+        "bit 8]",
         f"the faults stay in {sizes}",
         "what happens between two samples is enclosed by an envelope whose containment every step "
-        "checks; where it fails the bank starts again",
+        "checks; where it fails the bank begins anew",
         f"the step is evaluated in IEEE {design.precision} precision: the rounding errors of one "
         f"step stay below {design.rounding:.1e} of the size of its terms, which is "
         "added to the bounds",

@@ -14,8 +14,8 @@ def bank_intervals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the fault intervals of every filter of a bank.
 
-    Each holds the mean of the fault with the weights exp(-rate age); an alarm of any of them, zero
-    outside of it, proves a fault.
+    Each holds the mean of the fault since the sets began, with the weights exp(-rate age); an alarm
+    of any of them, zero outside of it, proves a fault. `Observer.step` decides by all of them too.
 
     Shapes: memory (..., n_memory), y (..., m).
     """
@@ -30,7 +30,8 @@ def bank_intervals(
     outputs, rates = design.outputs.tolist(), len(design.filters)
     places = [outputs.index(i) for i in design.fault_rows.tolist()]
     shape = (*parts.shape[:-1], len(places), rates)
-    N = parts[..., layout["response"]].reshape(shape)
+    # what begins anew at its next call knows nothing yet
+    N = (parts[..., layout["response"]] * (parts[..., layout["begin"]] < 0.5)).reshape(shape)
     found = []
     for noise, side in ((1, "upper"), (0, "lower")):
         ends = (shown[..., 0] - design.noise[:, noise]) / design.scale

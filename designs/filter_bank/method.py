@@ -33,8 +33,9 @@ class FilterBank(Method):
     Parameters
     ----------
     filters : sequence of float
-        Rates of the filters per second; the first one gives ``f_lower`` and ``f_upper``. Slow
-        filters have narrow intervals and long memories.
+        Rates of the filters per second. Slow filters have narrow intervals and long memories. The
+        first one gives ``f_lower`` and ``f_upper``, unless zero lies in its interval and not in
+        another one's.
     region : sequence of (float, float), optional
         Box of the states in which monotonicity is proved and which the bank assumes; the declared
         ranges by default.
@@ -56,7 +57,7 @@ class FilterBank(Method):
     there is no program to be solved and nothing singular to be evaluated.
 
     Between two samples all states stay in an envelope X with X_0 + [0, Ts] f(X) inside X, whose
-    containment every step checks; where it fails the bank starts again. The unmeasured states come
+    containment every step checks; where it fails the bank begins anew. The unmeasured states come
     from both ends of their own monotone equations, which no fault enters. Every measured state x
     with a fault theta, x' = c + g theta, gets for every rate l filters
 
@@ -67,9 +68,9 @@ class FilterBank(Method):
 
         [(x_lower - z_upper) / N, (x_upper - z_lower) / N]
 
-    encloses that mean, however the fault moves: not its present value, unless it is constant.
-    Without fault zero is never excluded, so an alarm of any filter proves a fault; the intervals of
-    the other rates follow from the memory (`bank_intervals`).
+    encloses that mean, however the fault moves: not its present value, unless it is constant. If
+    the fault was zero since the filters began, so are all means: an interval without zero, of any
+    filter, proves a fault. The intervals of all rates follow from the memory (`bank_intervals`).
 
     Examples
     --------

@@ -147,7 +147,7 @@ def build_core(design: BankDesign) -> Core:
             contradicted = ca.logic_or(contradicted, apart)
         low, high = _states(design, parts, shown)
         low, high = ca.fmax(low, region[:, 0]), ca.fmin(high, region[:, 1])
-        f = fault_intervals(design, parts, shown)[0]
+        f = telling(fault_intervals(design, parts, shown))
         X, contained = _envelope(design, corners, low, high)
         moved, hull = _move_hidden(design, corners, parts, X)
         moved |= _move_filters(design, corners, parts, X, hull)
@@ -255,6 +255,25 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
             high.append(ca.if_else(started, (above + slack) / safe, FAR))
         found.append(Ends(ca.vertcat(*low), ca.vertcat(*high)))
     return found
+
+
+def telling(found: Sequence[Ends]) -> Ends:
+    """Return the first filter's intervals, for a fault that another one shows before it that one's.
+
+    Each encloses a mean of the fault since the filters began, with weights of its own. A fault that
+    was zero throughout has means of zero, so zero lies in all of them: one without it is a proof
+    of the fault, whatever the others say. The one farthest from zero is taken.
+    """
+    low, high = ca.SX(found[0].lower), ca.SX(found[0].upper)
+    for j in range(low.numel()):
+        away, silent = ca.SX(0), ca.logic_and(low[j] <= 0.0, high[j] >= 0.0)
+        for other in found[1:]:
+            distance = ca.fmax(other.lower[j], -other.upper[j])
+            better = ca.logic_and(silent, distance > away)
+            low[j] = ca.if_else(better, other.lower[j], low[j])
+            high[j] = ca.if_else(better, other.upper[j], high[j])
+            away = ca.fmax(away, distance)
+    return Ends(low, high)
 
 
 def _envelope(

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.designs.core.certificate import Guarantee
-from obsynth.designs.core.guard import HORIZON, Watch
+from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import about_centre
 from obsynth.designs.qpv.claims import undisturbed
@@ -18,7 +18,7 @@ def numbers(design: QPVDesign) -> Numbers:
     widths = None
     if design.bounded:
         # without disturbances the bound shrinks for as long as a copy is kept at least
-        calls = 0 if design.noise is not None else Watch.of(design.options).horizon or HORIZON
+        calls = 0 if design.noise is not None else Watch.of(design.options).calls
         left = float(np.exp(-0.5 * design.alpha * design.Ts * calls)) * (1.0 + 2.0**-40)
         widths = np.sqrt(design.inverse_diagonal) * (left + allowance(design).value)
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}

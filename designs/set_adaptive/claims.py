@@ -206,14 +206,14 @@ def guarantee(design: SetDesign) -> Guarantee:
     else:
         claims = [
             "zeta, Omega and xi stay bounded; neither fault bounds nor state bounds are "
-            "guaranteed by the printed law, so infinite ones are returned",
+            "guaranteed by the printed law, so what is returned are the declared ranges and what "
+            "the readings say",
         ]
     assumptions = [
         f"the plant is {plant.name} in continuous time, its inputs held between the samples "
         f"(Ts = {design.Ts:g} s)",
-        f"the states stay in {where} at all times [monitored for {shown}: status bit 4; after it "
-        "the method starts again from these ranges]",
-        "the faults are constant and lie in the box given to memory0",
+        f"the states stay in {where} at all times [monitored for {shown}: status bit 8]",
+        "the faults are constant and lie in the box given to memory0, later in their ranges",
         f"a fault within {', '.join(f'[{s.lower:g}, {s.upper:g}]' for s in plant.f)} moves the "
         "outputs between the samples",
     ]

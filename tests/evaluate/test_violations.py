@@ -111,7 +111,7 @@ def test_the_counts():
     none = np.zeros((K, len(kinds), 0))
     seen = Record(x, none, status, lower, upper, none, none, broken)
     given = Trials(kinds, glitch, glitch, none, none)
-    case = SimpleNamespace(observer=SimpleNamespace(fault_delay=0), mean=0.0, window=3)
+    case = SimpleNamespace(observer=SimpleNamespace(fault_delay=0), means=(), window=3)
     found = counted(case, given, seen)
     assert found["glitch"] == Count(
         4,

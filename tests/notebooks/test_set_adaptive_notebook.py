@@ -10,7 +10,7 @@ QUESTION = """
               for r in (run, noisy)],
     "late": [[float(r.t[(r.t >= s) & (r.f_lower[:, i] > 0)][:1].sum() - s)
               for i, s in enumerate((200, 300))] for r in (run, noisy)],
-    "left": float(run.t[run.status & 4 > 0][0]),
+    "left": float(run.t[run.status & 8 > 0][0]),
     "ends": {law: [float(v) for v in pair] for law, pair in ends.items()},
     "coverage": min(noisy.coverage[name] for name in ("x1", "x2", "x3")),
     "valid": certificate.valid,
