@@ -40,11 +40,8 @@ class Equations:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         n, n_f = len(plant.x), len(plant.f)
-        v, known, rows, outputs, rest = _symbols(plant)
-        # what multiplies a disturbance or a parameter does so whatever the size of the state
-        J = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : n + n_f]
-        curved = np.array(ca.which_depends(ca.vec(J), v[:n], 1, False), dtype=bool).reshape(n)
-        self.curved: BoolArray = curved
+        v, known, rows, _, rest = _symbols(plant)
+        self.curved = curved = curved_states(plant)
         self.n, self.n_f, self.n_v = n, n_f, int(v.numel())
         faults = plant.box("f") + 0.0
         faults = np.column_stack([np.minimum(faults[:, 0], 0.0), np.maximum(faults[:, 1], 0.0)])
@@ -228,10 +225,14 @@ def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
 
 
 def curved_states(plant: Plant) -> BoolArray:
-    """Return on which states a derivative depends, (n,): the others enter linearly."""
+    """Return on which states a derivative by a state or a fault depends, (n,).
+
+    What multiplies a disturbance or a parameter does so whatever the size of the state.
+    """
     v, _, rows, outputs, _ = _symbols(plant)
-    slopes = ca.jacobian(ca.vertcat(rows, outputs), v)
-    found = ca.which_depends(ca.vec(slopes), v[: len(plant.x)], 1, False)
+    n, n_f = len(plant.x), len(plant.f)
+    slopes = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : n + n_f]
+    found = ca.which_depends(ca.vec(slopes), v[:n], 1, False)
     return np.array(found, dtype=bool).reshape(-1)
 
 
