@@ -63,7 +63,7 @@ def test_nothing_is_wrong_before(name):
     assert np.isfinite(seen.x).all()
 
 
-UNSETTLED = ("bounded_error_uio", "filter_bank", "qpv_observer", "four tanks, peak")
+UNSETTLED = ("bounded_error_uio", "qpv_observer", "four tanks, peak")
 """Observers whose horizon is too short for their sets to become as narrow as promised."""
 
 
