@@ -12,6 +12,7 @@ import sympy as sp
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.linear_parts import IdentityProof, constant_columns, prove_identity
 from obsynth.derive.algebra.sizes import LARGEST_ROW, size
+from obsynth.derive.algebra.slopes import jacobian
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
@@ -275,10 +276,7 @@ def _matrices(
         if any(size(row) > LARGEST_ROW for row in rows):
             # g takes up what these doubles are off
             return _slopes(model, point)
-        symbolic = (
-            sp.Matrix(rows).jacobian(x),
-            sp.Matrix(rows).jacobian(u) if u else sp.zeros(len(x), 0),
-        )
+        symbolic = (jacobian(rows, x), jacobian(rows, u))
     else:
         form = factorise(rows, x, u)
         symbolic = (form.A, form.B) if linear == "frozen" else (form.linear_A, form.linear_B)
@@ -287,11 +285,11 @@ def _matrices(
         value = entry.subs(numbers)
         if not value.is_finite:
             # the quotient t/x of a frozen form at x = 0 is the derivative of the term there
-            value = sp.limit(
-                entry.subs({s: n for s, n in numbers.items() if s != signals[j]}),
-                signals[j],
-                numbers[signals[j]],
-            )
+            others = {s: n for s, n in numbers.items() if s != signals[j]}
+            try:
+                value = sp.limit(entry.subs(others), signals[j], numbers[signals[j]])
+            except NotImplementedError:
+                value = sp.nan
         try:
             return round_number(value)[0]
         except DerivationError as error:

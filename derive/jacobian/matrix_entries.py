@@ -14,6 +14,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.algebra.slopes import jacobian
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
 from obsynth.derive.intervals.search.batch import Problem
@@ -153,8 +154,7 @@ def exact_jacobian(split_or_model: Split | Plant) -> sp.Matrix:
     else:
         model = split_or_model
         rows = model.rhs.applyfunc(lambda e: substitute(e, model.constant_values))
-    jacobian = sp.Matrix(rows).jacobian([s.symbol for s in model.x])
-    return jacobian.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+    return jacobian(rows, [s.symbol for s in model.x])
 
 
 def matrix_entries(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.slopes import jacobian
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.plant import Plant
@@ -54,11 +55,7 @@ def freeze(model: Plant, count: int = _POINTS) -> list[Frozen]:
     values = model.constant_values
     rows = [sp.Matrix([substitute(e, values) for e in part]) for part in (model.rhs, model.output)]
     kinds = {kind: [s.symbol for s in getattr(model, kind)] for kind in ("x", "d", "f", "w")}
-    parts = [
-        part.jacobian(kinds[kind]) if kinds[kind] else sp.zeros(part.rows, 0)
-        for part in rows
-        for kind in ("x", "d", "f")
-    ]
+    parts = [jacobian(part, kinds[kind]) for part in rows for kind in ("x", "d", "f")]
     quiet = dict.fromkeys([*kinds["f"], *kinds["w"]], sp.Integer(0))
     parts = [part.subs(quiet) for part in parts]
     signals = [s for kind in ("x", "u", "p", "rho", "d") for s in getattr(model, kind)]

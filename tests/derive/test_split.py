@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.derive import DerivationError, Split, StructureError, equilibrium, split
+from obsynth.derive import (
+    DerivationError,
+    Split,
+    StructureError,
+    equilibrium,
+    fault_isolability,
+    split,
+)
 from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.linear_parts import prove_identity, rounded
 from obsynth.derive.rigour import rational
@@ -307,3 +314,29 @@ def test_a_split_is_derived_again_from_its_file(parts):
     assert again.g == parts.g
     with pytest.raises(DerivationError, match="no stored split"):
         Split.from_dict({"linear": "frozen"})
+
+
+def test_signs_of_what_sympy_does_not_know_to_be_real_are_flat():
+    """SymPy leaves such derivatives undone. Mutant: they stay (ValueError, or no finite value)."""
+    plant = Plant("flat")
+    plant.states("x y", range=(1, 2))
+    plant.faults("f", range=(-1, 1))
+    row = "f - x + y*sign(sinh(x*y) + atan(x/3) + (sin(y) + 2)**(-2))"
+    plant.dynamics([row, "x - y"])
+    plant.outputs(["x", "y"])
+    parts = split(plant, ([1.5, 1.5], []), "jacobian")
+    assert parts.A.tolist() == [[-1.0, 1.0], [1.0, -1.0]]
+    assert fault_isolability(plant).detectable.all()
+
+
+def test_a_limit_that_sympy_does_not_find_is_refused_by_its_signal(monkeypatch):
+    def unknown(*_):
+        raise NotImplementedError("Don't know how to calculate the mrv")
+
+    monkeypatch.setattr(sp, "limit", unknown)
+    plant = Plant("no limit")
+    plant.states("x", range=(-1, 1))
+    plant.dynamics(["-sinh(x)"])
+    plant.outputs(["x"])
+    with pytest.raises(DerivationError, match="of x in the row of x has no finite value"):
+        split(plant, ([0], []))
