@@ -162,6 +162,8 @@ class Guard:
                 late = _LATE if horizon is None else min(_LATE, horizon - 1)
                 calls, widths = self.settle(begun, None if horizon is None else horizon - late)
                 return calls + late, widths
+            # what begins from a set without bounds would be lost for good
+            return MOST_CALLS if horizon is None else horizon, None
         return self.watch.calls, None
 
     @property

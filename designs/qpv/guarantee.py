@@ -5,18 +5,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.designs.core.certificate import Guarantee
-from obsynth.designs.core.guard import Watch
+from obsynth.designs.core.guard import MOST_CALLS, Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import about_centre
 from obsynth.designs.qpv.claims import undisturbed
 from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.step import allowance, measured_schedule
+from obsynth.designs.qpv.step import allowance, found_again, measured_schedule
 
 
 def numbers(design: QPVDesign) -> Numbers:
     """Return the gains L1, L2, ... at the vertices of the scheduling, (52), and what they reach."""
     widths = None
-    if design.bounded:
+    horizon = Watch.of(design.options).horizon
+    if design.bounded and (horizon == MOST_CALLS or found_again(design)):
         # without disturbances the bound shrinks for as long as a copy is kept at least
         calls = 0 if design.noise is not None else Watch.of(design.options).calls
         left = float(np.exp(-0.5 * design.alpha * design.Ts * calls)) * (1.0 + 2.0**-40)

@@ -63,24 +63,19 @@ def test_nothing_is_wrong_before(name):
     assert np.isfinite(seen.x).all()
 
 
-UNSETTLED = ("bounded_error_uio", "qpv_observer", "four tanks, peak")
-"""Observers whose horizon is too short for their sets to become as narrow as promised."""
-
-
 @pytest.mark.parametrize("name", CASES)
-def test_calm_sets_are_as_narrow_as_promised(name, request):
-    """All half widths of calm trials, started from the truth, against `Observer.half_widths`.
+def test_calm_sets_are_as_narrow_as_promised(name):
+    """All half widths of calm trials, from N calls on, against `Observer.half_widths`.
 
     Mutant: half widths of the core below what it proves.
     """
-    if name in UNSETTLED:
-        request.applymarker(pytest.mark.xfail(strict=False))
     given, seen = few(name)
     calm = [b for b, kind in enumerate(given.kinds) if kind == CALM]
     width = np.concatenate([seen.x_upper - seen.x_lower, seen.f_upper - seen.f_lower], axis=2)
     promised = case_of(name).observer.half_widths
     if promised is not None:
-        assert (0.5 * width[SETTLED:, calm].max(axis=(0, 1)) <= promised * (1 + 1e-9)).all()
+        settled = 0.5 * width[case_of(name).window :, calm].max(axis=(0, 1))
+        assert (settled <= promised * (1 + 1e-9)).all()
 
 
 def test_the_counts():

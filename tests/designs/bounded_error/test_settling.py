@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
+from obsynth.designs.core.guard import MOST_CALLS
 
 
 @pytest.fixture(scope="module", params=["ellipsoid", "peak"])
@@ -52,3 +53,13 @@ def test_a_shorter_horizon_widens_what_is_promised(observer):
         chosen = replace(design, options={**design.options, "horizon": horizon})
         sums.append(contract.guard(chosen).widths(observer.performance["core_half_widths"]).sum())
     assert sums[0] < sums[1] < sums[2]
+
+
+def test_what_could_not_begin_anew_is_not_given_up():
+    """Without the inversion nothing bounds a fault that declares no range."""
+    model = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
+    observer = ob.BoundedErrorUIO(gamma=0.005, cuts=()).design(model)
+    guard = observer.certificate.contract.guard(observer.certificate.design)
+    assert guard.horizon == MOST_CALLS
+    widths, _ = steady_run(observer, 1000)
+    assert np.isfinite(widths).all()
