@@ -10,7 +10,7 @@ from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import about_centre
 from obsynth.designs.qpv.claims import undisturbed
 from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.step import allowance, found_again, measured_schedule
+from obsynth.designs.qpv.step import SETTLED, allowance, found_again, measured_schedule
 
 
 def numbers(design: QPVDesign) -> Numbers:
@@ -19,8 +19,9 @@ def numbers(design: QPVDesign) -> Numbers:
     horizon = Watch.of(design.options).horizon
     if design.bounded and (horizon == MOST_CALLS or found_again(design)):
         # without disturbances the bound shrinks for as long as a copy is kept at least
-        calls = 0 if design.noise is not None else Watch.of(design.options).calls
-        left = float(np.exp(-0.5 * design.alpha * design.Ts * calls)) * (1.0 + 2.0**-40)
+        decay = 0.5 * design.alpha * design.Ts * Watch.of(design.options).calls
+        shrunk = 0.0 if design.noise is not None else min(decay, 0.5 * SETTLED)
+        left = float(np.exp(-shrunk)) * (1.0 + 2.0**-40)
         widths = np.sqrt(design.inverse_diagonal) * (left + allowance(design).value)
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
     return Numbers(gains, _performance(design), widths, ("eta",))

@@ -35,6 +35,7 @@ from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.step import (
+    SETTLED,
     build_core,
     build_ode,
     first_memory,
@@ -47,8 +48,6 @@ from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
-_SETTLED = 20.0
-"""Time constants of the bound of V for which a copy is kept by default."""
 ETA = Number(0.0, at_most=1.0, because="1 / eta enlarges the polytopes, so it lies in (0, 1]")
 DECAY = Number(at_least=0.0, because="a decay rate is not negative")
 ORDER = Number(at_least=2.0, because="the order s of the relaxation is an integer from 2 on")
@@ -287,5 +286,5 @@ class QPVObserver(Method):
         design = synthesise(setting, self.options(), gains, self.Ts)
         rate = design.alpha if design.noise is None else design.noise.rate
         most = MOST_CALLS * design.Ts
-        seconds = min(_SETTLED / rate, most) if rate > 0.0 and found_again(design) else most
+        seconds = min(SETTLED / rate, most) if rate > 0.0 and found_again(design) else most
         return replace(design, options=self.settling(seconds, design.Ts))

@@ -24,6 +24,8 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.signals import Signal
 from obsynth.symbolic.text import read_text
 
+SETTLED = 20.0
+"""Time constants of the bound of V for which a copy is kept by default."""
 # Above the rounding of the few dozen operations behind every returned number.
 _UP = 1.0 + 2.0**-40
 # What the root of V is at estimates that were placed anew.

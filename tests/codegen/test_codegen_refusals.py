@@ -83,7 +83,7 @@ def test_zeros_have_to_count_as_not_initialised(toy: Any, make_step: Any, tmp_pa
     assert refused(toy, tmp_path / "p", "memory of zeros").status == 0.0
 
 
-@pytest.mark.parametrize("status", [1.5, 33, float("nan")])
+@pytest.mark.parametrize("status", [1.5, 128, float("nan")])
 def test_a_status_that_is_no_mask(toy: Any, make_step: Any, tmp_path: Path, status: float) -> None:
     memory = ca.SX.sym("memory", 6)
     plain = make_step()
