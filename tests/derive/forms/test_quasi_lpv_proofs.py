@@ -106,6 +106,7 @@ def form_of(rows, centre):
     return form
 
 
+@pytest.mark.long
 @settings(max_examples=6, derandomize=True, deadline=None)
 @given(rows=_ROWS, centre=_CENTRE)
 def test_random_plants_of_factorable_terms_have_exact_forms(rows, centre, check_samples):

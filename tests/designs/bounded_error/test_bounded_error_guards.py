@@ -306,6 +306,7 @@ def test_shifted_error_recursion(design, tank_split, run):
     assert np.abs(xi[1:] - predicted)[1:].max() < 1e-4
 
 
+@pytest.mark.long
 def test_the_best_trace_of_a_given_gain_is_log_convex_in_gamma(base, tank_split, tank_bounds):
     """Why the search over gamma has one minimum when the gain is given."""
     prepared = read(tank_split, tank_bounds)

@@ -144,6 +144,7 @@ def test_repaired_form(tank_split, tank_bounds):
     assert observer.performance["sum_half_widths"] == pytest.approx(24.32, rel=5e-3)
 
 
+@pytest.mark.long
 def test_repaired_form_has_a_smaller_largest_gamma(base, tank_bounds):
     exact = UioDesign.from_record(base.record).data
     assert largest_gamma(plain_error(exact)) == pytest.approx(0.00903, rel=0.005)
@@ -188,6 +189,7 @@ def test_narrower_step_by_step(tank_split, tank_bounds, options, ratio):
     assert observer.performance["sum_half_widths"] / 24.32 == pytest.approx(ratio, abs=2e-3)
 
 
+@pytest.mark.long
 def test_one_ellipsoid_per_component(tank_split, tank_bounds, tank):
     method = ob.BoundedErrorUIO(
         gamma=0.0063, error="shifted", multipliers="per_component", post="per_component"
@@ -198,6 +200,7 @@ def test_one_ellipsoid_per_component(tank_split, tank_bounds, tank):
     assert min(run.coverage.values()) == 1.0
 
 
+@pytest.mark.long
 def test_gamma_search_beats_the_fixed_gamma(tank_split, tank_bounds):
     observer = ob.BoundedErrorUIO().design(tank_split, tank_bounds)
     assert observer.performance["sum_half_widths"] < 20.02

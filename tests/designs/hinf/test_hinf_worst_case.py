@@ -157,6 +157,7 @@ def test_a_level_that_is_claimed_too_low_is_exceeded(consistent):
     assert worst_case(observer, steps=2000).gain > claimed + 0.01
 
 
+@pytest.mark.long
 def test_random_plants_never_exceed_what_is_certified(bench):
     measured = [bench["measure"](seed, steps=1000, points=24, largest=3) for seed in SEEDS]
     designs = [row for row in measured if len(row) == 4]
