@@ -133,14 +133,16 @@ def build_and_compare(
     with tempfile.TemporaryDirectory(prefix="obsynth-build-") as place:
         out = Path(place)
         test, example = out / "test", out / "example"
-        source = project / "src" / f"{name}.c"
+        source, library = project / "src" / f"{name}.c", out / f"{name}.o"
+        command = [*compiler, *flags, f"-I{project / 'include'}"]
+        built = [str(source), "-c", "-o", str(library)]
+        _run([*command, *built], f"compiling {source.name}", out)
         for program, main in (
             (test, project / "tests" / f"test_{name}.c"),
             (example, project / "examples" / "main.c"),
         ):
-            include = f"-I{project / 'include'}"
-            files = [str(source), str(main), "-o", str(program), "-lm"]
-            _run([*compiler, *flags, include, *files], f"compiling {main.name}", out)
+            files = [str(main), str(library), "-o", str(program), "-lm"]
+            _run([*command, *files], f"compiling {main.name}", out)
         compared = _run(
             [str(test), str(project / "tests" / "vectors.txt")], "the test", out, (0, 1)
         )
