@@ -15,7 +15,6 @@ import sympy as sp
 
 import obsynth as ob
 from obsynth.designs import SolverTrouble
-from obsynth.designs.hinf.worst_case import worst_case
 
 METHODS = {
     "one multiplier": ob.HinfUIO(),
@@ -66,7 +65,7 @@ def measure(seed, methods=METHODS, steps=4000, points=64, largest=4):
         observer = methods[name].design(random_plant(seed, largest))
     except (ob.StructureError, ob.InfeasibleDesign, SolverTrouble) as refusal:
         return name, type(refusal).__name__
-    found = worst_case(observer, steps=steps, points=points)
+    found = ob.worst_case(observer, steps=steps, points=points)
     return name, found.certified, found.gain, found.limit
 
 

@@ -41,6 +41,7 @@ from obsynth.symbolic.arrays import FloatArray
 HORIZON = 400
 """N where nothing else is said."""
 MOST_CALLS = 10**9
+"""N of what is never given up."""
 _LATE = 2
 YOUNG = "_2"
 """What the names of the younger copy's parts of the memory end with."""
@@ -84,7 +85,7 @@ class Watch:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Builds the step of a method.
+    """What watches over the core of a design: its memory, its horizon, what is returned in the end.
 
     plant: in the time of the method
     sizes: parts of the core's memory
@@ -114,7 +115,7 @@ class Guard:
         known = len(self.plant.u) + sum(s.measured for s in self.plant.rho)
         boxes = {"x_lower": n, "x_upper": n} if self.discrete else {}
         boxes |= {"f_lower": n_f, "f_upper": n_f}
-        single = {name: size for name, size in self.sizes.items() if name != "initialised"}
+        single = dict(self.sizes)
         twice = {k: s for k, s in single.items() if k not in self.shared} | boxes | {"begin": 1}
         young = {name + YOUNG: size for name, size in twice.items()}
         before = {"before": known} if self.discrete else {}

@@ -150,10 +150,6 @@ class Contract(Generic[D]):
             None if self.settle is None else partial(self.settle, design),
         )
 
-    def layout(self, design: Any) -> dict[str, slice]:
-        """Return which entries of the memory hold what."""
-        return self.guard(design).layout()
-
     def start(
         self,
         design: Any,

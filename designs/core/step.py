@@ -139,7 +139,7 @@ class Step:
         """Run the core of one copy on its sets."""
         core, contractor, delay = self.core, self.contractor, self.guard.delay
         X, now, before = sets
-        names = [k for k in self.guard.sizes if k not in (*self.guard.shared, "initialised")]
+        names = [name for name in self.guard.sizes if name not in self.guard.shared]
         own = {name: self.part[name + end] for name in names}
         begins = self.part["begin" + end] > 0.5
         X = _declared(X, self.reset[0]).where(begins, X)
@@ -228,8 +228,6 @@ class Step:
         turn = ca.logic_or(over, ca.fabs(age - N) < 0.5)
         moved: dict[str, ca.SX] = {}
         for name in self.guard.sizes:
-            if name == "initialised":
-                continue
             mine, other = old.known.moved[name], young.known.moved[name]
             moved[name] = mine if name in self.guard.shared else select(over, other, mine)
             moved[name + YOUNG] = other

@@ -99,7 +99,8 @@ def extended(
 ) -> ca.Function:
     """Return a right-hand side for the guarded memory from one for the core's own.
 
-    Both copies of a part move alike, since they began alike; what is the guard's stands still.
+    Both copies of a part move alike, since they began alike; what is the guard's stands still, as
+    does a memory that was not initialised.
     """
     names = ode.name_in()
     ports = [ca.SX.sym(name, ode.numel_in(i)) for i, name in enumerate(names)]
@@ -110,9 +111,11 @@ def extended(
     moved = []
     for name, place in layout.items():
         base = name.removesuffix(mark)
-        moving = base in own and base != "initialised"
-        moved.append(rates[own[base]] if moving else ca.SX(place.stop - place.start, 1))
-    return ca.Function("ode", ports, [ca.densify(ca.vertcat(*moved))], names, ["dmemory"])
+        moved.append(rates[own[base]] if base in own else ca.SX(place.stop - place.start, 1))
+    running = memory[layout["initialised"]] > 0.5
+    together = ca.vertcat(*moved)
+    outputs = select(running, together, ca.SX(together.numel(), 1))
+    return ca.Function("ode", ports, [ca.densify(outputs)], names, ["dmemory"])
 
 
 def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:

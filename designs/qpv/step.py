@@ -38,11 +38,10 @@ _CELLS = 256
 def memory_sizes(design: QPVDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
-    ``xhat``, ``fhat``, ``level`` (a bound of V = e'P e, infinite where none is known) and
-    ``initialised`` (0 or 1).
+    ``xhat``, ``fhat`` and ``level`` (a bound of V = e'P e, infinite where none is known).
     """
     plant = design.plant
-    return {"xhat": len(plant.x), "fhat": len(plant.f), "level": 1, "initialised": 1}
+    return {"xhat": len(plant.x), "fhat": len(plant.f), "level": 1}
 
 
 def first_memory(
@@ -160,7 +159,7 @@ def build_ode(design: QPVDesign) -> ca.Function:
     """Return `Observer.ode`: (memory, u, y[, theta]) -> dmemory."""
     plant = design.plant
     layout = slices(memory_sizes(design))
-    memory = ca.SX.sym("memory", layout["initialised"].stop)
+    memory = ca.SX.sym("memory", layout["level"].stop)
     found = _symbols(plant)
     u, y, theta = found["u"], found["y"], found["theta"]
     equations = _Equations(design)
@@ -170,9 +169,7 @@ def build_ode(design: QPVDesign) -> ca.Function:
     rate, limit = equations.level_rate()
     grown = ca.if_else(level <= 1.0, rate * (limit - level), 0.0)
     d_state = equations.rate(state, u, y, theta, gain)
-    running = memory[layout["initialised"]] > 0.5
-    moved = ca.vertcat(d_state, grown, 0)
-    outputs = select(running, moved, ca.SX.zeros(moved.numel()))
+    outputs = ca.vertcat(d_state, grown)
     inputs = {"memory": memory, "u": u, "y": y}
     if theta.numel():
         inputs["theta"] = theta
