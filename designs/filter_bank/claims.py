@@ -15,6 +15,8 @@ def claims(design: BankDesign) -> Iterator[Claim]:
     """Prove what the guarantee of a stored bank rests on, its signs and gains taken as they are."""
     own = [int(design.signs.x[i, i]) for i in design.hidden]
     slowest = float(design.filters.min())
+    slopes = design.signs.f[design.fault_rows, np.arange(len(design.gain))]
+    smallest = float((slopes * design.gain).min())
     same = design.filters.tolist() == list(design.options["filters"])
     yield Claim(
         "falling",
@@ -25,10 +27,10 @@ def claims(design: BankDesign) -> Iterator[Claim]:
     )
     yield Claim(
         "filters",
-        "the filters are those of the options, each forgets, and its response to a fault is "
-        "positive",
-        bool(same and slowest > 0.0 and design.gain.min() > 0.0 and design.Ts > 0.0),
-        min(slowest, float(design.gain.min())),
+        "the filters are those of the options, each forgets, and its response to a fault has the "
+        "sign of the slope",
+        bool(same and slowest > 0.0 and smallest > 0.0 and design.Ts > 0.0),
+        min(slowest, smallest),
         "comparison",
     )
 

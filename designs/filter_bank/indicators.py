@@ -37,5 +37,6 @@ def bank_intervals(
         ends = (shown[..., 0] - design.noise[:, noise]) / design.scale
         rest = ends[..., places][..., None] - parts[..., layout[f"filter_{side}"]].reshape(shape)
         open_end = np.full(shape, -np.inf if noise else np.inf)
-        found.append(np.divide(rest, N, out=open_end, where=N > 0.0))
-    return found[0], found[1]
+        found.append(np.divide(rest, np.abs(N), out=open_end, where=N != 0.0))
+    rises = design.gain[:, None] > 0.0
+    return np.where(rises, found[0], -found[1]), np.where(rises, found[1], -found[0])

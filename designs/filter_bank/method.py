@@ -27,7 +27,7 @@ class FilterBank(Method):
 
     For continuous plants whose equations are monotone in every signal that is not known at run
     time, every output showing one state, y = s x + v with s > 0, and every fault entering the
-    equation of one measured state, alone in it, additively and with a positive constant factor.
+    equation of one measured state, alone in it, additively and with a constant factor.
     The flow of an unmeasured state has to fall with that state itself.
 
     Parameters
@@ -68,9 +68,10 @@ class FilterBank(Method):
 
         [(x_lower - z_upper) / N, (x_upper - z_lower) / N]
 
-    encloses that mean, however the fault moves: not its present value, unless it is constant. If
-    the fault was zero since the filters began, so are all means: an interval without zero, of any
-    filter, proves a fault. The intervals of all rates follow from the memory (`bank_intervals`).
+    (its ends exchanged where g < 0) encloses that mean, however the fault moves: not its present
+    value, unless it is constant. If the fault was zero since the filters began, so are all means:
+    an interval without zero, of any filter, proves a fault. The intervals of all rates follow from
+    the memory (`bank_intervals`).
 
     Examples
     --------

@@ -147,12 +147,12 @@ def _faults(plant: Plant, rhs: list[sp.Expr], outputs: list[int]) -> tuple[list[
                 condition="one equation for each fault",
             )
         slope = exact_slope(rhs[entered[0]], fault.symbol)
-        if not slope.is_number or not slope > 0:
+        if not slope.is_number or slope.is_zero:
             raise StructureError(
                 f"the fault {fault.name} enters the equation of {names[entered[0]]} with the "
-                f"factor {slope}; the bank needs a positive constant",
+                f"factor {slope}; the bank needs a constant",
                 symbol=fault.name,
-                condition="constant positive factors",
+                condition="constant factors",
             )
         if entered[0] in rows:
             other = plant.f[rows.index(entered[0])].name

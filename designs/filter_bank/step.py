@@ -237,7 +237,8 @@ def _states(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> tuple
 def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> list[Ends]:
     """Return the intervals of every filter, (n_f,) each: of means with the weights exp(-rate age).
 
-    ((y_low - z_upper) / N, (y_high - z_lower) / N), all numbers while the response N is zero.
+    ((y_low - z_upper) / N, (y_high - z_lower) / N), mirrored where the response N is negative; all
+    numbers while it is zero.
     """
     outputs, rates = design.outputs.tolist(), len(design.filters)
     found = []
@@ -249,10 +250,12 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
             below = shown[0][k] - parts["filter_upper"][place]
             above = shown[1][k] - parts["filter_lower"][place]
             slack = design.rounding * (ca.fabs(shown[0][k]) + ca.fabs(shown[1][k]))
-            started = N > 0.0
+            rises = design.gain[j] > 0.0
+            started = N > 0.0 if rises else N < 0.0
             safe = ca.if_else(started, N, 1.0)
-            low.append(ca.if_else(started, (below - slack) / safe, -FAR))
-            high.append(ca.if_else(started, (above + slack) / safe, FAR))
+            ends = (below - slack, above + slack) if rises else (above + slack, below - slack)
+            low.append(ca.if_else(started, ends[0] / safe, -FAR))
+            high.append(ca.if_else(started, ends[1] / safe, FAR))
         found.append(Ends(ca.vertcat(*low), ca.vertcat(*high)))
     return found
 
@@ -356,7 +359,7 @@ def _move_filters(
                 z = parts[name][j * len(rates) + k]
                 end = X[side][i]
                 slack = ca.fabs(z) + gathered * (ca.fabs(balance) + rate * ca.fabs(end))
-                slack += largest[j] * parts["response"][j * len(rates) + k]
+                slack += largest[j] * ca.fabs(parts["response"][j * len(rates) + k])
                 new = decay * z + gathered * (balance + rate * end)
                 values.append(new + sign * design.rounding * slack)
         moved[name] = ca.vertcat(*values)

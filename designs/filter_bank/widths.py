@@ -71,7 +71,7 @@ def steady_half_widths(design: BankDesign) -> tuple[FloatArray, FloatArray] | No
             step[:-2, :-2] = fades
             step[-2] = [*(gathered * slope[i, hidden]), decay, gathered * drive]
             ended = np.linalg.matrix_power(step, calls) @ [*excess, declared[i], 1.0]
-            response = float(gain) * -np.expm1(-rate * Ts * calls) / rate
+            response = abs(float(gain)) * -np.expm1(-rate * Ts * calls) / rate
             faults[j, k] = (width[i] + lost + ended[-2]) / response
     width[hidden] += np.linalg.matrix_power(fades, calls) @ excess
     range_f = np.diff(design.plant.box("f"))

@@ -9,6 +9,7 @@ from obsynth.derive.rigour import ExactMatrix
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.set_adaptive.bounds import BLOCKS
+from obsynth.designs.set_adaptive.gain import settled_response
 from obsynth.designs.set_adaptive.model import SetModel
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
@@ -46,10 +47,10 @@ def covers(design: SetDesign, fresh: SetModel) -> Iterator[Claim]:
 
 def _signs(design: SetDesign) -> Claim:
     low = float(design.plant.box("x")[:, 0].min())
-    smallest = float(min(design.C.min(initial=np.inf), design.G.min(initial=np.inf)))
+    smallest = float(design.C.min(initial=np.inf))
     return Claim(
         "signs",
-        "x >= 0 over the declared ranges, C >= 0 and G >= 0 (Assumption 1)",
+        "x >= 0 over the declared ranges and C >= 0 (Assumption 1); G of any sign",
         bool(low >= 0.0 and smallest >= 0.0),
         min(low, smallest),
         "comparison",
@@ -117,7 +118,7 @@ def _law(design: SetDesign) -> Claim:
     if design.law == "printed":
         statement = "the printed law: its order is not guaranteed, so no fault bound is reported"
     else:
-        statement = "with N >= 0 and Gamma > 0 a step of theta is a mean of two bounds"
+        statement = "with Gamma > 0 a step of theta is a mean of bounds"
     return Claim("law", statement, margin > 0.0, margin, "comparison")
 
 
@@ -236,8 +237,8 @@ def guarantee(design: SetDesign) -> Guarantee:
 
 def _performance(design: SetDesign) -> dict[str, float]:
     fastest = float((-np.diag(design.A_lower - design.L @ design.C)).max())
-    settled = design.C @ np.linalg.solve(design.L @ design.C - design.A_upper, design.G)
-    shown = settled[design.fault_outputs, np.arange(len(design.Gamma))]
+    shown = settled_response(design.L @ design.C - design.A_upper, design.C, design.G)
+    shown = shown[design.fault_outputs, np.arange(len(design.Gamma))]
     return {
         "decay": design.alpha,
         "decay_step": design.alpha_step,

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.symbolic.arrays import FloatArray
 
 _PARTS = {
     "zeta_m": "n",
@@ -128,34 +129,90 @@ def drives(
     return made[0], made[1]
 
 
+def image(matrix: FloatArray, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the ends of M a for every a between two ends, columns or matrices."""
+    plus, minus = ca.DM(np.maximum(matrix, 0.0)), ca.DM(np.minimum(matrix, 0.0))
+    return plus @ low + minus @ high, plus @ high + minus @ low
+
+
+def responses(design: SetDesign, memory: Memory) -> tuple[ca.SX, ca.SX]:
+    """Return N_m and N_M, (m, q) each: N_m theta <= r_m and r_M <= N_M theta, see `residuals`."""
+    low, high = image(design.C, memory["Omega_m"], memory["Omega_M"])
+    return -low, -high
+
+
 def residuals(design: SetDesign, memory: Memory, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return r_m = y_high - C zeta_m and r_M = y_low - C zeta_M, shape (m, 1) each."""
-    C = ca.DM(design.C)
-    return high - C @ memory["zeta_m"], low - C @ memory["zeta_M"]
+    ends = image(design.C, memory["zeta_m"], memory["zeta_M"])
+    return high - ends[0], low - ends[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """What an output says of a fault: factor * fault is on one side of rest, 0 where it is silent.
+
+    size: sum of the magnitudes of what rest and factor * fault are made of
+    """
+
+    factor: ca.SX
+    rest: ca.SX
+    size: ca.SX
+
+
+def pulls(
+    design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX], sizes: ca.SX
+) -> tuple[list[list[Pull]], list[list[Pull]]]:
+    """Return what bounds every fault from above and below, the others anywhere in their bounds.
+
+    N_m theta <= r_m bounds fault i from above where N_m,ki > 0 and from below where it is negative,
+    r_M <= N_M theta the other way; k is the output that shows it. sizes (m, 1): of the readings.
+    """
+    N, size = responses(design, memory), sizes + shown_size(design, memory)
+    bounds = memory["theta_m"], memory["theta_M"]
+    found: tuple[list[list[Pull]], list[list[Pull]]] = ([], [])
+    for i, k in enumerate(design.fault_outputs.tolist()):
+        others = [j for j in range(len(design.Gamma)) if j != i]
+        rests = []
+        for matrix, residual, least in ((N[0], r[0], ca.fmin), (N[1], r[1], ca.fmax)):
+            rest = residual[k]
+            for j in others:
+                rest = rest - least(*(matrix[k, j] * bound[j] for bound in bounds))
+            rests.append((matrix[k, i], rest))
+        for made, sides in zip(found, ((ca.fmax, ca.fmin), (ca.fmin, ca.fmax)), strict=True):
+            pairs = zip(sides, rests, strict=True)
+            made.append([Pull(side(n, 0.0), rest, size[k]) for side, (n, rest) in pairs])
+    return found
+
+
+def shown_size(design: SetDesign, memory: Memory) -> ca.SX:
+    """Return the magnitudes of what zeta - Omega theta shows, (m, 1), summed."""
+    faults = ca.fmax(ca.fabs(memory["theta_m"]), ca.fabs(memory["theta_M"]))
+    zeta, Omega = (
+        ca.fmax(ca.fabs(memory[f"{name}_m"]), ca.fabs(memory[f"{name}_M"]))
+        for name in ("zeta", "Omega")
+    )
+    size: ca.SX = ca.DM(np.abs(design.C)) @ (zeta + Omega @ faults)
+    return size
 
 
 def theta_rates(design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Return the derivatives of theta_m and theta_M.
 
-    Printed, (8): -Gamma Omega'C'(r + C Omega theta). Cooperative, with N = -C Omega >= 0: every
-    component goes towards what its own output leaves when the other faults are at their opposite
-    bounds, so that the order is kept for every Gamma:
+    Printed, (8): -Gamma Omega'C'(r + C Omega theta). Cooperative, with N = -C Omega: every
+    component goes towards what its own output leaves when the other faults are anywhere in their
+    bounds, so that the order is kept for every Gamma. Where N >= 0 that is
     theta_m,i' = Gamma_i N_ki (r_m,k - sum_{j != i} N_kj theta_M,j - N_ki theta_m,i).
     """
-    C, q = ca.DM(design.C), len(design.Gamma)
+    own = memory["theta_m"], memory["theta_M"]
+    if design.law == "printed":
+        pairs = zip(responses(design, memory), r, own, strict=True)
+        first, second = (ca.DM(design.Gamma) * (N.T @ (rest - N @ end)) for N, rest, end in pairs)
+        return first, second
     rates = []
-    for o, other, residual in (("m", "M", r[0]), ("M", "m", r[1])):
-        N = -C @ memory[f"Omega_{o}"]
-        own, opposite = memory[f"theta_{o}"], memory[f"theta_{other}"]
-        if design.law == "printed":
-            rates.append(ca.DM(design.Gamma) * (N.T @ (residual - N @ own)))
-            continue
-        parts = []
-        for i in range(q):
-            k = int(design.fault_outputs[i])
-            rest = residual[k]
-            for j in range(q):
-                rest = rest - N[k, j] * (own[i] if j == i else opposite[j])
-            parts.append(float(design.Gamma[i]) * N[k, i] * rest)
+    for found, end in zip(pulls(design, memory, r, ca.SX.zeros(len(design.C))), own, strict=True):
+        parts = [
+            sum(gain * p.factor * (p.rest - p.factor * end[i]) for p in found[i])
+            for i, gain in enumerate(design.Gamma.tolist())
+        ]
         rates.append(ca.vertcat(*parts))
     return rates[0], rates[1]

@@ -16,7 +16,13 @@ from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi import Problem
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
 from obsynth.designs.set_adaptive.equations import MONITORS, memory_sizes
-from obsynth.designs.set_adaptive.gain import Gain, analyse_gain, design_gain, gain_problem
+from obsynth.designs.set_adaptive.gain import (
+    Gain,
+    analyse_gain,
+    design_gain,
+    gain_problem,
+    settled_response,
+)
 from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
 from obsynth.designs.set_adaptive.printed import printed_gain
 from obsynth.designs.set_adaptive.record import SetDesign, System
@@ -36,7 +42,7 @@ class SetAdaptiveObserver(Method):
     """Intervals of states and constant faults by two bounding systems.
 
     For continuous plants x' = A(rho) x + B u + phi + G theta + W1 w, y = C x + v with
-    nonnegative states, C >= 0 and G >= 0, every output showing one state.
+    nonnegative states and C >= 0, every output showing one state.
 
     Parameters
     ----------
@@ -222,8 +228,8 @@ class SetAdaptiveObserver(Method):
         C, q = model.C, len(model.plant.f)
         Gamma = self._adaptation(model.plant)
         outputs = output_of_fault(C, model.A_lower_box, model.G, model.plant.names("f"))
-        # -(A_M - L C)^-1 G is where -Omega settles, and Gamma N^2 how fast theta then moves
-        settled = C @ np.linalg.solve(gain.L @ C - A_upper, model.G)
+        # Gamma N^2 is how fast theta moves when N has settled
+        settled = settled_response(gain.L @ C - A_upper, C, model.G)
         adaptation = Gamma * settled[outputs, np.arange(q)] ** 2
         longest = 1.0 / float((-np.diag(A_lower - gain.L @ C)).max())
         shortest = min(longest / 32.0, 1.0 / float(adaptation.max()))

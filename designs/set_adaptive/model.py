@@ -98,7 +98,7 @@ def read(given: Plant | Split, noise: bool = True) -> SetModel:
             "an output has an input or a constant in it; declare the output without them",
             condition="y = C x + v",
         )
-    _check_signs(plant, C, G)
+    _check_signs(plant, C)
     box = plant.box("w")
     if noise and not np.isfinite(box).all():
         name = plant.names("w")[int(np.flatnonzero(~np.isfinite(box).all(axis=1))[0])]
@@ -135,14 +135,18 @@ def read_again(design: SetDesign) -> SetModel:
 def output_of_fault(
     C: FloatArray, A_lower: FloatArray, G: FloatArray, names: tuple[str, ...]
 ) -> list[int]:
-    """Return for every fault the output that shows it first, by derivatives, then by size."""
+    """Return for every fault the output that shows it first, by derivatives, then by size.
+
+    What it does to one state may cancel what it does to another: the output that is found then
+    tells little of it, or nothing.
+    """
     flow = np.maximum(A_lower, 0.0)
     np.fill_diagonal(flow, 0.0)
     found = []
     for j, name in enumerate(names):
         reached = G[:, j]
         for _ in range(len(A_lower)):
-            shown = C @ reached
+            shown = np.abs(C @ reached)
             if shown.max() > 0.0:
                 found.append(int(np.argmax(shown)))
                 break
@@ -156,7 +160,7 @@ def output_of_fault(
     return found
 
 
-def _check_signs(plant: Plant, C: FloatArray, G: FloatArray) -> None:
+def _check_signs(plant: Plant, C: FloatArray) -> None:
     if np.any(C < 0.0):
         k, i = np.argwhere(C < 0.0)[0]
         raise StructureError(
@@ -164,15 +168,6 @@ def _check_signs(plant: Plant, C: FloatArray, G: FloatArray) -> None:
             "needs C >= 0: measure its negative",
             symbol=plant.output_names[k],
             condition="C >= 0",
-        )
-    if np.any(G < 0.0):
-        i, j = np.argwhere(G < 0.0)[0]
-        name = plant.names("f")[j]
-        raise StructureError(
-            f"the fault {name} enters the row of {plant.names('x')[i]} with a negative factor; "
-            f"Assumption 1 needs G >= 0: declare -{name} as the fault",
-            symbol=name,
-            condition="G >= 0",
         )
 
 

@@ -27,8 +27,11 @@ from obsynth.designs.set_adaptive.equations import (
     columns,
     drives,
     ends,
+    image,
     memory_sizes,
+    pulls,
     residuals,
+    responses,
     theta_rates,
 )
 from obsynth.designs.set_adaptive.record import SetDesign
@@ -130,16 +133,14 @@ def build_ode(design: SetDesign) -> ca.Function:
     d_theta = theta_rates(design, memory, r)
     smallest = ca.fmin(memory["theta_m"], memory["theta_M"])
     largest = ca.fmax(memory["theta_m"], memory["theta_M"])
+    faults = image(design.G, smallest, largest)
     changed = {"theta_m": d_theta[0], "theta_M": d_theta[1]}
     forget = 0.0 if design.window is None else 1.0 / design.window
-    for o, drive, bound, residual in (
-        ("m", lower, smallest, r[0]),
-        ("M", upper, largest, r[1]),
-    ):
-        N = -ca.DM(design.C) @ memory[f"Omega_{o}"]
+    both = zip(("m", "M"), (lower, upper), faults, r, responses(design, memory), strict=True)
+    for o, drive, fault, residual, N in both:
         changed[f"zeta_{o}"] = drive.M @ memory[f"zeta_{o}"] + drive.c
         changed[f"Omega_{o}"] = drive.M @ memory[f"Omega_{o}"] - G
-        changed[f"xi_{o}"] = drive.M @ memory[f"xi_{o}"] + drive.c + G @ bound
+        changed[f"xi_{o}"] = drive.M @ memory[f"xi_{o}"] + drive.c + fault
         changed[f"R_{o}"] = N.T @ N - forget * memory[f"R_{o}"]
         changed[f"b_{o}"] = N.T @ residual - forget * memory[f"b_{o}"]
     changed["weight"] = 1.0 - forget * memory["weight"]
@@ -159,29 +160,23 @@ def build_ode(design: SetDesign) -> ca.Function:
 def _adapt(
     design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX], sizes: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Fault bounds by backward Euler: in the cooperative law a mean of two bounds, so a bound."""
-    C, q, Ts = ca.DM(design.C), len(design.Gamma), design.Ts
-    results = []
-    for o, other, residual in (("m", "M", r[0]), ("M", "m", r[1])):
-        N = -C @ memory[f"Omega_{o}"]
-        own, opposite = memory[f"theta_{o}"], memory[f"theta_{other}"]
-        if design.law == "printed":
-            gain = ca.DM(np.diag(design.Gamma)) * Ts
-            system = ca.SX.eye(q) + gain @ N.T @ N
-            results.append(ca.densify(ca.solve(system, own + gain @ (N.T @ residual))))
-            continue
+    """Fault bounds by backward Euler: in the cooperative law a mean of bounds, so a bound."""
+    own, results = (memory["theta_m"], memory["theta_M"]), []
+    if design.law == "printed":
+        for N, residual, end in zip(responses(design, memory), r, own, strict=True):
+            gain = ca.DM(np.diag(design.Gamma)) * design.Ts
+            system = ca.SX.eye(len(design.Gamma)) + gain @ N.T @ N
+            results.append(ca.densify(ca.solve(system, end + gain @ (N.T @ residual))))
+        return results[0], results[1]
+    for found, end, sign in zip(pulls(design, memory, r, sizes), own, (1.0, -1.0), strict=True):
         parts = []
-        for i in range(q):
-            k = int(design.fault_outputs[i])
-            rest, size = residual[k], sizes[k] + ca.fabs(C[k, :] @ memory[f"zeta_{o}"])
-            for j in range(q):
-                if j != i:
-                    rest = rest - N[k, j] * opposite[j]
-                    size = size + ca.fabs(N[k, j] * opposite[j])
-            push = Ts * float(design.Gamma[i]) * N[k, i]
-            slack = design.rounding * (ca.fabs(own[i]) + push * size)
-            moved = own[i] + push * rest + (slack if o == "m" else -slack)
-            parts.append(moved / (1.0 + push * N[k, i]))
+        for i, gain in enumerate((design.Ts * design.Gamma).tolist()):
+            moved, size, weight = end[i], ca.fabs(end[i]), ca.SX(1.0)
+            for pull in found[i]:
+                moved = moved + gain * pull.factor * pull.rest
+                size = size + gain * ca.fabs(pull.factor) * pull.size
+                weight = weight + gain * pull.factor * pull.factor
+            parts.append((moved + sign * design.rounding * size) / weight)
         results.append(ca.vertcat(*parts))
     return results[0], results[1]
 
@@ -211,17 +206,17 @@ def _predict(
 ) -> dict[str, ca.SX]:
     """Move zeta, Omega and xi over one step; the last column collects what rounding may do."""
     weights = uniformisation(design.Ts, design.mu)
-    G = ca.DM(design.G)
-    q = len(design.Gamma)
-    allowed = ca.DM(np.abs(design.plant.box("f")).max(axis=1))
+    G, q = ca.DM(design.G), len(design.Gamma)
+    declared = ca.DM(np.abs(design.plant.box("f")).max(axis=1))
+    allowed = ca.fmax(declared, ca.fmax(ca.fabs(smallest), ca.fabs(largest)))
+    faults = image(design.G, smallest, largest)
     changed = {}
-    for o, drive, bound, sign in (("m", lower, smallest, -1.0), ("M", upper, largest, 1.0)):
+    for o, drive, fault, sign in (("m", lower, faults[0], -1.0), ("M", upper, faults[1], 1.0)):
         zeta, Omega, xi = (memory[f"{name}_{o}"] for name in ("zeta", "Omega", "xi"))
-        magnitude = ca.fmax(ca.fabs(zeta), ca.fabs(xi)) - Omega @ allowed
-        forced = drive.size + G @ ca.fmax(ca.fabs(bound), allowed)
-        forced = forced + ca.fabs(drive.M) @ magnitude
+        magnitude = ca.fmax(ca.fabs(zeta), ca.fabs(xi)) + ca.fabs(Omega) @ allowed
+        forced = drive.size + ca.fabs(G) @ allowed + ca.fabs(drive.M) @ magnitude
         state = ca.horzcat(zeta, xi, Omega, magnitude)
-        pushed = ca.horzcat(drive.c, drive.c + G @ bound, -G, forced)
+        pushed = ca.horzcat(drive.c, drive.c + fault, -G, forced)
         moved = apply(weights, drive.M, state, pushed)
         slack = sign * design.rounding * moved[:, 2 + q]
         changed[f"zeta_{o}"] = moved[:, 0] + slack
@@ -236,8 +231,7 @@ def _monitor(
     """Integrals (13) over all time, or with the weight exp(-(age)/window)."""
     keep = 1.0 if design.window is None else float(np.exp(-design.Ts / design.window))
     changed = {"weight": keep * memory["weight"] + design.Ts * y_finite}
-    for o, residual in (("m", r[0]), ("M", r[1])):
-        N = -ca.DM(design.C) @ memory[f"Omega_{o}"]
+    for o, residual, N in zip(("m", "M"), r, responses(design, memory), strict=True):
         for name, value in ((f"R_{o}", N.T @ N), (f"b_{o}", N.T @ residual)):
             added = ca.if_else(y_finite, design.Ts * value, ca.SX(*value.shape))
             changed[name] = keep * memory[name] + added

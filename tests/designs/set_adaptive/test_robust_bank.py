@@ -268,7 +268,9 @@ def test_inclusion_sees_a_mutant(bank, closed_loop, certify, monkeypatch, mutant
         )
     else:
         late = 1
-    broken = certify(record).observer()
+    # a response of the other sign than the slope is refused before anything runs
+    assert certify(record).valid is (mutant != "sign of the fault")
+    broken = certify(record, claims=lambda design: ()).observer()
     loop = closed_loop(broken, late=late)
     counts = [sum(violations(broken, hard_run(loop, seed))) for seed in range(12)]
     assert sum(counts) > 0
@@ -463,7 +465,7 @@ def chain(fault_rows, **changes):
     out = x[3] ** 2 / 2
     rates = [u - flow[0], flow[0] - flow[1] + w, flow[1] - flow[2], flow[2] - k * out]
     for fault, row in zip(faults, fault_rows, strict=True):
-        rates[row] += changes.get("factor", 1) * fault
+        rates[row] += (x[0] if changes.get("varying") else 1) * fault
     plant.dynamics(rates)
     plant.outputs([x[0] + v, x[3]])
     return plant
@@ -498,7 +500,7 @@ def test_parameters_disturbances_and_two_unmeasured_states():
     [
         ((0, 1), {}, "f2 enters the equation of x2, which is not measured"),
         ((0, 0), {}, "f1 and f2 enter the same equation"),
-        ((0, 3), {"factor": -1}, "f1 .*positive constant"),
+        ((0, 3), {"varying": True}, "f1 .*factor x1; the bank needs a constant"),
     ],
 )
 def test_other_plants_are_refused_by_name(rows, changes, words):

@@ -208,7 +208,7 @@ def plant_with(change=None, **changes):
         f = 0
     (v,) = plant.disturbances("v", **({} if change == "noise" else {"bound": 0.01}))
     d = plant.unknown_inputs("d")[0] if change == "unknown input" else 0
-    factor = {"negative": -1, "varying": a}.get(change, 1)
+    factor = a if change == "varying" else 1
     coupling = 3 if change == "unstable" else 1
     plant.dynamics(
         [-2 * a + coupling * b + u + factor * f + d, a - (b if change != "unstable" else -b)]
@@ -225,7 +225,6 @@ def plant_with(change=None, **changes):
         ("no fault", "declares no fault"),
         ("fault range", "fault f has no range"),
         ("noise", "disturbance v has no bound"),
-        ("negative", "f enters the row of a with a negative factor"),
         ("varying", r"B_f\[1,1\].*varies with a"),
         ("sum", "y1 does not show one state"),
         ("falls", "y1 falls with a"),
