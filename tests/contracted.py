@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import sympy as sp
+from tapes import NUMPY, tape
 
 import obsynth as ob
 from obsynth.designs.core.boxes import Ends
@@ -169,6 +170,20 @@ def vessel():
     return plant
 
 
+def by_hand():
+    """Steady half widths that a few lines of arithmetic give; the gain of h varies."""
+    plant = ob.Plant("by hand")
+    a, b, c, e = plant.states("a b c e", range=[(-9, 9), (-9, 9), (-4, 4), (-9, 9)])
+    f, g, h = plant.process_faults("f g h", range=[(-5, 5), (-9, 9), (-2, 2)], rate=[0.01, 1, 1])
+    v, w = plant.disturbances("v w", bound=[0.1, 0.2])
+    sine = sp.sin(c)
+    plant.dynamics(
+        [a / 2 - b / 4 + f / 3, b / 5 - g, c / 2 + sine / 10 + a / 10, (2 + sine) * h], Ts=1
+    )
+    plant.outputs([a + v, b + w, e + v])
+    return plant
+
+
 PLANTS = {
     p.__name__: p
     for p in (
@@ -263,16 +278,27 @@ def boxes(rng, whole, count, size):
     return np.stack([at, np.minimum(at + wide, high)], axis=1)
 
 
-def trials(plant, Ts=0.01, seed=0, count=TRIALS, size=0.5, ends=0.7):
-    """Draw boxes, truths and what follows from the equations alone."""
+def trials(plant, Ts=0.01, seed=0, count=TRIALS, size=0.5, ends=0.7, kind=np.float64):
+    """Draw boxes, truths and what follows from the equations alone.
+
+    kind: of the numbers that a step is given: ends, inputs, scheduling and readings
+    """
+
+    def stored(numbers):
+        return numbers.astype(kind).astype(float)
+
     rng = np.random.default_rng(seed)
-    x = boxes(rng, finite(plant.box("x")), count, size)
-    f = boxes(rng, finite(plant.box("f")), count, size)
+    x = stored(boxes(rng, finite(plant.box("x")), count, size))
+    f = stored(boxes(rng, finite(plant.box("f")), count, size))
     x0, f0 = drawn(rng, x, count, ends), drawn(rng, f, count, ends)
     kinds = ("u", "d", "w", "p", "rho")
     first, second = (
         {kind: signals(rng, plant.box(kind), count, ends) for kind in kinds} for _ in range(2)
     )
+    for name in ("u", "rho"):
+        first[name] = np.clip(
+            stored(first[name]), *plant.box(name).reshape(-1, 2, 1).transpose(1, 0, 2)
+        )
     call = plant.function().map(count)
 
     def at(state, fault, given):
@@ -287,7 +313,7 @@ def trials(plant, Ts=0.01, seed=0, count=TRIALS, size=0.5, ends=0.7):
     f_box = finite(plant.box("f"))
     ends_of_f = np.maximum(f0 - rates, f_box[:, [0]]), np.minimum(f0 + rates, f_box[:, [1]])
     f1 = drawn(rng, np.stack(ends_of_f, axis=1), count, ends)
-    y = at(x1, f1, second)[1]
+    y = stored(at(x1, f1, second)[1])
     curved = Contractor(plant, Ts).equations.curved
     box = np.where(curved[:, None], plant.box("x"), [-np.inf, np.inf])
     fair = ((x1 >= box[:, [0]]) & (x1 <= box[:, [1]])).all(axis=0)
@@ -317,17 +343,33 @@ def cutting(contractor):
     return ca.Function("cut", [x, f, known, y, used], [ca.cse(ca.densify(o)) for o in outputs])
 
 
+def in_single(function, given):
+    """Run the instructions of a function in single precision, columns by columns."""
+    count, kind = given[0].shape[1], np.float32
+    rows = [part.astype(kind) for part in given]
+    with np.errstate(all="ignore"):
+        found = tape(function, rows, NUMPY, lambda value: np.full(count, value, dtype=kind))
+    return np.array([np.broadcast_to(np.asarray(row, dtype=float), (count,)) for row in found])
+
+
 def cut(contractor, given, used=1.0):
     """Return X (n, 2, N), F' and F (n_f, 2, N) for all trials."""
     count = given.x.shape[2]
-    function = cutting(contractor).map(count)
 
     def flat(box):
         return box.transpose(0, 2, 1).reshape(len(box), 2 * count)
 
     known = np.vstack([given.u, given.rho])
     told = np.broadcast_to(used, given.y.shape)
-    found = function(flat(given.x), flat(given.f), known, np.where(told > 0, given.y, 0.0), told)
+    y = np.where(told > 0, given.y, 0.0)
+    if contractor.precision == "single":
+        columns = [box.reshape(-1, count, order="F") for box in (given.x, given.f)]
+        rows = in_single(cutting(contractor), [*columns, known, y, told])
+        sizes = np.cumsum([2 * len(given.x), 2 * len(given.f)])
+        parts = np.split(rows, sizes)
+        return [part.reshape(-1, 2, count, order="F") for part in parts]
+    function = cutting(contractor).map(count)
+    found = function(flat(given.x), flat(given.f), known, y, told)
     return [np.array(v).reshape(-1, count, 2).transpose(0, 2, 1) for v in found]
 
 

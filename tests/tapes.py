@@ -74,6 +74,8 @@ NUMPY = {
     "less_equal": np.less_equal,
     "logical_not": lambda a: a == 0,
     "conjunction": lambda a, b: (a != 0) & (b != 0),
+    "disjunction": lambda a, b: (a != 0) | (b != 0),
+    "ceiling": np.ceil,
     "if_else_zero": lambda a, b: np.where(a != 0, b, b.dtype.type(0)),
     "sign": np.sign,
     "power_const": np.power,

@@ -2,7 +2,8 @@
 
 Changes: rounding left out (`up(x)` becomes `x`, a unit roundoff becomes 0), the least for the
 largest, the lower end for the upper, a sign, a term or a condition dropped, a comparison negated,
-all for any, a factor halved, a refusal that is never reached, a claim that always holds. How many
+all for any, a factor halved, one branch of a choice in code for both, a refusal that is never
+reached, a claim that always holds. How many
 roundings a bound counts is left as it is: it covers a worst case that numbers do not reach.
 """
 
@@ -26,12 +27,27 @@ _PAIRS = (
 )
 SWAPPED = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
 _QUANTIFIERS = {"all": "any", "any": "all"}
+# Calls that choose or connect in code that is generated, by the number of what they are given.
+_CHOICES = {("if_else", 3): (1, 2), ("select", 3): (1, 2)}
+_CONDITIONS = {("logic_and", 2): (0, 1), ("logic_or", 2): (0, 1), ("logic_not", 1): (0,)}
 # Calls that round outwards their first argument, and numbers that stand for rounding.
 _ROUNDED = {"up", "down", "raised", "lowered", "widen", "above", "_above", "outward"}
-_ZERO = {"UNIT_ROUNDOFF", "_ULP", "_EPS", "_UNDERFLOW", "unit", "rounding", "margin", "lost"}
+_ZERO = {
+    "UNIT_ROUNDOFF",
+    "ULPS",
+    "_ULP",
+    "_EPS",
+    "_UNDERFLOW",
+    "unit",
+    "rounding",
+    "margin",
+    "lost",
+}
 _ZERO_CALLS = {"gamma_bound", "allowance"}
 _ONE = {"UP", "_ROUND", "ROUND_UP"}
 _NEGATED = {ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="}
+# Both ends of an interval have the same.
+_SIZES = {"shape", "size", "numel", "ndim"}
 # What only shows, and what a mutant cannot tell the truth about.
 _SHOWN = {"__str__", "__repr__", "_repr_html_", "__format__"}
 
@@ -207,6 +223,12 @@ class _Finder(ast.NodeVisitor):
             self.add("quantifier", node.func, front + _QUANTIFIERS[name])
         elif name == "Claim" and len(node.args) > 2:
             self.add("claim", node.args[2], "True")
+        elif name == "where" and len(node.args) == 2 and isinstance(node.func, ast.Attribute):
+            self.add("choice", node, f"({self.text(node.func.value)})")
+            self.add("choice", node, f"({self.text(node.args[1])})")
+        for kind, calls in (("choice", _CHOICES), ("condition", _CONDITIONS)):
+            for k in calls.get((name, len(node.args)), ()):
+                self.add(kind, node, f"({self.text(node.args[k])})")
         if name in _ROUNDED and node.args:
             self.visit(node.args[0])
         elif name not in _ZERO_CALLS:
@@ -223,7 +245,10 @@ class _Finder(ast.NodeVisitor):
     def visit_Attribute(self, node: ast.Attribute) -> None:
         if isinstance(node.ctx, ast.Load):
             self._swap(node, node.attr, self.text(node)[: -len(node.attr)])
-        self.visit(node.value)
+        if node.attr not in _SIZES:
+            self.visit(node.value)
+        elif isinstance(node.value, ast.Attribute):
+            self.visit(node.value.value)
 
     def _swap(self, node: ast.expr, name: str, front: str) -> None:
         other = SWAPPED.get(name)

@@ -5,15 +5,30 @@ The trials that look for a lost point also find contractors that are told less t
 
 import functools
 from dataclasses import replace
+from fractions import Fraction as F
 
 import casadi as ca
 import numpy as np
 import pytest
-from contracted import PLANTS, TRIALS, Narrow, cut, drawn, finite, following, lost, made, trials
+from contracted import (
+    PLANTS,
+    TRIALS,
+    Narrow,
+    by_hand,
+    cut,
+    drawn,
+    finite,
+    following,
+    lost,
+    made,
+    trials,
+)
 
 import obsynth as ob
+from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.contractor import CUTS, Contractor
 from obsynth.designs.core.core import Core, Known
+from obsynth.designs.core.equations import Equations
 from obsynth.designs.core.guard import Guard, Watch
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import fill
@@ -26,8 +41,8 @@ def tried(name):
 
 
 @functools.cache
-def of(name, kind=Contractor, w=1.0, rate=1.0, cuts=CUTS):
-    return kind(made(name, w, rate), 0.01, cuts)
+def of(name, kind=Contractor, w=1.0, rate=1.0, cuts=CUTS, precision="double"):
+    return kind(made(name, w, rate), 0.01, cuts, precision)
 
 
 # -- nothing is lost ---------------------------------------------------------------------------
@@ -67,6 +82,56 @@ def test_a_contractor_that_is_told_less_loses_points(name):
         assert lost(of(name, Narrow), given)[0] > 100
     shift = 2e-5 * np.diff(finite(plant.box("x")), axis=1)
     assert lost(of(name), replace(given, x1=given.x1 + shift))[0] > 100
+
+
+@pytest.mark.parametrize(
+    "name", ["tanks", "pmsm", "flexible_joint", "mixed_rows", "gains", "corners"]
+)
+def test_single_precision_loses_no_point(name):
+    """Ends, inputs and readings of single precision, instructions rounded to it.
+
+    Mutants: the step of doubles; the rounding of a reading or of a coefficient left out.
+    """
+    plant = made(name)
+    given = trials(plant, seed=5, size=0.1, ends=1.0, kind=np.float32)
+    assert lost(of(name, precision="single"), given) == [0, 0, 0]
+    assert lost(of(name), given)[0] > 500
+
+
+def test_strips_and_rates_are_rounded_outwards():
+    """Against exact rationals, where the other states of a strip nearly cancel the reading.
+
+    Mutants: a product, a sum or a rate as floating point has it.
+    """
+    contractor, rng, count = of("mixed_rows"), np.random.default_rng(9), 400
+    rows = [[2, F(-1, 3), 0], [1, 1, F(3, 7)], [0, 0, F(-1, 3)]]
+    noise = [(F(-1, 10), F(1, 5)), (F(-1, 5), F(3, 10)), (F(-1, 20), F(1, 20))]
+    X, y, used = Ends(*(ca.SX.sym("x", 3) for _ in range(2))), ca.SX.sym("y", 3), ca.SX.sym("b", 3)
+    told = contractor.measure(X, y, ca.vertsplit(used))
+    measure = ca.Function("m", [X.lower, X.upper, y, used], [told.lower, told.upper])
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (2, 2)):
+        for side in (0, 1):
+            x = rng.uniform(-4.0, 4.0, (3, count))
+            x[j] = rng.uniform(-1e-2, 1e-2, count)
+            low, high = x.copy(), x.copy()
+            low[j], high[j] = -1e6, 1e6
+            spoken = np.array(rows[i], dtype=float) @ x + float(noise[i][side])
+            told = np.where(np.arange(3)[:, None] == i, spoken, 0.0)
+            bits = np.repeat(np.eye(3)[:, [i]], count, axis=1)
+            found = [np.array(v)[j] for v in measure(low, high, told, bits)]
+            for k in range(count):
+                others = sum(rows[i][n] * F(x[n, k]) for n in range(3) if n != j)
+                exact = (F(spoken[k]) - noise[i][side] - others) / rows[i][j]
+                assert F(found[0][k]) <= exact <= F(found[1][k])
+    contractor, F_set = of("gains"), Ends(*(ca.SX.sym("f", 2) for _ in range(2)))
+    moved = contractor.drift(F_set)
+    drift = ca.Function("d", [F_set.lower, F_set.upper], [moved.lower, moved.upper])
+    ends = rng.uniform(-9.0, 9.0, (2, count))
+    low, high = (np.array(v) for v in drift(ends, ends))
+    for j, rate in enumerate((0.1, 0.2)):
+        for k in range(count):
+            assert F(low[j, k]) <= F(ends[j, k]) - F(rate)
+            assert F(high[j, k]) >= F(ends[j, k]) + F(rate)
 
 
 @pytest.mark.parametrize("name", ["mixed_rows", "corners", "tanks"])
@@ -210,6 +275,30 @@ def test_outputs_that_are_not_constant_rows_have_no_strip():
     assert [strip is None for strip in found] == [False, *[True] * 5, False]
 
 
+def test_the_row_that_tells_a_fault_is_looked_up_in_the_column_of_that_fault():
+    """Signs of states and faults differ. Mutant: the column of a state in place of it."""
+    plant = ob.Plant("signs")
+    a, b = plant.states("a b", range=(-1, 1))
+    f, g, h = plant.process_faults("f g h", range=(-1, 1))
+    plant.dynamics([a / 2 - b / 3 + f / 4 + (a + 2) * h, b / 2 - a / 4 - g / 5 + a * h], Ts=1)
+    plant.outputs([a, b])
+    assert Equations(plant).invertible == [(0, 0), (1, 1), (2, 0)]
+
+
+def test_signs_are_proved_cell_by_cell():
+    """Of x + x^3 / 3 - x^2 / 2, whose slope 1 - x + x^2 is at least 3/4.
+
+    Mutant: one cell, over which each x is taken by itself.
+    """
+    plant = ob.Plant("cells")
+    (x,) = plant.states("x", range=(0, 2))
+    plant.dynamics([(x - x**2 / 2 + x**3 / 3) / 8], Ts=1)
+    plant.outputs([x])
+    low, high = 8 * Equations(plant).slopes[0, 0]
+    assert 0.5 < low <= 0.75
+    assert 3.0 <= high < 3.3
+
+
 # -- how narrow sets become --------------------------------------------------------------------
 
 LAWS = {
@@ -267,3 +356,31 @@ def test_mean_half_widths_are_those_of_another_implementation(name, cuts):
         assert found[place] == pytest.approx(known, rel=0.02), place
     promised = guard.widths(None)
     assert (np.array(widths[-1]) <= promised * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_promised_half_widths_are_those_of_the_formulas(delay):
+    """By hand: strips, the image, inversions with constant slopes alone, rates, in this order.
+
+    a, b, e: their strips; c: h = h / 2 + h / 10 + h_a / 10, reached in many passes;
+    f: (h_a + h_a / 2 + h_b / 4) 3; g: h_b + h_b / 5; h has a gain that varies.
+    Mutants: another fault's column; the wider of two; passes that end while one width still falls.
+    """
+    plant = by_hand()
+    x, late, now = [0.1, 0.2, 0.025, 0.1], [0.6, 0.24, 2.0], [0.61, 1.24, 2.0]
+    inf = np.inf
+
+    def widths(cuts, core=None):
+        own = np.full(7, inf) if core is None else core
+        return Contractor(plant, 1.0, cuts).half_widths(own, delay).tolist()
+
+    def near(numbers):
+        return pytest.approx(numbers, rel=1e-6)
+
+    assert widths(CUTS) == near(x + (late if delay else now))
+    still = late if delay else [5.0, 9.0, 2.0]
+    assert widths(("ranges", "strips", "image", "inversion")) == near(x + still)
+    assert widths(("ranges",)) == near([inf, inf, 4.0, inf, 5.0, 9.0, 2.0])
+    assert widths(("strips",)) == near([0.1, 0.2, inf, 0.1, inf, inf, inf])
+    own = np.array([0.05, 0.1, 1.0, 0.2, 0.2, 0.1, 0.3])
+    assert widths((), own) == near(own)

@@ -4,13 +4,15 @@ import casadi as ca
 import numpy as np
 import pytest
 import sympy as sp
+from contracted import by_hand, made
 
 import obsynth as ob
 from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS
 from obsynth.designs.core.core import Core, Known
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.guard import YOUNG, Guard, Watch
+from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import fill
 
@@ -31,12 +33,11 @@ def drifting():
     return plant
 
 
-def blind(sizes=None):
+def blind(n_f=0):
     """A core that knows nothing and whose estimate is zero."""
 
     def run(seen):
-        zero = ca.SX.zeros(2)
-        return Known(zero, ca.SX(0, 1), None, None, {})
+        return Known(ca.SX.zeros(2), ca.SX.zeros(n_f), None, None, {})
 
     return Core(run, lambda x, f, kept: {})
 
@@ -247,3 +248,75 @@ def test_a_core_that_claims_too_much_is_void_not_believed():
     watched = Watched(drifting(), core=Core(run, lambda x, f, kept: {}))
     *_, status = watched.call(watched.start([(-10, 10), (-10, 10)]), [0.0], [0.0])
     assert status == 8
+
+
+@pytest.mark.parametrize(
+    ("delay", "horizon", "told", "calls"),
+    [(0, None, None, 17), (1, None, None, 17), (0, 9, 7, 9), (1, 9, 7, 9), (0, 2, 1, 2)],
+)
+def test_bounds_settle_from_what_one_instant_says(delay, horizon, told, calls):
+    """Strips, ranges and inversions without an image, faults one rate later within their ranges.
+
+    Mutants: the calls added to the horizon; faults without their rates, or beyond their ranges.
+    """
+    asked = []
+
+    def settle(begun, number):
+        asked.append((begun, number))
+        return (15 if number is None else number), 0.5 * begun
+
+    watch = Watch.of({"horizon": horizon, "recovery": 1, "cuts": None})
+    guard = Guard(by_hand(), {}, watch, delay, 1.0, settle=settle)
+    assert guard.horizon == calls
+    ((begun, number),) = asked
+    assert number == told
+    faults = [0.61, 1.24, 2.0] if delay else [0.62, 2.24, 2.0]
+    assert begun == pytest.approx([0.1, 0.2, 4.0, 0.1, *faults], rel=1e-6)
+    assert np.all(guard.widths(np.full(7, 9.0)) <= np.maximum(0.5 * begun, 1e-6) * (1 + 1e-6))
+
+
+def test_what_nothing_bounds_does_not_settle_and_is_not_given_up():
+    """Without a reading of b. Mutant: bounds asked to settle from infinity."""
+
+    def settle(begun, number):
+        raise AssertionError(begun)
+
+    for horizon, calls in ((None, MOST_CALLS), (9, 9)):
+        watch = Watch.of({"horizon": horizon, "recovery": 1, "cuts": ["strips"]})
+        guard = Guard(drifting(), {}, watch, 0, 1.0, settle=settle)
+        assert guard.settled == (calls, None)
+
+
+def test_measured_scheduling_is_remembered_with_the_input():
+    """The image of the next call is taken with both. Mutant: room for inputs alone."""
+    plant = made("gains")
+    watch = Watch.of({"horizon": 400, "recovery": 1, "cuts": None})
+    guard = Guard(plant, {}, watch, 0, 1.0)
+    step = Step(guard, blind(2)).build()
+    layout, box = guard.layout(), np.array([[2.0, 2.1], [0.0, 0.1]])
+    memory = fill(layout, guard.first({}, box, np.zeros((2, 2))))
+    widths = []
+    for theta in (0.0, 1.0):
+        moved = step(memory, [1.0], [2.05, 0.05], [theta])[0]
+        assert np.array(moved[layout["before"]]).ravel().tolist() == [1.0, theta]
+        after = step(moved, [1.0], [np.nan, np.nan], [0.5])
+        widths.append([float(after[k][0]) for k in (3, 4)])
+    # x - (1 + theta) k x / 10 + f x / 2 + u / 50 + n, about 2.05
+    assert widths[0][0] - widths[1][0] == pytest.approx(0.205, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "unbounded"),
+    [("by_hand", "a, b, e inside of", None), ("loose", "b inside of", "level has no declared")],
+)
+def test_the_guarantee_names_the_states_that_begin_from_declared_ranges(name, inside, unbounded):
+    """Those that nothing holds to their ranges elsewhere. Mutant: the others named."""
+    plant = by_hand() if name == "by_hand" else made(name)
+    watch = Watch.of({"horizon": 30, "recovery": 1, "cuts": None})
+    found = monitored(Guarantee(("own",), ("its",)), Guard(plant, {}, watch, 0, 1.0), False)
+    text = [*found.claims, *found.assumptions]
+    assert sum(line.startswith(inside) for line in text) == 1
+    assert sum("no declared range" in line for line in text) == (unbounded is not None)
+    assert unbounded is None or any(line.startswith(unbounded) for line in text)
+    assert sum("60 calls" in line for line in text) == 2
+    assert text[0] == "own" and found.assumptions[0] == "its"

@@ -4,6 +4,7 @@ import casadi as ca
 import mpmath as mp
 import numpy as np
 import pytest
+from tapes import NUMPY, tape
 
 from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program, evaluate
@@ -102,7 +103,8 @@ def code(op, number, ranges, rounding):
     ends = [(ca.SX.sym("l"), ca.SX.sym("h")) for _ in ranges]
     operands = [Lifted(*pair, *given) for pair, given in zip(ends, ranges, strict=True)]
     found = lifted._Arithmetic(rounding).apply(Node(op, (), number), operands)
-    return ca.Function("f", [e for pair in ends for e in pair], [found.lower, found.upper])
+    function = ca.Function("f", [e for pair in ends for e in pair], [found.lower, found.upper])
+    return function, (found.low, found.high)
 
 
 def run(function, boxes):
@@ -121,7 +123,10 @@ def points(rng, boxes):
 
 
 def missed(case, count=10, rounding=None, seed=0):
-    """Return how many exact values are outside of a lifted operation, and the ends it gave."""
+    """Return how many exact values are outside of a lifted operation, and the ends it gave.
+
+    Outside of the ends, or of the numbers that hold both.
+    """
     rng = np.random.default_rng(seed)
     op, _, number = case.partition(" ")
     tried, value = CASES[case]
@@ -130,7 +135,8 @@ def missed(case, count=10, rounding=None, seed=0):
         boxes = [drawn(rng, r, count) for r in ranges]
         if op == "meet":
             boxes[1] = np.sort([np.clip(boxes[0][0], *ranges[1]), boxes[1][1]], axis=0)
-        low, high = run(code(op, int(number or 0), ranges, rounding or Rounding()), boxes)
+        function, (least, most) = code(op, int(number or 0), ranges, rounding or Rounding())
+        low, high = run(function, boxes)
         ends.append((ranges, boxes, low, high))
         truths = [
             (b == 0.0) | (b == 1.0) for r, b in zip(ranges, boxes, strict=True) if r in TRUTHS
@@ -153,7 +159,7 @@ def missed(case, count=10, rounding=None, seed=0):
                     except (ValueError, ZeroDivisionError):
                         continue
                     if abs(exact) < FAR:  # what is beyond counts as FAR
-                        outside += not low[k] <= exact <= high[k]
+                        outside += not (low[k] <= exact <= high[k] and least <= exact <= most)
     return outside, ends
 
 
@@ -242,6 +248,103 @@ def test_other_wrong_forms_are_seen(case, name, mutant, monkeypatch):
     assert missed(case)[0] > 0
 
 
+# -- what a form is not known for, numbers, single precision ------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("op", "ranges", "wanted"),
+    [
+        ("arctangent2", ((-3.0, 5.0), (-3.0, 5.0)), (-np.pi, np.pi)),
+        ("power_const", ((2.0, 3.0), (1.0, 2.0)), (2.0, 9.0)),
+        ("floor", ((-3.0, 5.5),), (-3.0, 5.0)),
+        ("acosh", ((-3.0, -2.0),), (-FAR, FAR)),
+        ("log", ((-3.0, -2.0),), (-FAR, FAR)),
+    ],
+)
+def test_what_has_no_form_is_enclosed_by_its_numbers(op, ranges, wanted):
+    """Mutants: one number for both ends; an operation that is defined nowhere given its form."""
+    function, numbers = code(op, 0, ranges, Rounding())
+    low, high = run(function, [np.array([[lo + 0.1], [hi - 0.1]]) for lo, hi in ranges])
+    assert [low[0], high[0]] == list(numbers) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(
+    "numbers", [(np.nan, 1.0), (1.0, np.nan), (-np.inf, np.inf), (-1e200, 1e200)]
+)
+def test_what_is_not_known_is_far(numbers):
+    assert lifted._within(*numbers) == (-FAR, FAR)
+
+
+def test_numbers_are_those_of_the_rules():
+    """Not wider, so that signs that the rules know make the formulas short."""
+    for case, (tried, _) in CASES.items():
+        op, _, number = case.partition(" ")
+        extra = (int(number),) if number else ()
+        for ranges in tried:
+            with np.errstate(all="ignore"):
+                rule = RULES[op](*(tuple(np.array([end]) for end in r) for r in ranges), *extra)
+            wanted = lifted._within(*(float(end[0]) for end in rule))
+            if op not in ("power_const", "add", "subtract", "multiply", "select", "divide"):
+                assert code(op, int(number or 0), ranges, Rounding())[1] == wanted, case
+
+
+def in_single(function, boxes):
+    """Run a function in single precision, rows of ends."""
+    given = [[end.astype(np.float32)] for box in boxes for end in box]
+    count = boxes[0].shape[1]
+    with np.errstate(all="ignore"):
+        found = tape(function, given, NUMPY, lambda v: np.full(count, v, dtype=np.float32))
+    return [np.broadcast_to(np.asarray(v, dtype=float), (count,)) for v in found]
+
+
+SINGLE = dict.fromkeys(("add", "subtract", "multiply", "divide"), (NEAR, UP))
+SINGLE |= {"sqrt": ((0.0, 4.0),), "power_int 3": (NEAR,)}
+
+
+@pytest.mark.parametrize("case", SINGLE)
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_single_precision_steps_over_its_own_rounding(case, precision):
+    """Mutant: the step of doubles, by which values are missed."""
+    rng, outside, ranges = np.random.default_rng(3), 0, SINGLE[case]
+    given = [np.float32(rng.uniform(*r, 300)).astype(float) for r in ranges]
+    op, _, number = case.partition(" ")
+    function = code(op, int(number or 0), ranges, Rounding(precision))[0]
+    low, high = in_single(function, [np.stack([v, v]) for v in given])
+    with mp.workprec(PRECISION):
+        for k in range(300):
+            exact = CASES[case][1](*(mp.mpf(float(v[k])) for v in given))
+            outside += not low[k] <= exact <= high[k]
+    assert (outside == 0) == (precision == "single")
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(("op", "crest"), [("sine", 0.5), ("cosine", 0.0)])
+def test_crests_and_troughs_beside_an_end_are_not_missed(op, crest, precision):
+    """Of angles of any size: the end beyond it is the next number of the precision.
+
+    Mutants: no margin for the rounding of the number of periods; large angles taken as known.
+    """
+    rng, kind = np.random.default_rng(4), np.float32 if precision == "single" else np.float64
+    sizes = 10.0 ** rng.uniform(0, 7 if precision == "single" else 15, 200)
+    most = 2e8 if precision == "single" else 1e16
+    for half in (0, 1):
+        with mp.workprec(PRECISION):
+            at = [
+                (2 * int(n) + half + mp.mpf(crest)) * mp.pi
+                for n in sizes * rng.choice([-1, 1], 200)
+            ]
+        near = np.array([float(v) for v in at]).astype(kind)
+        below = np.array([float(n) <= v for n, v in zip(near, at, strict=True)])
+        under = np.where(below, near, np.nextafter(near, kind(-np.inf)))
+        above = np.where(below, np.nextafter(near, kind(np.inf)), near)
+        wide = rng.uniform(0.1, 1.0, 200).astype(kind)
+        for low, high in ((under, above + wide), (under - wide, above)):
+            box = np.stack([low, high]).astype(float)
+            function = code(op, 0, ((-most, most),), Rounding(precision))[0]
+            found = in_single(function, [box]) if precision == "single" else run(function, [box])
+            assert (found[0] == -1.0).all() if half else (found[1] == 1.0).all()
+
+
 # -- programs ----------------------------------------------------------------------------------
 
 UNARY = [
@@ -291,7 +394,7 @@ def test_random_programs(seed):
     program = Program.from_casadi(ca.Function("p", [x], [f(x) for f in in_code]))
     low, high = ca.SX.sym("low", 3), ca.SX.sym("high", 3)
     variables = [Lifted(low[i], high[i], *r) for i, r in enumerate(ranges)]
-    found = lift(program, program.outputs, variables)
+    found = lift(program, program.outputs, variables, Rounding() if seed % 2 else None)
     function = ca.Function(
         "f",
         [low, high],
