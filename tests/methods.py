@@ -10,6 +10,7 @@ import sympy as sp
 
 import obsynth as ob
 from luenberger.method import Luenberger
+from obsynth.designs.general.method import GeneralUIO
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,38 @@ def vessel_moving() -> ob.Scenario:
     )
 
 
+def motor() -> ob.Plant:
+    """A motor outside of the papers' class.
+
+    The gain of its fault varies, its friction is known to an interval, its load to nothing, and a
+    third reading is nonlinear.
+    """
+    plant = ob.Plant("motor")
+    i, w = plant.states("i omega", range=[(-8, 8), (-40, 40)], nominal=0)
+    (u,) = plant.inputs("u", range=(-12, 12), nominal=2)
+    (f,) = plant.process_faults("f", range=(-4, 4), rate=8)
+    (b,) = plant.params("b", tolerance=0.1, value=0.1)
+    (load,) = plant.unknown_inputs("load")
+    n = plant.disturbances("n1:4", bound=[0.02, 0.05, 0.05])
+    gain = 1 + w / 200
+    plant.dynamics([2 * (gain * (u + f) - i - w / 100), 100 * (i / 100 - b * w / 10 - load)])
+    plant.outputs([i + n[0], w + n[1], i * w / 20 + n[2]])
+    return plant.discretise("euler", Ts=sp.Rational(1, 100))
+
+
+def motor_turning() -> ob.Scenario:
+    return ob.Scenario(
+        name="turning",
+        steps=150,
+        x0=[0.3, 1.0],
+        guess=[0.0, 0.0],
+        inputs=lambda k: [3 + 2 * np.sin(k / 15)],
+        faults=np.clip(0.04 * np.arange(151) - 2.0, 0.0, 2.0)[:, None],
+        unknown_inputs=lambda k: [0.02 * np.sin(k)],
+        x_range=[(-1, 1), (-2, 2)],
+    )
+
+
 METHODS = {
     "bounded_error_uio": Entry(
         ob.BoundedErrorUIO(gamma=0.005),
@@ -109,6 +142,15 @@ METHODS = {
         spoilt=(("bound", "gamma", 0), 2.0, "lmi"),
         option={"gamma": 1.5},
         gains=("K", "F"),
+    ),
+    "general_uio": Entry(
+        GeneralUIO(),
+        motor,
+        motor_turning,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("bound", "b", 3), 0.9, "peak"),
+        option={"weights": -1.0},
+        gains=("L",),
     ),
     "hinf_uio": Entry(
         ob.HinfUIO(method="general", multipliers="per_row", decay=0.6),

@@ -63,7 +63,7 @@ def tanks() -> Case:
     With ellipsoids they are the table's entry of the bounded-error observer.
     """
     plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
-    observer = ob.BoundedErrorUIO(gamma=0.005, bounds="peak", horizon=HORIZON).design(plant)
+    observer = ob.BoundedErrorUIO(bounds="peak", horizon=HORIZON).design(plant)
     return Case(
         observer,
         plant,

@@ -21,6 +21,7 @@ from obsynth.derive.errors import DerivationError, StructureError, UnboundedErro
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
 from obsynth.derive.jacobian.entries import (
+    COLUMNS,
     JacobianEntries,
     all_variables,
     jacobian_entries,
@@ -46,8 +47,8 @@ _SWITCHES = (sp.sign, sp.Heaviside, Relational)
 _CORNERS = (*_SWITCHES, *_STEPS, sp.Piecewise, sp.Abs, sp.Max, sp.Min)
 
 
-def refuse_jumps(model: Plant) -> None:
-    """Check that the right-hand side of a plant is continuous over its box.
+def refuse_jumps(model: Plant, outputs: bool = False) -> None:
+    """Check that the right-hand side of a plant, or its outputs too, is continuous over its box.
 
     Off its switching surfaces a row is smooth or has kinks. Two of them meet in no more than edges,
     round which every path leads: it is enough that the limits from both sides and the value on the
@@ -56,12 +57,13 @@ def refuse_jumps(model: Plant) -> None:
     """
     kinds = ("x", "u", "d", "f", "w", "p", "rho")
     box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    shown = [*zip(model.output_names, model.output, strict=True)] if outputs else []
     if model.continuous is not None:
         model, step = model.continuous, model
         if step.discretisation != "euler" and model.rhs.has(*_CORNERS, sp.atan2):
             box |= _stages(model, step)
     held = {symbol: rational(low) for symbol, (low, high) in box.items() if low == high}
-    for name, row in zip(model.names("x"), model.rhs, strict=True):
+    for name, row in [*zip(model.names("x"), model.rhs, strict=True), *shown]:
         surface = _jump(substitute(row, model.constant_values).xreplace(held), box)
         if surface is not None:
             raise StructureError(
@@ -319,7 +321,7 @@ def _refuse(entries: JacobianEntries, ranges: Ranges, what: str) -> None:
 
 def jacobian_bounds(
     split_or_model: Split | Plant,
-    wrt: Literal["states", "inputs"] = "states",
+    wrt: Literal["states", "inputs", "joint"] = "states",
     rtol: float = 1e-6,
     effort: Literal["fast", "normal", "tight"] = "normal",
 ) -> JacobianBounds:
@@ -329,8 +331,9 @@ def jacobian_bounds(
     ----------
     split_or_model : Split or Plant
         A split: the Jacobian of its g. A plant: the Jacobian of its right-hand side.
-    wrt : {"states", "inputs"}
-        What to differentiate by.
+    wrt : {"states", "inputs", "joint"}
+        What to differentiate by. "joint", of a plant: the right-hand side and below it the outputs,
+        by the states and beside them the disturbances.
     rtol : float
         Wanted gap between guaranteed and attained range, relative to its width.
     effort : {"fast", "normal", "tight"}
@@ -359,16 +362,23 @@ def jacobian_bounds(
     >>> np.round(found.max[2, 2], 6), len(found.vertices()), found.naive_vertex_count
     (np.float64(0.014459), 16, 64)
     """
-    if wrt not in ("states", "inputs"):
-        raise DerivationError(f"wrt={wrt!r} is not known; choose 'states' or 'inputs'", wrt=wrt)
+    if wrt not in COLUMNS:
+        raise DerivationError(
+            f"wrt={wrt!r} is not known; choose one of {', '.join(map(repr, COLUMNS))}", wrt=wrt
+        )
+    joint = wrt == "joint"
+    if joint and isinstance(split_or_model, Split):
+        raise DerivationError("wrt='joint' is of a plant: a split has linear outputs", wrt=wrt)
     part = split_or_model if isinstance(split_or_model, Split) else None
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
-    refuse_jumps(model.check())
+    refuse_jumps(model.check(), outputs=joint)
     entries = jacobian_entries(model, part, wrt)
     ranges = entries.search(rtol, effort)
-    function = "dg" if part is not None else "df"
-    _refuse(entries, ranges, f"{function}/d{'x' if wrt == 'states' else 'u'}")
-    shape = (len(model.x), len(model.x) if wrt == "states" else len(model.u))
+    function = "d[f; h]" if joint else "dg" if part is not None else "df"
+    kinds = COLUMNS[wrt]
+    _refuse(entries, ranges, f"{function}/d{''.join(kinds)}")
+    rows = len(model.x) + (len(model.output_names) if joint else 0)
+    shape = rows, sum(len(getattr(model, kind)) for kind in kinds)
     return _assemble(entries, ranges, shape)
 
 

@@ -24,6 +24,8 @@ _SAMPLES = 96
 # Expanding a longer entry costs more than the zeros it may show.
 _LONG = 1000
 _KINDS = ("x", "u", "p", "rho", "d", "f", "w")
+COLUMNS = {"states": ("x",), "inputs": ("u",), "joint": ("x", "w")}
+"""Kinds of signals that a Jacobian is taken by."""
 # Two forms of a row are compared on boxes of this share of the ranges.
 _SHARE, _BOXES = 0.25, 24
 _GAIN = 0.9
@@ -71,18 +73,26 @@ class JacobianEntries:
 
 
 def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntries:
-    """Collect the entries of a Jacobian that are not structurally zero."""
-    kind = {"states": "x", "inputs": "u"}[wrt]
+    """Collect the entries of a Jacobian that are not structurally zero.
+
+    wrt: "states" or "inputs" of the right-hand side; "joint" of it and the outputs below it, by
+        states and disturbances
+    """
+    kinds = COLUMNS[wrt]
+    kind = kinds[0]
     sx = model.sx(constants="symbol")
-    columns = getattr(sx, kind)
+    columns = ca.vertcat(*(getattr(sx, k) for k in kinds))
     constants = [enclose_number(substitute(v, {})) for v in model.constant_values.values()]
-    rows, rhs = _preferred_rows(model, constants)
+    typed, written = list(model.rhs), ca.vertsplit(sx.rhs)
+    if wrt == "joint":
+        typed, written = [*typed, *model.output], [*written, *ca.vertsplit(sx.y)]
+    rows, rhs = _preferred_rows(model, typed, written, constants)
     if part is not None:
         noise = ca.vertcat(sx.d, sx.f, sx.w)
         rhs = ca.substitute(rhs, noise, ca.SX.zeros(noise.numel()))
     jacobian, quotients = _differentiated(model, rhs, columns, constants)
     linear = None if part is None else (part.A if kind == "x" else part.B)
-    wrt_symbols = [s.symbol for s in getattr(model, kind)]
+    wrt_symbols = [s.symbol for k in kinds for s in getattr(model, k)]
     quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
     places, values, shifts, shift_symbols = [], [], [], []
     expressions: dict[Entry, sp.Expr] = {}
@@ -164,11 +174,13 @@ def _differentiated(
 
 
 def _preferred_rows(
-    model: Plant, constants: list[tuple[float, float]]
+    model: Plant,
+    rows: list[sp.Expr],
+    rhs: list[ca.SX],
+    constants: list[tuple[float, float]],
 ) -> tuple[list[sp.Expr], ca.SX]:
-    """Right-hand side row by row, as it is or in a form with narrower ranges."""
+    """Return every row of the plant as it is or in a form with narrower ranges."""
     sx = model.sx(constants="symbol")
-    rows, rhs = list(model.rhs), ca.vertsplit(sx.rhs)
     columns = ca.vertcat(sx.x, sx.u)
     signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
     variables, box = all_variables(model)
@@ -263,13 +275,15 @@ def sample_entries(entries: JacobianEntries) -> dict[Entry, FloatArray]:
     rng = np.random.default_rng(0)
     lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)
     upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)
-    points = lower + rng.random((_SAMPLES, len(lower))) * (upper - lower)
+    # fewer samples than entries could not tell which depend on each other
+    count = max(_SAMPLES, len(entries.places) + _SAMPLES // 2)
+    points = lower + rng.random((count, len(lower))) * (upper - lower)
     middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
     values = entries.values
     if entries.quotients is not None:
         values = entries.quotients.closed(values)
     function = ca.Function("sample", [entries.variables, entries.constants], [values])
-    result = np.array(function(points.T, np.tile(middle[:, None], (1, _SAMPLES))))
+    result = np.array(function(points.T, np.tile(middle[:, None], (1, count))))
     # points outside the domain of some entry say nothing about dependences
     usable = np.isfinite(result).all(axis=0)
     return dict(zip(entries.places, result[:, usable], strict=True))

@@ -40,6 +40,8 @@ from obsynth.designs.bounded_error.synthesis import (
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.lmi import Problem
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -80,8 +82,10 @@ class BoundedErrorUIO(Method):
     weights : sequence of float, optional
         Of the components (states, then faults), for ``trace_inverse`` and peak
         bounds; 1 by default.
-    form : {"corrected", "printed", "repaired"}
-        The direct LMI at the vertices of the exact Jacobian set; (51) as
+    form : {"general", "corrected", "printed", "repaired"}, optional
+        "general": plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, in current form
+        (the paper's observer predicts first); by default for peak bounds of a plant. The paper's
+        class has: the direct LMI at the vertices of the exact Jacobian set ("corrected"); (51) as
         printed; (51) with diagonal multipliers, which is valid row by row.
 
     Raises
@@ -142,16 +146,49 @@ class BoundedErrorUIO(Method):
     bounds: Literal["ellipsoid", "peak"] = "ellipsoid"
     objective: Objective = "trace_inverse"
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
-    form: Literal["corrected", "printed", "repaired"] = "corrected"
+    form: Literal["general", "corrected", "printed", "repaired"] | None = None
+
+    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer; see `Method.design`."""
+        general = self._general(model)
+        return super().design(model, bounds) if general is None else general.design(model)
+
+    def analyse(
+        self,
+        model: Plant | Split,
+        gains: Mapping[str, ArrayLike],
+        bounds: JacobianBounds | None = None,
+    ) -> Observer:
+        """Return what given gains guarantee: ``K`` and ``F``, or ``L``; see `Method.analyse`."""
+        if self.form == "general" or (self.form is None and "L" in gains):
+            return self._as_general().analyse(model, gains)
+        return super().analyse(model, gains, bounds)
+
+    def _general(self, model: Plant | Split) -> GeneralUIO | None:
+        """Return the method of the general class where it designs for the model."""
+        if self.form == "general" or (self.form is None and self.bounds == "peak"):
+            return self._as_general() if isinstance(model, Plant) else None
+        return None
+
+    def _as_general(self) -> GeneralUIO:
+        idle = ("gamma", "multipliers", "error", "post", "objective")
+        refuse_idle(self, "the observer of the general class", *idle)
+        return GeneralUIO(
+            bounds="peak",
+            weights=self.weights,
+            horizon=self.horizon,
+            recovery=self.recovery,
+            cuts=self.cuts,
+        )
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""
         if self.weights is not None and not any(self.weights):
             raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
-        if self.bounds == "peak" and self.form == "corrected":
+        if self.bounds == "peak" and self.form in ("corrected", None):
             idle = ("post", "objective", "multipliers", "error")
             refuse_idle(self, 'bounds="peak", which has no ellipsoid', *idle)
-        if self.form != "corrected" and (
+        if self.form in ("printed", "repaired") and (
             self.error != "plain" or self.multipliers != "equal" or self.bounds != "ellipsoid"
         ):
             raise ObsynthError(
@@ -197,7 +234,7 @@ class BoundedErrorUIO(Method):
         if self.gamma is None:
             raise ObsynthError("the LMI is linear only for a fixed gamma: give gamma=")
         model: UioModel = self._checked(given, bounds)
-        if self.form != "corrected":
+        if self.form in ("printed", "repaired"):
             from obsynth.designs.bounded_error.multipliers import box_vertices, multiplier_problem
 
             data = _with_vertices(model, box_vertices(model.bounds))
@@ -236,7 +273,7 @@ class BoundedErrorUIO(Method):
 
     def _design_ellipsoid(self, model: UioModel) -> UioDesign:
         system, noise, weights = self._setting(model)
-        if self.form == "corrected":
+        if self.form not in ("printed", "repaired"):
 
             def solve(gamma: float) -> EllipsoidSolution:
                 return synthesise(system, gamma, noise, self.objective, weights)

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import TINY, Enclosure, add_up, lowered, product_up, raised
-from obsynth.designs.bounded_error.peak.responses import PowerSum, Response, power_sum, response
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.general.responses import PowerSum, Response, power_sum, response
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

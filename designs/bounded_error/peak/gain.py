@@ -20,8 +20,8 @@ from obsynth.designs.bounded_error.peak.bound import (
     peak_bound,
     spectral_radius,
 )
-from obsynth.designs.bounded_error.peak.responses import absolute_sums
 from obsynth.designs.bounded_error.peak.system import PeakSystem, projected_gains
+from obsynth.designs.general.responses import absolute_sums
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

@@ -29,9 +29,9 @@ from obsynth.designs.bounded_error.peak.bound import (
     small_gain_solution,
     spectral_radius,
 )
-from obsynth.designs.bounded_error.peak.responses import PowerSum, Response, power_sum, response
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.general.responses import PowerSum, Response, power_sum, response
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

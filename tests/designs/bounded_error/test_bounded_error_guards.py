@@ -338,7 +338,7 @@ def test_the_recursion_of_the_ellipsoid_counts_the_rounding_of_a_step(design):
         assert np.all(bound.decay @ np.full(len(tau), V) + bound.offset >= moved)
 
 
-@pytest.mark.parametrize("options", [{"bounds": "peak"}, {"gamma": 0.05}])
+@pytest.mark.parametrize("options", [{"bounds": "peak", "form": "corrected"}, {"gamma": 0.05}])
 def test_a_fault_without_a_range_may_have_a_coefficient_that_is_no_double(options):
     """1/3 rounds, times a fault of 1e6: more than 2^-40 of the states.
 

@@ -19,10 +19,10 @@ from obsynth.designs.bounded_error.peak.bound import (
     prove_peak,
     small_gain_solution,
 )
-from obsynth.designs.bounded_error.peak.responses import power_sum, response
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.designs.bounded_error.peak.transient import Transient, transient
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.general.responses import power_sum, response
 from obsynth.symbolic.errors import ObsynthError
 
 REFERENCE = Path(__file__).parents[2] / "reference" / "bounded_error_uio.json"

@@ -11,9 +11,9 @@ from obsynth.designs.bounded_error.peak import gain as peak_gain_module
 from obsynth.designs.bounded_error.peak.attained import attained
 from obsynth.designs.bounded_error.peak.bound import peak_bound, prove_peak
 from obsynth.designs.bounded_error.peak.gain import PeakGain, peak_gain
-from obsynth.designs.bounded_error.peak.responses import absolute_sums
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.general.responses import absolute_sums
 from obsynth.symbolic.errors import ObsynthError
 
 REFERENCE = json.loads(

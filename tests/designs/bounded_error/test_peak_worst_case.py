@@ -17,10 +17,10 @@ from obsynth.derive.rigour import Enclosure
 from obsynth.designs.bounded_error.peak import bound as peak_bound_module
 from obsynth.designs.bounded_error.peak.attained import Attained, attained
 from obsynth.designs.bounded_error.peak.bound import PeakBound, peak_bound
-from obsynth.designs.bounded_error.peak.responses import response
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.designs.bounded_error.peak.transient import transient
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.general.responses import response
 
 REFERENCE = Path(__file__).parents[2] / "reference" / "bounded_error_uio.json"
 WBAR, EPSBAR = np.full(3, 0.1), np.full(2, 0.05)

@@ -1,0 +1,352 @@
+"""The extended plant: faults as states, unknown inputs taken away, the rest as disturbances.
+
+For a discrete plant ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form:
+
+- a fault that is followed becomes a state with ``f+ = f + step``, the step within its rate;
+- other faults, parameters known to an interval, scheduling variables that are not measured, and
+  unknown inputs with a range are disturbances like w;
+- unknown inputs without a range are taken away. ``F(x, d) - F(x, 0)`` has to lie in the span of a
+  constant D0, which is found from numbers and proved: rows that hold the identity in D0 tell the
+  others. With ``L0 = D0 (C D0)^-1`` on outputs of constant slopes and ``T0 = I - L0 C``, the rows
+  ``T0 F`` know nothing of d, whatever its size, and ``x = T0 x + L0 C x``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy as sp
+
+from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour import round_number, substitute
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Role, Signal
+
+_POINTS = 24
+_RANK = 1e-7
+_LARGEST_DENOMINATOR = 10**6
+
+
+@dataclass(frozen=True, eq=False)
+class Extended:
+    """A plant whose states are those of another and its faults, with known and bounded signals.
+
+    plant: states (x, followed faults), inputs (u, measured scheduling), disturbances v; its rows
+        are ``T0 F`` and ``f + step``
+    followed: names of the faults that are states
+    free: names of the unknown inputs that are taken away
+    D0, L0, T0: exact matrices, shapes (N, k), (N, m), (N, N)
+    picked: outputs that L0 reads
+    """
+
+    plant: Plant
+    followed: tuple[str, ...]
+    free: tuple[str, ...]
+    D0: sp.Matrix
+    L0: sp.Matrix
+    T0: sp.Matrix
+    picked: tuple[int, ...]
+
+    def leak(self, L0: FloatArray, largest: FloatArray) -> FloatArray:
+        """Bound what rounding L0 leaves of the unknown inputs in the states, (N,).
+
+        ``|(I - L0 C) L0_exact C x|`` for ``|C x| <= largest``, shape (m,).
+        """
+        size = self.T0.shape[0]
+        if not self.free:
+            return np.zeros(size)
+        given = sp.Matrix(*L0.shape, [sp.Rational(v) for v in L0.ravel().tolist()])
+        C = self.output_slopes()
+        left = (sp.eye(size) - given * C) * self.L0
+        found = np.zeros(size)
+        for (i, j), value in _items(left):
+            middle, error = round_number(sp.nsimplify(value) if value.is_Float else value)
+            found[i] += (abs(middle) + error) * largest[j]
+        return np.asarray(found * (1.0 + 2.0**-40))
+
+    def output_slopes(self) -> sp.Matrix:
+        """Return the constant slopes of the picked outputs, zero in other rows, (m, N)."""
+        symbols = [s.symbol for s in self.plant.x]
+        C = sp.zeros(len(self.plant.output_names), len(symbols))
+        for i in self.picked:
+            row = substitute(self.plant.output[i], self.plant.constant_values)
+            C[i, :] = sp.Matrix([[sp.expand(sp.diff(row, s)) for s in symbols]])
+        return C
+
+
+def _items(matrix: sp.Matrix) -> list[tuple[tuple[int, int], sp.Expr]]:
+    """Return the entries that are not zero, with their places."""
+    return [
+        ((i, j), matrix[i, j])
+        for i in range(matrix.shape[0])
+        for j in range(matrix.shape[1])
+        if matrix[i, j] != 0
+    ]
+
+
+def extend(model: Plant, unfollowed: Sequence[str] = ()) -> Extended:
+    """Make the extended plant of a discrete one; `unfollowed` faults are disturbances.
+
+    StructureError where unknown inputs cannot be taken away, or a disturbance has no bound.
+    """
+    constants = model.constant_values
+    rows = [substitute(row, constants) for row in model.rhs]
+    outputs = [substitute(row, constants) for row in model.output]
+    followed = [
+        s for s in model.f if s.name not in unfollowed and (s.rate is not None or s.constant)
+    ]
+    free = [s for s in model.d if not s.bounded]
+    loose = [
+        *(s for s in model.w),
+        *(s for s in model.p),
+        *(s for s in model.rho if not s.measured),
+        *(s for s in model.d if s.bounded),
+        *(s for s in model.f if s not in followed),
+    ]
+    unbounded = [s for s in loose if not s.bounded]
+    if unbounded:
+        first = unbounded[0]
+        more = ", or with rate= to have it followed" if first in model.f else ""
+        raise StructureError(
+            f"{first.role} {', '.join(s.name for s in unbounded)} has no bound, so no interval can "
+            f"be guaranteed; declare it with bound= or range={more}",
+            symbols=tuple(s.name for s in unbounded),
+            condition="bounded disturbances",
+        )
+    taken = {s.name for s in model.signals} | set(model.output_names)
+    steps = [_step(s, taken) for s in followed]
+    for fault, step in zip(followed, steps, strict=True):
+        moved = fault.symbol if step is None else fault.symbol + step.symbol
+        rows.append(moved)
+    states = [*model.x, *followed]
+    size = len(states)
+    D0, base = _span(rows, free, states, model)
+    L0, picked = _left_inverse(D0, outputs, states, free, model)
+    T0 = sp.eye(size) - L0 * _slopes(outputs, states, picked)
+    if free:
+        rows = [
+            base[i] if T0[i, :] == sp.eye(size)[i, :] else sp.expand(T0[i, :].dot(sp.Matrix(base)))
+            for i in range(size)
+        ]
+    made = Plant(model.name)
+    made.add_signals(
+        [replace(s, role=Role.STATE, rate=None, of=None, constant=False) for s in states]
+    )
+    made.add_signals(list(model.u))
+    made.add_signals(
+        [replace(s, role=Role.INPUT, constant=False, value=None) for s in model.rho if s.measured]
+    )
+    noise = [*loose, *(step for step in steps if step is not None)]
+    made.add_signals(
+        [
+            replace(
+                s,
+                role=Role.DISTURBANCE,
+                rate=None,
+                of=None,
+                constant=False,
+                nominal=None,
+                value=None,
+                measured=True,
+            )
+            for s in noise
+        ]
+    )
+    made.dynamics(rows, Ts=model.exact_Ts)
+    made.outputs(outputs, names=list(model.output_names))
+    return Extended(
+        made,
+        tuple(s.name for s in followed),
+        tuple(s.name for s in free),
+        D0,
+        L0,
+        T0,
+        picked,
+    )
+
+
+def _step(fault: Signal, taken: set[str]) -> Signal | None:
+    """Return the signal of a fault's increments; None for one that does not change."""
+    if fault.constant:
+        return None
+    name = f"step_{fault.name}"
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    rate = float(fault.rate or 0.0)
+    return Signal(name, sp.Symbol(name, real=True), Role.DISTURBANCE, -rate, rate)
+
+
+def _span(
+    rows: list[sp.Expr], free: list[Signal], states: list[Signal], model: Plant
+) -> tuple[sp.Matrix, list[sp.Expr]]:
+    """Return D0 and the rows without unknown inputs; rows less these lie in its span, proved."""
+    size = len(rows)
+    zero = {s.symbol: sp.Integer(0) for s in free}
+    if not free:
+        return sp.zeros(size, 0), rows
+    names = ", ".join(s.name for s in free)
+    base = [row.subs(zero) for row in rows]
+    left = [
+        sp.Integer(0) if not row.free_symbols & set(zero) else row - kept
+        for row, kept in zip(rows, base, strict=True)
+    ]
+    if any(kept.has(sp.nan, sp.zoo, sp.oo) for kept in base):
+        raise StructureError(
+            f"unknown input {names}: the equations are not defined where it is zero; declare it "
+            "with range=, as a bounded disturbance",
+            symbols=tuple(s.name for s in free),
+        )
+    touched = [i for i, row in enumerate(left) if row != 0]
+    samples = _sampled([left[i] for i in touched], model)
+    scale = np.array([_half(states[i]) for i in touched])
+    scaled = samples / scale[:, None]
+    norms = np.linalg.norm(scaled, axis=0)
+    scaled = scaled[:, norms > 0.0] / norms[norms > 0.0]
+    rank = int(np.linalg.matrix_rank(scaled, tol=_RANK)) if scaled.size else 0
+    if rank == len(touched):
+        D0 = sp.zeros(size, rank)
+        for column, i in enumerate(touched):
+            D0[i, column] = 1
+        return D0, base
+    pivots = _pivots(scaled, rank)
+    D0 = sp.zeros(size, rank)
+    known = scaled[pivots]
+    for k, i in enumerate(touched):
+        if k in pivots:
+            D0[i, pivots.index(k)] = 1
+            continue
+        weights = np.linalg.lstsq(known.T, scaled[k], rcond=None)[0]
+        weights = weights * scale[k] / scale[pivots]
+        for column, weight in enumerate(weights.tolist()):
+            if abs(weight) > 1e-9 * float(np.abs(weights).max(initial=0.0)):
+                D0[i, column] = _simple(left[i], left[touched[pivots[column]]], weight, rank)
+        told = sum((D0[i, c] * left[touched[p]] for c, p in enumerate(pivots)), sp.Integer(0))
+        if not is_zero(left[i] - told):
+            raise StructureError(
+                f"unknown input {names}: what it does to {states[i].name} is no constant multiple "
+                f"of what it does to {', '.join(states[touched[p]].name for p in pivots)}, so no "
+                "constant direction holds it; declare it with range=, as a bounded disturbance",
+                symbols=tuple(s.name for s in free),
+                condition="constant directions of unknown inputs",
+            )
+    return D0, base
+
+
+def _half(signal: Signal) -> float:
+    """Return half the range of a signal, 1 where it has none."""
+    half = 0.5 * (signal.upper - signal.lower)
+    return half if np.isfinite(half) and half > 0.0 else 1.0
+
+
+def _sampled(rows: list[sp.Expr], model: Plant) -> FloatArray:
+    """Evaluate rows at random points of the box, shape (rows, points)."""
+    signals = [s for s in model.signals if s.role is not Role.PARAM or s.lower < s.upper]
+    rng = np.random.default_rng(0)
+    function = sp.lambdify([s.symbol for s in signals], rows, modules="numpy", cse=True)
+    columns = []
+    for _ in range(_POINTS):
+        point = [
+            rng.uniform(s.lower, s.upper) if s.bounded else rng.uniform(-1.0, 1.0) for s in signals
+        ]
+        with np.errstate(all="ignore"):
+            value = np.array(function(*point), dtype=float)
+        if np.isfinite(value).all():
+            columns.append(value)
+    return np.array(columns).reshape(-1, len(rows)).T
+
+
+def _pivots(scaled: FloatArray, rank: int) -> list[int]:
+    """Return rows that span the others."""
+    from scipy.linalg import qr
+
+    order = qr(scaled.T, pivoting=True, mode="r")[1]
+    return sorted(int(k) for k in order[:rank])
+
+
+def _simple(row: sp.Expr, pivot: sp.Expr, weight: float, rank: int) -> sp.Expr:
+    """Return the exact factor that a number stands for."""
+    if rank == 1:
+        ratio = sp.cancel(sp.together(row / pivot))
+        if not ratio.free_symbols:
+            return ratio
+    return sp.Rational(weight).limit_denominator(_LARGEST_DENOMINATOR)
+
+
+def _slopes(outputs: list[sp.Expr], states: list[Signal], picked: Sequence[int]) -> sp.Matrix:
+    C = sp.zeros(len(outputs), len(states))
+    for i in picked:
+        C[i, :] = sp.Matrix([[sp.expand(sp.diff(outputs[i], s.symbol)) for s in states]])
+    return C
+
+
+def _left_inverse(
+    D0: sp.Matrix,
+    outputs: list[sp.Expr],
+    states: list[Signal],
+    free: list[Signal],
+    model: Plant,
+) -> tuple[sp.Matrix, tuple[int, ...]]:
+    """Return ``D0 (C D0)^-1`` on some outputs of constant slopes, and these outputs."""
+    size, m, k = len(states), len(outputs), D0.shape[1]
+    if k == 0:
+        return sp.zeros(size, m), ()
+    names = tuple(s.name for s in free)
+    seen = [i for i, row in enumerate(outputs) if row.free_symbols & {s.symbol for s in free}]
+    if seen:
+        raise StructureError(
+            f"unknown input {', '.join(names)} stands in the output {model.output_names[seen[0]]}, "
+            "where nothing tells it from noise: declare it with range=",
+            symbols=names,
+        )
+    moving = [s.symbol for s in (*states, *model.w, *model.p, *model.rho, *model.f)]
+    constant = [i for i, row in enumerate(outputs) if _is_affine(row, moving)]
+    C = _slopes(outputs, states, constant)
+    CD = (C * D0).applyfunc(sp.nsimplify)
+    numbers = np.array(CD.evalf(17).tolist(), dtype=float).reshape(m, k)
+    for i in range(m):
+        if i not in constant and any(
+            sp.diff(outputs[i], s.symbol) != 0 and any(D0[j, c] != 0 for c in range(k))
+            for j, s in enumerate(states)
+        ):
+            numbers[i] = 0.0
+    noise = np.array([_noise(row, model) for row in outputs])
+    weighted = numbers / noise[:, None]
+    norms = np.linalg.norm(weighted, axis=0)
+    rank = np.linalg.matrix_rank(weighted / np.where(norms > 0, norms, 1.0), tol=1e-9)
+    if rank < k:
+        acts = [s.name for i, s in enumerate(states) if any(D0[i, c] != 0 for c in range(k))]
+        raise StructureError(
+            f"rank(C D0) = {rank} but unknown input {', '.join(names)} acts in {k} directions, on "
+            f"{', '.join(acts)}: no output of constant slopes ({', '.join(model.output_names)}) "
+            f"shows it one step later. Measure {acts[0]}, or declare {names[0]} with range=, as a "
+            "bounded disturbance",
+            condition="rank(C D) = rank(D)",
+            symbols=names,
+        )
+    picked = tuple(_pivots(weighted, k))
+    inverse = CD.extract(list(picked), list(range(k))).inv()
+    L0 = sp.zeros(size, m)
+    part = D0 * inverse
+    for column, i in enumerate(picked):
+        L0[:, i] = part[:, column]
+    return L0, picked
+
+
+def _is_affine(row: sp.Expr, symbols: Sequence[sp.Symbol]) -> bool:
+    """Whether all slopes of a row are numbers."""
+    present = [s for s in symbols if row.has(s)]
+    return all(not sp.expand(sp.diff(row, s)).free_symbols for s in present)
+
+
+def _noise(row: sp.Expr, model: Plant) -> float:
+    """Return how far the disturbances of an output reach, a number above zero."""
+    total = 0.0
+    for s in model.w:
+        if row.has(s.symbol) and s.bounded:
+            slope = sp.diff(row, s.symbol)
+            if not slope.free_symbols:
+                total += abs(float(slope)) * 0.5 * (s.upper - s.lower)
+    return total or 1e-9

@@ -1,0 +1,1 @@
+"""The observer of the general class: one error system for what users type."""

@@ -1,0 +1,133 @@
+"""The stored design of the general class: plain data from which step and proofs are made."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any
+
+import numpy as np
+
+from obsynth.derive.forms.extended import Extended, extend
+from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.record import Record
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Modes(Record):
+    """Coordinates in which the first error fades.
+
+    basis: V, whose columns belong to blocks of one or two
+    inverse: Y, which takes errors to these coordinates
+    blocks: how many columns each block has
+    """
+
+    basis: Annotated[FloatArray, "N N"]
+    inverse: Annotated[FloatArray, "N N"]
+    blocks: Annotated[IntArray, "n_b"]
+
+    def check(self) -> None:
+        """Refuse blocks that are not those of the basis."""
+        if not np.all((self.blocks == 1) | (self.blocks == 2)) or self.blocks.sum() != len(
+            self.basis
+        ):
+            raise CertificateError(
+                f"the blocks {self.blocks.tolist()} of the stored design do not make up "
+                f"{len(self.basis)} columns"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Fading(Record):
+    """How the first error fades: at most ``reach G^k start |xi_0|`` is added to the peak bounds.
+
+    decay: lambda, at least the spectral radius of G
+    modes: coordinates of the recursion; without them it is the exponential c lambda^k
+    """
+
+    G: Annotated[FloatArray, "n_b n_b"]
+    reach: Annotated[FloatArray, "N n_b"]
+    start: Annotated[FloatArray, "n_b N"]
+    decay: float
+    modes: Modes | None
+
+
+@dataclass(frozen=True, eq=False)
+class PeakBound(Record):
+    """Guaranteed peak bounds.
+
+    b: of the errors before the last correction, then of those after it, shape (2 N,)
+    fading: what the first error adds to the latter
+    """
+
+    KIND = "peak"
+
+    b: Annotated[FloatArray, "N+N"]
+    fading: Fading
+
+
+@dataclass(frozen=True, eq=False)
+class Rounding(Record):
+    """Bounds of what rounding adds, each (N,): to xq, to xc and to the next prediction."""
+
+    q: Annotated[FloatArray, "N"]
+    c: Annotated[FloatArray, "N"]
+    p: Annotated[FloatArray, "N"]
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralDesign(Record):
+    """Everything that is deployed and proved, in doubles.
+
+    plant: the discrete plant
+    unfollowed: faults that count as disturbances, see `extend`
+    v_centre, v_radius: box of the disturbances of the extended plant
+    L0: what takes unknown inputs away
+    Z: the gain; zero where L0 reads
+    family: Jacobians of the extended plant's rows and outputs by its states and disturbances
+    rounding: allowances of one step
+    options: the options of the method, as given
+    """
+
+    plant: Plant
+    unfollowed: tuple[str, ...]
+    v_centre: Annotated[FloatArray, "n_v"]
+    v_radius: Annotated[FloatArray, "n_v"]
+    L0: Annotated[FloatArray, "N m"]
+    Z: Annotated[FloatArray, "N m"]
+    family: Annotated[AffineFamily, "N+m N+n_v"]
+    rounding: Rounding
+    bound: PeakBound
+    options: Mapping[str, Any]
+
+    def check(self) -> None:
+        """Refuse faults that the plant does not have."""
+        unknown = [name for name in self.unfollowed if name not in self.plant.names("f")]
+        if unknown or len(set(self.unfollowed)) < len(self.unfollowed):
+            raise CertificateError(
+                f"the stored design names faults {list(self.unfollowed)}; the plant has "
+                f"{list(self.plant.names('f'))}"
+            )
+
+    @cached_property
+    def extended(self) -> Extended:
+        """The plant with its faults as states, derived from the stored equations."""
+        return extend(self.plant, self.unfollowed)
+
+    @property
+    def size(self) -> int:
+        """Number of states of the extended plant."""
+        return len(self.L0)
+
+    @cached_property
+    def middle(self) -> FloatArray:
+        """The Jacobian that stands for all in the step, shape (N + m, N + n_v)."""
+        return self.family.midpoint
+
+    @property
+    def L(self) -> FloatArray:
+        """The gain from a reading to the estimate, ``L0 + Z (I - C0 L0)``, shape (N, m)."""
+        C0 = self.middle[self.size :, : self.size]
+        return np.asarray(self.L0 + self.Z - self.Z @ (C0 @ self.L0))

@@ -1,0 +1,93 @@
+"""What rounding adds in one step, proved for the stored gains, stage by stage.
+
+Each stage of the step as it runs differs from its equation over real numbers, with the plant's own
+constants, by what `rounding_bound` says over the limits of estimates and inputs and all readings
+that an admissible plant shows there. What is left of the unknown inputs by a rounded L0 counts like
+rounding of the first stage. All of it is at most `GeneralDesign.rounding`.
+"""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.rounding import Bound, cut_box, rounding_bound
+from obsynth.designs.general.record import GeneralDesign, Rounding
+from obsynth.designs.general.step import Limits, curved, stages
+from obsynth.symbolic.arrays import FloatArray
+
+CELLS = 256
+# Above the rounding of the formulas here, all of whose terms are nonnegative.
+UP = 1.0 + 2.0**-40
+# What is stored above what was found, so that another library finds it proved too.
+ROOM = 1.0 + 2.0**-10
+
+
+def _ends(box: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return box[:, :1], box[:, 1:]
+
+
+def shown(design: GeneralDesign, limits: Limits) -> FloatArray:
+    """Bound the readings of states within the limits, (m,)."""
+    plant = design.extended.plant
+    sx = plant.sx()
+    output = ca.Function("shown", [sx.x, sx.u, sx.w], [ca.densify(sx.y)], ["x", "u", "w"], ["y"])
+    found = _over(design, output, {"x": limits.x, "u": limits.u, "w": plant.box("w")})["y"]
+    return np.asarray(found.size + found.error)
+
+
+def _over(
+    design: GeneralDesign, function: ca.Function, boxes: dict[str, FloatArray]
+) -> dict[str, Bound]:
+    """Bound the rounding of a function over boxes, cut along the states that matter."""
+    plant = design.extended.plant
+    bends = np.flatnonzero(curved(plant))
+    x_lo, x_hi = _ends(boxes["x"])
+    if bends.size:
+        pieces = max(1, min(16, int(CELLS ** (1.0 / len(bends)))))
+        lo, hi = cut_box(boxes["x"][bends], pieces)
+        x_lo, x_hi = (np.repeat(end, lo.shape[1], axis=1) for end in (x_lo, x_hi))
+        x_lo[bends], x_hi[bends] = lo, hi
+    cells = {"x": (x_lo, x_hi)}
+    for name in function.name_in():
+        if name != "x":
+            cells[name] = _ends(boxes[name].reshape(-1, 2))
+    return rounding_bound(function, cells)
+
+
+def needed(design: GeneralDesign) -> Rounding:
+    """Bound what one step adds, rounded up."""
+    plant = design.extended.plant
+    limits = Limits.of(plant)
+    most = shown(design, limits)
+    boxes = {"x": limits.x, "u": limits.u, "y": np.column_stack([-most, most])}
+    first, second, third = stages(design)
+    leak = design.extended.leak(design.L0, most)
+    return Rounding(
+        q=(_over(design, first, boxes)["q"].error + leak) * UP,
+        c=_over(design, second, boxes)["c"].error * UP,
+        p=_over(design, third, boxes)["p"].error * UP,
+    )
+
+
+def settle(design: GeneralDesign) -> GeneralDesign:
+    """Return a design with gains, its allowances those that its step needs."""
+    found = needed(design)
+    return replace(design, rounding=Rounding(found.q * ROOM, found.c * ROOM, found.p * ROOM))
+
+
+def prove_rounding(design: GeneralDesign) -> Claim:
+    """Compare the allowances with what one step needs."""
+    found, have = needed(design), design.rounding
+    room = min(
+        float((mine - least).min(initial=np.inf))
+        for mine, least in ((have.q, found.q), (have.c, found.c), (have.p, found.p))
+    )
+    return Claim(
+        "rounding",
+        "the rounding error of one step is within the allowances",
+        bool(room >= 0.0),
+        room,
+        "interval analysis of the rounding of every instruction",
+    )

@@ -1,0 +1,245 @@
+"""What runs: a prediction, corrected with the readings, and half widths around it."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known, Parts, Seen
+from obsynth.designs.core.given import Start
+from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.signals import LARGEST_SIGNAL
+from obsynth.designs.core.stepping import clip, inside
+from obsynth.designs.general.record import GeneralDesign
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import BoolArray, FloatArray
+
+ROUND_UP = 1.0 + 2.0**-50
+# covers the rounding of estimate - half and estimate + half
+ULPS = 2.0**-50
+# Above the relative rounding error of the few dozen operations of each formula below.
+UP = 1.0 + 2.0**-44
+SETTLED = 0.01
+MOST_CALLS = 100_000
+
+
+def curved(plant: Plant) -> BoolArray:
+    """Return on which states of an extended plant some slope depends, (N,)."""
+    sx = plant.sx()
+    both = ca.vertcat(sx.x, sx.w)
+    slopes = ca.jacobian(ca.vertcat(sx.rhs, sx.y), both)
+    found = ca.which_depends(ca.vec(ca.densify(slopes)), sx.x, 1, False)
+    return np.array(found, dtype=bool).reshape(-1)
+
+
+def held(plant: Plant) -> BoolArray:
+    """Return which inputs enter in no constant way, so that they have to keep to their range."""
+    sx = plant.sx()
+    slopes = ca.jacobian(ca.vertcat(sx.rhs, sx.y), sx.u)
+    everything = ca.vertcat(sx.x, sx.u, sx.w)
+    return np.array(
+        [bool(ca.depends_on(ca.SX(slopes[:, k]), everything)) for k in range(sx.u.numel())]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Where estimates and inputs are followed: boxes (N, 2), (n_u, 2).
+
+    Inputs that enter in no constant way keep to their ranges. Everything else may leave its range
+    by its width on either side, and where none is declared `LARGEST_SIGNAL` stands for it.
+    """
+
+    x: FloatArray
+    u: FloatArray
+
+    @classmethod
+    def of(cls, plant: Plant) -> "Limits":
+        """Read the limits of an extended plant."""
+        x, u = (_finite(plant.box(kind)) for kind in "xu")
+        return cls(_wider(x), np.where(held(plant)[:, None], u, _wider(u)))
+
+
+def _finite(box: FloatArray) -> FloatArray:
+    box = box.reshape(-1, 2)
+    return np.where(np.isfinite(box), box, [-LARGEST_SIGNAL, LARGEST_SIGNAL])
+
+
+def _wider(box: FloatArray) -> FloatArray:
+    wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
+    return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
+
+
+def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return (xp, u, y) -> xq, (xq, u, y) -> xc and (xc, u) -> next xp.
+
+    Rows and outputs are the extended plant's own at v0, inside the box of the states on which a
+    slope depends, and go on outside with the middle of their slopes.
+    """
+    plant, N = design.extended.plant, design.size
+    m = len(plant.output_names)
+    x, u, y = (ca.SX.sym(s, k) for s, k in (("x", N), ("u", len(plant.u)), ("y", m)))
+    empty = ca.DM(0, 1)
+    box = np.where(curved(plant)[:, None], plant.box("x"), [-np.inf, np.inf])
+    inner = clip(x, box)
+    middle = design.middle
+    outside = x - inner
+    rows, outputs = plant.function()(inner, u, empty, empty, ca.DM(design.v_centre), empty, empty)
+    A0, C0 = (ca.sparsify(ca.DM(part)) for part in (middle[:N, :N], middle[N:, :N]))
+    loose = np.isfinite(box).any(axis=1)
+    A0[:, np.flatnonzero(~loose).tolist()] = 0.0
+    C0[:, np.flatnonzero(~loose).tolist()] = 0.0
+    rows = rows + ca.sparsify(A0) @ outside
+    innovation = y - (outputs + ca.sparsify(C0) @ outside)
+    # the outputs that L0 reads have constant slopes: no clipping there
+    plain = plant.function()(x, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
+    first = x + ca.sparsify(ca.DM(design.L0)) @ (y - plain)
+    if not design.extended.picked:
+        first = x
+    second = x + ca.sparsify(ca.DM(design.Z)) @ innovation
+    names = ["x", "u", "y"]
+    return (
+        ca.Function("first", [x, u, y], [ca.densify(first)], names, ["q"]),
+        ca.Function("second", [x, u, y], [ca.densify(second)], names, ["c"]),
+        ca.Function("third", [x, u], [ca.densify(rows)], names[:2], ["p"]),
+    )
+
+
+def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> ca.SX:
+    """Return an s that holds for a state and a fault in boxes, around a prediction."""
+    low, high = (
+        ca.vertcat(x.lower, _followed(design, f.lower)),
+        ca.vertcat(x.upper, _followed(design, f.upper)),
+    )
+    apart = ca.fmax(high - prediction, prediction - low)
+    return ca.sparsify(ca.DM(design.bound.fading.start * UP)) @ (apart * UP)
+
+
+def _followed(design: GeneralDesign, f: ca.SX) -> ca.SX:
+    names = design.plant.names("f")
+    return ca.vertcat(*(f[names.index(name)] for name in design.extended.followed))
+
+
+@dataclass(frozen=True, eq=False)
+class Running:
+    """How half widths evolve: ``s+ = decay s``, half widths ``reach s + add``, (N,)."""
+
+    decay: FloatArray
+    reach: FloatArray
+    add: FloatArray
+
+    @classmethod
+    def of(cls, design: GeneralDesign) -> "Running":
+        """Read the recursion of a design; underflow is far below what `add` counts twice."""
+        bound = design.bound
+        add = bound.b[design.size :] * ROUND_UP
+        return cls(bound.fading.G * UP, bound.fading.reach * UP, add)
+
+    def half_widths(self, s: FloatArray) -> FloatArray:
+        """Return the half widths that belong to a value of s."""
+        return np.asarray(self.reach @ s * ROUND_UP + self.add)
+
+
+def per_signal(design: GeneralDesign, widths: FloatArray) -> FloatArray:
+    """Return half widths of states and all faults from those of the followed ones, (n + n_f,)."""
+    n, names = len(design.plant.x), design.plant.names("f")
+    found = np.full(n + len(names), np.inf)
+    found[:n] = widths[:n]
+    for k, name in enumerate(design.extended.followed):
+        found[n + names.index(name)] = widths[n + k]
+    return found
+
+
+def steady(design: GeneralDesign) -> FloatArray:
+    """Return the steady half widths of the core, states then faults, (n + n_f,)."""
+    return per_signal(design, Running.of(design).add)
+
+
+def settling(
+    design: GeneralDesign, box: FloatArray, calls: int | None = None
+) -> tuple[int, FloatArray]:
+    """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
+
+    They begin from boxes of half widths `box` (n + n_f,), around estimates that are as near as the
+    limits say; with `calls` given, the half widths after so many.
+    """
+    running = Running.of(design)
+    n, names = len(design.plant.x), design.plant.names("f")
+    pick = [*range(n), *(n + names.index(name) for name in design.extended.followed)]
+    near = running.add * (1.0 + SETTLED)
+    s = np.asarray(design.bound.fading.start @ (2.0 * box[pick] + near)) * (1.0 + 2.0**-40)
+    k = 0
+    while k < (MOST_CALLS if calls is None else calls):
+        if calls is None and np.all(running.half_widths(s) <= near):
+            break
+        s, k = running.decay @ s, k + 1
+    return k, per_signal(design, running.half_widths(s) * (1.0 + 2.0**-30))
+
+
+def memory_sizes(design: GeneralDesign) -> dict[str, int]:
+    """Return the parts of the memory: the prediction of states and followed faults, and s."""
+    return {"prediction": design.size, "bound": len(design.bound.fading.G)}
+
+
+def first_memory(design: GeneralDesign, start: Start) -> dict[str, ArrayLike]:
+    """Start at the guess, and in the middle of the boxes of the followed faults."""
+    names = design.plant.names("f")
+    middle = start.f.mean(axis=1)
+    faults = [middle[names.index(name)] for name in design.extended.followed]
+    return {"prediction": np.concatenate([start.guess, faults])}
+
+
+def build_core(design: GeneralDesign) -> Core:
+    """Build what the observer knows of its own.
+
+    A missing reading counts as expected, and the half widths begin anew after it.
+    """
+    first, second, third = stages(design)
+    plant, n = design.extended.plant, len(design.plant.x)
+    running, limits = Running.of(design), Limits.of(plant)
+    reach, decay = (ca.sparsify(ca.DM(part)) for part in (running.reach, running.decay))
+    names, followed = design.plant.names("f"), design.extended.followed
+    own = curved(plant)[:n]
+    domain = np.where(own[:, None], design.plant.box("x"), [-np.inf, np.inf])
+    outputs = plant.function()
+    empty = ca.DM(0, 1)
+
+    def spread(values: ca.SX, other: float) -> ca.SX:
+        entries = [
+            values[n + followed.index(name)] if name in followed else ca.SX(other) for name in names
+        ]
+        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+
+    def run(seen: Seen) -> Known:
+        prediction, s = seen.memory["prediction"], seen.memory["bound"]
+        u = ca.vertcat(seen.u, seen.theta)
+        expected = outputs(prediction, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
+        y = seen.readings(expected)
+        q = first(prediction, u, y)
+        c = second(q, u, y)
+        half = (reach @ s) * ROUND_UP + ca.DM(running.add)
+        half = half + ULPS * ca.fabs(c)
+        low, high = c - half, c + half
+        sound = ca.logic_and(inside(prediction, prediction, limits.x), inside(q, q, limits.x))
+        sound = ca.logic_and(sound, inside(c, c, limits.x))
+        sound = ca.logic_and(sound, inside(u, u, limits.u))
+        return Known(
+            c[:n],
+            spread(c, 0.0),
+            Ends(low[:n], high[:n]),
+            Ends(spread(low, -FAR), spread(high, FAR)) if names else None,
+            {"prediction": third(c, u), "bound": decay @ s},
+            sound=sound,
+        )
+
+    def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
+        return {"bound": start_bound(design, x, f, kept["prediction"])}
+
+    def place(x: Ends, f: Ends, kept: Parts) -> Parts:
+        near = x.nearest(kept["prediction"][:n])
+        box = Ends(_followed(design, f.lower), _followed(design, f.upper))
+        return {"prediction": ca.vertcat(near, box.nearest(kept["prediction"][n:]))}
+
+    return Core(run, begin, place, domain=domain)

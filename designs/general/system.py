@@ -1,0 +1,178 @@
+"""The error system of the general class, enclosed.
+
+The extended plant is ``x+ = F(x, u, v) + D0 phi, y = h(x, u, v)``, with rows F that know nothing
+of phi (see `extend`); the observer, in current form, with h and F continued affinely outside the
+box by the middle [A0 W0; C0 V0] of their Jacobians,
+
+    xq = xp + L0 (y - h(xp, u, v0)),   xc = xq + Z (y - h(xq, u, v0)),   xp+ = F(xc, u, v0).
+
+Let e_p = x - xp, less what L0 takes away, and e_q, e_c alike, v less v0, T = I - L0 C. Averages of
+Jacobians along the way from an estimate to the state lie in the convex family, so
+
+    e_q  = T e_p - L0 V v
+    e_c  = (I - Z C0) e_q - Z V0 v - sum_j Z b_j delta'_j [e_q; v]_(c_j)
+    e_p+ = A0 e_c + W0 v + sum_j b_j delta_j [e_c; v]_(c_j) ,     |delta_j|, |delta'_j| <= r_j ,
+
+where delta of F and delta' of h are independent. One channel for every column of every direction:
+outside the box the state x in it satisfies ``x - sat(xhat) = Theta (x - xhat)`` with a diagonal
+0 <= Theta <= 1, which each column of the deviation shrinks with.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from obsynth.derive.rigour import UNIT_ROUNDOFF, Enclosure, add_up, product_up, raised
+from obsynth.designs.general.record import GeneralDesign
+from obsynth.symbolic.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Uncertain columns: ``b delta z`` with z one component of [e; v] and ``|delta| <= radius``.
+
+    columns: the b, shape (rows, count)
+    radii, sources: of each, shape (count,)
+    """
+
+    columns: FloatArray
+    radii: FloatArray
+    sources: IntArray
+
+    def coupling(self, size: int) -> FloatArray:
+        """Return how the channels are driven by the errors, (count, N)."""
+        found = np.zeros((len(self.radii), size))
+        inner = np.flatnonzero(self.sources < size)
+        found[inner, self.sources[inner]] = self.radii[inner]
+        return found
+
+    def sizes(self, size: int, v_radius: FloatArray) -> FloatArray:
+        """Return how large those are that disturbances drive, (count,), zero for others."""
+        found = np.zeros(len(self.radii))
+        outer = np.flatnonzero(self.sources >= size)
+        found[outer] = raised(self.radii[outer] * v_radius[self.sources[outer] - size], 1)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSystem:
+    """The matrices above, all enclosed. Shapes: N errors, n_v disturbances, m outputs.
+
+    A0, W0, C0, V0: the middle, exact doubles
+    T, M: ``I - L0 C`` and ``(I - Z C0) T``, (N, N)
+    through, direct: ``L0 V`` and ``L0 V + Z (V0 - C0 L0 V)``, what v adds to e_q, e_c
+    B_v, B_y: what v and the channels of h add to e_p
+    of_h, of_F: channels; `of_h.columns` (m, .), `of_F.columns` (N, .)
+    rest: what the family varies beside its channels, entrywise, (N + m, N + n_v)
+    v_radius: of v about v0
+    """
+
+    A0: FloatArray
+    W0: FloatArray
+    C0: FloatArray
+    V0: FloatArray
+    L0: FloatArray
+    Z: FloatArray
+    T: Enclosure
+    M: Enclosure
+    through: Enclosure
+    direct: Enclosure
+    B_v: Enclosure
+    B_y: Enclosure
+    of_h: Channels
+    of_F: Channels
+    rest: FloatArray
+    v_radius: FloatArray
+
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.A0)
+
+    @cached_property
+    def closed(self) -> Enclosure:
+        """``M A0``, which moves e_c, (N, N)."""
+        return self.M @ self.A0
+
+    @cached_property
+    def moving(self) -> Enclosure:
+        """``A0 M``, which moves e_p, (N, N)."""
+        return Enclosure.of(self.A0) @ self.M
+
+
+def split_columns(
+    directions: FloatArray, radii: FloatArray, rows: slice, widths: FloatArray
+) -> Channels:
+    """Take the directions of a family apart, column by column, where a column varies at all.
+
+    widths: of the variables by which the columns are derivatives; without width no deviation
+    """
+    part = directions[:, rows]
+    varies = np.any(part != 0.0, axis=1) & (radii > 0.0)[:, None] & (widths > 0.0)
+    which, sources = np.nonzero(varies)
+    return Channels(part[which, :, sources].T, radii[which], sources)
+
+
+def error_system(design: GeneralDesign) -> ErrorSystem:
+    """Form the error system of a design with gains."""
+    family, N = design.family, design.size
+    middle, mids = design.middle, family.ranges.mean(axis=1)
+    apart = np.maximum(family.ranges[:, 1] - mids, mids - family.ranges[:, 0])
+    radii = np.where(apart > 0.0, np.nextafter(apart, np.inf), 0.0)
+    # what rounding the middle moves
+    size = np.abs(family.constant) + np.tensordot(np.abs(mids), np.abs(family.directions), axes=1)
+    spread = 2.0 * (len(mids) + 1) * UNIT_ROUNDOFF * size
+    rest = raised(family.radius + np.where(len(mids) > 0, spread, 0.0), 4)
+    rest[(family.radius == 0.0) & (size == 0.0)] = 0.0
+    A0, W0, C0, V0 = middle[:N, :N], middle[:N, N:], middle[N:, :N], middle[N:, N:]
+    widths = np.concatenate([np.ones(N), design.v_radius])
+    eye, of = np.eye(N), Enclosure.of
+    L0, Z = of(design.L0), of(design.Z)
+    kept = of(eye) - Z @ C0
+    T = of(eye) - L0 @ Enclosure(C0, rest[N:, :N])
+    through = L0 @ Enclosure(V0, rest[N:, N:])
+    direct = kept @ through + Z @ V0
+    of_h = split_columns(family.directions, radii, slice(N, None), widths)
+    of_F = split_columns(family.directions, radii, slice(0, N), widths)
+    return ErrorSystem(
+        A0=A0,
+        W0=W0,
+        C0=C0,
+        V0=V0,
+        L0=design.L0,
+        Z=design.Z,
+        T=T,
+        M=kept @ T,
+        through=through,
+        direct=direct,
+        B_v=of(W0) - of(A0) @ direct,
+        B_y=-(of(A0) @ (Z @ of_h.columns)),
+        of_h=of_h,
+        of_F=of_F,
+        rest=rest,
+        v_radius=design.v_radius,
+    )
+
+
+def magnitude(value: Enclosure) -> FloatArray:
+    """Bound the entries of an enclosure."""
+    total: FloatArray = np.abs(value.mid) + value.rad
+    return np.where(value.rad > 0, np.nextafter(total, np.inf), total)
+
+
+@dataclass(frozen=True, eq=False)
+class Extra:
+    """What else enters, rounding above all: bounds for e_q and e_c directly, and for e_p."""
+
+    q: FloatArray
+    c: FloatArray
+    p: FloatArray
+
+
+def extra_inputs(system: ErrorSystem, design: GeneralDesign) -> Extra:
+    """Bound what rounding and the leak of L0 add, (N,) each."""
+    rounding, kept = design.rounding, np.abs(np.eye(system.size) - system.Z @ system.C0)
+    kept = raised(kept + np.abs(system.Z) @ np.abs(system.C0) * 2.0**-48, 4)
+    c = add_up(product_up(kept, rounding.q), rounding.c)
+    return Extra(rounding.q, c, add_up(product_up(np.abs(system.A0), c), rounding.p))
