@@ -13,6 +13,10 @@ from obsynth.symbolic.plant import Plant
 
 _STARTS = 32
 _ITERATIONS = 60
+_HALVINGS = 30
+_VALUES = 4_000
+# A step that leaves more than this share of the residual leads nowhere, and so do a few of them.
+_SLOW, _PATIENCE = 0.99, 3
 _NO_VALUES: FloatArray = np.zeros(0)
 
 
@@ -79,39 +83,44 @@ def _inputs(model: Plant, u: ArrayLike | None) -> FloatArray:
     return values
 
 
-def _residual_function(model: Plant) -> ca.Function:
+def _residual_functions(model: Plant) -> tuple[ca.Function, ca.Function]:
+    """Return what is to vanish, and its derivative by the state."""
     sx = model.sx()
     residual = sx.rhs - sx.x if model.Ts is not None else sx.rhs
     quiet = ca.vertcat(sx.d, sx.f, sx.w)
     residual = ca.substitute(residual, quiet, ca.SX.zeros(quiet.numel()))
     arguments = [sx.x, sx.u, sx.p, sx.rho]
-    return ca.Function("residual", arguments, [residual, ca.jacobian(residual, sx.x)])
+    slope = ca.cse(ca.jacobian(residual, sx.x))
+    return ca.Function("residual", arguments, [residual]), ca.Function("slope", arguments, [slope])
 
 
-def _newton(function: ca.Function, start: FloatArray, given: list[Any]) -> tuple[FloatArray, float]:
-    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        value, slope = function(x, *given)
-        return np.array(value).ravel(), np.array(slope)
-
-    x = start
-    value, slope = at(x)
+def _newton(
+    functions: tuple[ca.Function, ca.Function], start: FloatArray, given: list[Any]
+) -> tuple[FloatArray, float, int]:
+    """Return where Newton's method ends, what is left there, and how many values that took."""
+    x, value = start, np.array(functions[0](start, *given)).ravel()
+    count, slow = 1, 0
     for _ in range(_ITERATIONS):
+        slope = np.array(functions[1](x, *given))
         if not (np.isfinite(value).all() and np.isfinite(slope).all()):
-            return x, np.inf
+            return x, np.inf, count
         size = float(np.abs(value).max(initial=0.0))
-        if size == 0.0:
+        if size == 0.0 or slow == _PATIENCE:
             break
         # least squares: an integrator makes the Jacobian singular without making it useless
         step = np.linalg.lstsq(slope, -value, rcond=None)[0]
-        for halving in range(30):
+        for halving in range(_HALVINGS):
             trial = x + step * 0.5**halving
-            trial_value, trial_slope = at(trial)
-            if np.abs(trial_value).max(initial=0.0) < size:
+            trial_value = np.array(functions[0](trial, *given)).ravel()
+            count += 1
+            left = float(np.abs(trial_value).max(initial=0.0))
+            if left < size:
                 break
         else:
             break
-        x, value, slope = trial, trial_value, trial_slope
-    return x, float(np.abs(value).max(initial=0.0))
+        slow = slow + 1 if left > _SLOW * size else 0
+        x, value = trial, trial_value
+    return x, float(np.abs(value).max(initial=0.0)), count
 
 
 def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
@@ -147,7 +156,7 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
     inputs = _inputs(model, u)
     p, rho = operating_values(model, "p"), operating_values(model, "rho")
     box = model.box("x")
-    function = _residual_function(model)
+    functions = _residual_functions(model)
     first = operating_values(model, "x")
     finite = np.isfinite(box).all(axis=1)
     width = np.where(
@@ -155,10 +164,14 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
     )
     rng = np.random.default_rng(0)
     outside: FloatArray | None = None
+    spent = 0
     for attempt in range(_STARTS):
+        if spent > _VALUES:
+            break
         start = first if attempt == 0 else first + width * (rng.random(len(first)) - 0.5)
         start = np.clip(start, box[:, 0], box[:, 1])
-        x, residual = _newton(function, start, [inputs, p, rho])
+        x, residual, count = _newton(functions, start, [inputs, p, rho])
+        spent += count
         scale = 1.0 + float(np.abs(x).max(initial=0.0))
         if residual > 1e-9 * scale:
             continue

@@ -16,12 +16,15 @@ Lagrange's method, shrink to a fraction. Every rewritten part is proved equal to
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import sympy as sp
 
 from obsynth.derive.algebra.sizes import LARGEST_ROW, is_short, simplified, size
 
 _LARGEST_SUM = 200
+# The stages of a Runge-Kutta step stand in it many times over.
+_once = lru_cache(maxsize=4096)
 
 
 def cancel_common_factors(
@@ -213,8 +216,9 @@ def products_to_sums(expression: sp.Expr) -> sp.Expr | None:
     return None if result == expression else result
 
 
-def _waves(expression: sp.Expr) -> set[sp.Expr]:
-    return set(expression.atoms(sp.sin, sp.cos))
+@_once
+def _waves(expression: sp.Expr) -> frozenset[sp.Expr]:
+    return frozenset(expression.atoms(sp.sin, sp.cos))
 
 
 def _has_products(expression: sp.Expr) -> bool:
@@ -227,6 +231,7 @@ def _has_products(expression: sp.Expr) -> bool:
     return False
 
 
+@_once
 def _is_polynomial(expression: sp.Expr) -> bool:
     """Whether sines and cosines stand in sums, products and natural powers only."""
     if not _waves(expression):
@@ -241,6 +246,7 @@ def _is_polynomial(expression: sp.Expr) -> bool:
     return False
 
 
+@_once
 def _rewritten(expression: sp.Expr) -> sp.Expr:
     if not _waves(expression) or not expression.args:
         return expression

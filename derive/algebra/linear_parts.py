@@ -8,6 +8,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.sizes import LARGEST_ROW, simplified, size, text
 from obsynth.derive.algebra.sizes import symbols as symbols_of
+from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import round_number, substitute
@@ -60,20 +61,20 @@ def constant_columns(
         for j, symbol in enumerate(symbols):
             if symbol not in present:
                 continue
-            slope = sp.diff(row, symbol)
-            if slope.free_symbols - set(values):
-                slope = simplified(slope)
-            others = sorted(str(s) for s in slope.free_symbols - set(values))
+            factor = slope(row, symbol)
+            if factor.free_symbols - set(values):
+                factor = simplified(factor)
+            others = sorted(str(s) for s in factor.free_symbols - set(values))
             if others:
                 raise StructureError(
                     f"the {what} {symbol} enters the row of {row_names[i]} with the coefficient "
-                    f"{text(slope)}, which depends on {', '.join(others)}; it has to enter "
+                    f"{text(factor)}, which depends on {', '.join(others)}; it has to enter "
                     "linearly with a constant coefficient",
                     symbol=str(symbol),
                     row=row_names[i],
-                    coefficient=slope,
+                    coefficient=factor,
                 )
-            exact[i, j] = substitute(slope, values)
+            exact[i, j] = substitute(factor, values)
         rest = row - sum((exact[i, j] * s for j, s in enumerate(symbols)), sp.Integer(0))
         rest = substitute(rest, values)
         zero = substitute(row.subs(dict.fromkeys(symbols, 0)), values)

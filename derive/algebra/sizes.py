@@ -10,6 +10,8 @@ from typing import Any
 
 import sympy as sp
 
+from obsynth.derive.rigour.walks import once, replaced
+
 LARGEST_SIMPLIFY = 300
 """Parts of an expression up to which `sympy.simplify` is asked; its longest proof had 280."""
 LARGEST_ROW = 10_000
@@ -23,14 +25,14 @@ _LONGEST = 300
 def size(expression: Any) -> int:
     """Count the parts of an expression written out."""
     known: dict[sp.Basic, int] = {}
-    for node in _once(expression):
+    for node in once(expression):
         known[node] = min(_ENDLESS, 1 + sum(known[part] for part in node.args))
     return known[expression]
 
 
 def symbols(expression: sp.Expr) -> set[sp.Basic]:
     """Collect the symbols of an expression, however long it is."""
-    return {node for node in _once(expression) if isinstance(node, sp.Symbol)}
+    return {node for node in once(expression) if isinstance(node, sp.Symbol)}
 
 
 def is_short(expression: sp.Expr) -> bool:
@@ -44,7 +46,7 @@ def expanded_terms(expression: sp.Expr) -> int:
     degree: dict[sp.Basic, int] = {}
     factors: dict[sp.Basic, frozenset[sp.Basic]] = {}
     largest = 1
-    for node in _once(expression):
+    for node in once(expression):
         parts = node.args
         count[node], degree[node] = 1, 0 if node.is_number else 1
         factors[node] = frozenset() if node.is_number else frozenset([node])
@@ -76,28 +78,22 @@ def _monomials(degree: int, variables: int) -> int:
     return min(_ENDLESS, comb(degree + variables, small))
 
 
-def _once(expression: sp.Basic) -> list[sp.Basic]:
-    """List every different part, parts before what they are in."""
-    done: dict[sp.Basic, None] = {}
-    stack: list[tuple[sp.Basic, bool]] = [(expression, False)]
-    while stack:
-        node, ready = stack.pop()
-        if ready:
-            done[node] = None
-        elif node not in done:
-            stack.append((node, True))
-            stack.extend((part, False) for part in node.args if part not in done)
-    return list(done)
-
-
 def expanded(expression: sp.Expr) -> sp.Expr:
     """Expand what does not become too long; leave the rest as it is."""
     return sp.expand(expression) if is_short(expression) else expression
 
 
 def simplified(expression: sp.Expr) -> sp.Expr:
-    """Simplify what is short; leave the rest as it is."""
-    return sp.simplify(expression) if size(expression) <= LARGEST_SIMPLIFY else expression
+    """Simplify what is short; leave the rest as it is.
+
+    SymPy tries for seconds to make something of a jump; nothing is to be made of it.
+    """
+    if size(expression) > LARGEST_SIMPLIFY:
+        return expression
+    jumps = (sp.sign, sp.Heaviside, sp.floor, sp.ceiling)
+    names = {node: sp.Dummy(real=True) for node in once(expression) if isinstance(node, jumps)}
+    short = sp.simplify(replaced(expression, names))
+    return replaced(short, {name: node for node, name in names.items()})
 
 
 def text(expression: sp.Expr) -> str:

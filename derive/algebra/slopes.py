@@ -4,15 +4,31 @@ from collections.abc import Sequence
 
 import sympy as sp
 
+from obsynth.derive.rigour.walks import once, replaced
+
+_FLAT = (sp.sign, sp.Heaviside, sp.floor, sp.ceiling)
+
+
+def slope(row: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
+    """Differentiate a row; what jumps is flat beside its jump."""
+    return jacobian(sp.Matrix([row]), [symbol])[0]
+
 
 def jacobian(rows: sp.Matrix, symbols: Sequence[sp.Symbol]) -> sp.Matrix:
     """Differentiate rows; what jumps is flat beside its jump.
 
-    SymPy leaves the derivative of the sign of something that it does not know to be real undone.
+    Everything here is real, which SymPy does not always know: it leaves the derivative of a sign
+    undone then, as it does that of a floor, and later takes hours over what it left.
     """
     if not symbols:
         return sp.zeros(len(rows), 0)
-    found = sp.Matrix(rows).jacobian(symbols)
-    undone = [d for d in found.atoms(sp.Derivative) if isinstance(d.expr, sp.sign | sp.Heaviside)]
-    flat = found.xreplace(dict.fromkeys(undone, sp.Integer(0)))
-    return flat.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+    flat: dict[sp.Basic, sp.Basic] = {}
+    back: dict[sp.Basic, sp.Basic] = {}
+    for node in once(*rows):
+        jump = sp.sign(node.args[0]) if isinstance(node, sp.Abs) else node
+        if isinstance(jump, _FLAT):
+            level = sp.Dummy(real=True)
+            back[level] = jump
+            flat[node] = level if jump is node else replaced(node.args[0], flat) * level
+    found = sp.Matrix([replaced(row, flat) for row in rows]).jacobian(symbols)
+    return found.applyfunc(lambda entry: replaced(entry, back))

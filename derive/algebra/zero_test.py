@@ -9,7 +9,7 @@ from typing import Any
 import sympy as sp
 
 from obsynth.derive.algebra.secants import quotients
-from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, size
+from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, simplified, size
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 NUMERIC = "numerically zero at 60 digits"
@@ -103,7 +103,7 @@ def _prove(expression: sp.Expr, exponentials: bool = True) -> str:
     for name, attempt, limit in (
         ("cancel", _cancel, _LARGEST_CANCEL),
         ("cancel", _cancel_exponentials, _LARGEST_EXPONENTIAL if exponentials else 0),
-        ("simplify", sp.simplify, LARGEST_SIMPLIFY),
+        ("simplify", simplified, LARGEST_SIMPLIFY),
     ):
         if length > limit or _size_over_one(expression) > _LARGEST_NUMERATOR:
             continue

@@ -352,7 +352,8 @@ def bound_ranges(
     if not 0.0 <= rtol < 1.0:
         raise DerivationError(f"rtol has to lie in [0, 1); given was {rtol}", rtol=rtol)
     problem = make_problem(expressions, variables, box, constants, constant_box, quotients)
-    return _ranges(problem, staged(problem, rtol, EFFORTS[effort]))
+    budget = EFFORTS[effort].for_nodes(len(problem.program.nodes))
+    return _ranges(problem, staged(problem, rtol, budget))
 
 
 def _ranges(problem: Problem, outcome: Outcome) -> Ranges:

@@ -8,6 +8,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import cancel_common_factors, products_to_sums
 from obsynth.derive.algebra.sizes import LARGEST_ROW, size, symbols
+from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
@@ -151,7 +152,7 @@ def _exact_entry(row: sp.Expr, symbol: sp.Symbol, name: str, model: Plant) -> sp
     if size(row) > LARGEST_ROW:
         signals = symbols(row) - set(model.constant_values)
         return sp.Function(name)(*sorted(signals, key=str))
-    return substitute(sp.diff(substitute(row, {}), symbol), model.constant_values)
+    return substitute(slope(substitute(row, {}), symbol), model.constant_values)
 
 
 def all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:

@@ -12,9 +12,10 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.errors import StructureError
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour import rational, substitute
+from obsynth.derive.rigour import substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal
@@ -64,9 +65,9 @@ class Monotone:
 
     def _parts(self, row: sp.Expr, symbol: sp.Symbol) -> list[list[sp.Expr]]:
         """Return the slope as a sum of products, each listed by its factors."""
-        parts = [[sp.diff(row, symbol)]]
+        parts = [[slope(row, symbol)]]
         parts += [
-            [sp.diff(row, piece.signal.symbol), sp.diff(piece.inner, symbol)]
+            [slope(row, piece.signal.symbol), slope(piece.inner, symbol)]
             for piece in self.pieces
             if row.has(piece.signal.symbol)
         ]
@@ -155,5 +156,4 @@ def _signed_power(node: sp.Mul) -> tuple[sp.Expr, sp.Expr, sp.Expr] | None:
 
 def exact_slope(row: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
     """Return the derivative of an equation with every double as the rational that it is."""
-    slope = sp.diff(row, symbol)
-    return slope.xreplace({number: rational(float(number)) for number in slope.atoms(sp.Float)})
+    return substitute(slope(row, symbol), {})

@@ -29,6 +29,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.errors import DerivationError
+from obsynth.derive.rigour.walks import once, replaced
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 UNIT_ROUNDOFF = 2.0**-53
@@ -134,16 +135,15 @@ def rational(value: float) -> sp.Rational:
 
 def exact(expression: sp.Expr) -> sp.Expr:
     """Write floats as the rationals they are; arithmetic with floats would round and overflow."""
-    floats = {number: sp.Rational(number) for number in expression.atoms(sp.Float)}
-    return expression.xreplace(floats) if floats else expression
+    floats = {n: sp.Rational(n) for n in once(expression) if isinstance(n, sp.Float)}
+    return replaced(expression, floats) if floats else expression
 
 
 def substitute(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
     """Put exact numbers in place of symbols; floats of the user become the rationals they are."""
     result = exact(sp.sympify(expression))
-    if present := {s: exact(values[s]) for s in result.free_symbols if s in values}:
-        result = result.subs(present)
-    return result
+    present = {s: exact(values[s]) for s in once(result) if s in values}
+    return replaced(result, present) if present else result
 
 
 def round_number(number: sp.Expr) -> tuple[float, float]:

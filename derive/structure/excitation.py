@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
@@ -159,7 +160,7 @@ def _effect(plant: Plant, index: int) -> FaultEffect:
     quiet = {s.symbol: sp.Integer(0) for kind in ("f", "w") for s in getattr(plant, kind)}
     rows = [*plant.rhs, *plant.output]
     column = sp.Matrix(
-        [substitute(sp.diff(row, signal.symbol), plant.constant_values).subs(quiet) for row in rows]
+        [substitute(slope(row, signal.symbol), plant.constant_values).subs(quiet) for row in rows]
     )
     depends = sorted({str(s) for s in column.free_symbols})
     entries = matrix_entries({(i, 0): column[i] for i in range(len(rows))}, plant)

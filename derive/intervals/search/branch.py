@@ -95,6 +95,9 @@ _MATRIX_NUMBERS = 1_000_000
 _SINGULAR_ROWS = 8
 _SINGULAR_WIDTH = 2.0**-20
 _SAMPLES = 48
+# Nodes of a program from which on fewer boxes are looked at, and without second derivatives.
+_LONG_PROGRAM = 2_000
+_LONGEST_CURVED = 10_000
 _TINY = 1e-300
 
 
@@ -104,6 +107,14 @@ class Budget:
 
     boxes: int
     sweeps: int
+
+    def for_nodes(self, nodes: int) -> Budget:
+        """Return what is left where a program is so long that every box costs more.
+
+        It has more derivatives to bound as well, and each of them is longer.
+        """
+        nodes = max(nodes, _LONG_PROGRAM)
+        return Budget(max(1, self.boxes * _LONG_PROGRAM**2 // nodes**2), self.sweeps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +163,8 @@ class Search:
         self.singular: dict[int, Interval] = {}
         self.boxes = self.sweeps = 0
         source = problem.source
-        self.curvatures = None if source is None else Curvatures(source, problem.program)
+        long = len(problem.program.nodes) > _LONGEST_CURVED
+        self.curvatures = None if source is None or long else Curvatures(source, problem.program)
         self.open = self.without_limits(self.initial())
 
     def initial(self) -> Rows:
