@@ -10,6 +10,7 @@ counted and not planted.
     python tools/mutants.py                   # all listed ones, some made in every file
     python tools/mutants.py derive/rigour     # in files whose name has these words
     python tools/mutants.py derive/rigour/interval.py --each 20 --seed 7
+    python tools/mutants.py --each 999 --again told.txt  # those that a run before says survive
 """
 
 import argparse
@@ -48,7 +49,7 @@ BUSY, LIMIT, MEMORY = 120, 600.0, 2**33
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
 
 
-@dataclass
+@dataclass(eq=False)
 class Watch:
     """A plugin of pytest that runs first what has caught before, then what is quick.
 
@@ -97,6 +98,10 @@ class Job:
     where: str = ""
     says: str = ""
     why: str = ""
+
+    def told_in(self, line: str) -> bool:
+        """Whether a line of an earlier run is about it, wherever it stood in its file then."""
+        return f" {self.file}:" in line and line.endswith(f" {self.says}")
 
     @property
     def room(self) -> str:
@@ -223,12 +228,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--most", type=int, default=10**6, help="mutants at most")
     parser.add_argument("--minutes", type=float, default=60.0, help="none is planted later")
     parser.add_argument("--workers", type=int, default=2, help="copies of the checkout")
+    parser.add_argument("--again", type=Path, help="what a run printed: its survivors alone")
     parser.add_argument("--list", type=Path, nargs="*", default=LISTS, help="instead of ours")
     asked = parser.parse_args(arguments)
     began, lists = time.monotonic(), read(asked.list)
     found = made(lists, asked.each, asked.seed)
     everything = [*listed(lists), *(job for _, job in sorted(found, key=lambda f: f[0]))]
     chosen = [job for job in everything if asked.words in job.file][: asked.most]
+    if asked.again:
+        before = [line for line in asked.again.read_text().splitlines() if "SURVIVES" in line]
+        chosen = [job for job in chosen if any(map(job.told_in, before))]
     told = [job for job in chosen if job.why]
     for name in HEAVY:
         importlib.import_module(name)

@@ -178,6 +178,7 @@ def is_exact(name: str, operands: list[Node]) -> BoolArray:
     if name == "add":
         bl, bh = -bh, -bl
     zero = ((al == 0.0) & (ah == 0.0)) | ((bl == 0.0) & (bh == 0.0))
-    above = (al > 0.0) & (bl > 0.0) & (bh <= 2.0 * al) & (ah <= 2.0 * bl)
-    below = (ah < 0.0) & (bh < 0.0) & (bl >= 2.0 * ah) & (al >= 2.0 * bh)
+    # of one sign: b by itself, a within the factor of it
+    above = (bl > 0.0) & (bh <= 2.0 * al) & (ah <= 2.0 * bl)
+    below = (bh < 0.0) & (bl >= 2.0 * ah) & (al >= 2.0 * bh)
     return np.asarray(zero | above | below)

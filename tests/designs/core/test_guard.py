@@ -320,3 +320,18 @@ def test_the_guarantee_names_the_states_that_begin_from_declared_ranges(name, in
     assert unbounded is None or any(line.startswith(unbounded) for line in text)
     assert sum("60 calls" in line for line in text) == 2
     assert text[0] == "own" and found.assumptions[0] == "its"
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_first_boxes_are_stored_outside_of_what_is_given(precision):
+    """In numbers of the precision. Mutant: the box as it is, which single precision rounds."""
+    kind = np.float32 if precision == "single" else np.float64
+    watch = Watch.of({"horizon": 30, "recovery": 1, "cuts": None})
+    guard = Guard(drifting(), {}, watch, 0, 1.0, precision)
+    box = np.array([[0.1, 0.3], [-0.7, -0.1]])
+    parts = guard.first({}, box, np.zeros((0, 2)))
+    for end in ("", YOUNG):
+        lower, upper = (np.asarray(parts[f"x_{name}{end}"]) for name in ("lower", "upper"))
+        assert (lower <= box[:, 0]).all() and (upper >= box[:, 1]).all()
+        assert (lower == lower.astype(kind)).all() and (upper == upper.astype(kind)).all()
+        assert np.abs(np.stack([lower, upper], axis=1) - box).max() < 2 * np.finfo(kind).eps

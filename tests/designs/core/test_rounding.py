@@ -110,6 +110,12 @@ def at(*values):
     return column, column
 
 
+def zero(a, b):
+    return (a * a) * b - a * (a * b)
+
+
+C1, C2 = 1211528, 12809876
+TWICE = (1 + 3613284 * 2**-23, 1 + 4144635 * 2**-23)
 CASES = {
     # the rounding of one product, nearly half a unit in the last place of 1
     "one product": (lambda a, b: a * b, (1 + 2042 * 2**-23, 1 + 2054 * 2**-23), 1.1),
@@ -123,7 +129,18 @@ CASES = {
     "a root": (lambda a, b: ca.sqrt(a * a - 1.0) * b, (1 + 2**-12 + 2**-23, 1.0), 2.1),
     "a square": (lambda a, b: ((a * a - 1.0) * b) ** 2, (1 + 2**-12 + 2**-23, 2.0**20), 2.1),
     "a power": (lambda a, b: ((a * a - 1.0) * b) ** 1.7, (1 + 2**-12 + 2**-23, 2.0**20), 2.1),
+    "an exponent": (lambda a, b: 2.0 ** ((a * a - 1.0) * b), (1 + 2**-12 + 2**-23, 1024.0), 2.1),
     "a function": (lambda a, b: ca.exp((a * a - 1.0) * b), (1 + 2**-12 + 2**-23, 1024.0), 2.1),
+    # a^2 b is larger than 1, but not when it is rounded
+    "a minimum": (lambda a, b: ca.fmin(a * a * b, 1.0), (1 + C1 * 2**-23, C2 * 2**-24), 2.1),
+    "a maximum": (lambda a, b: ca.fmax(-1.0, -a * a * b), (1 + C1 * 2**-23, C2 * 2**-24), 2.1),
+    "its turn": (lambda a, b: ca.fmin(1.0, a * a * b), (1 + C1 * 2**-23, C2 * 2**-24), 2.1),
+    "both turned": (lambda a, b: ca.fmax(-a * a * b, -1.0), (1 + C1 * 2**-23, C2 * 2**-24), 2.1),
+    "an angle": (lambda a, b: ca.atan2(1.0, (a * a - 1.0) * b), (1 + 2**-12 + 2**-23, 1024.0), 2.5),
+    "a slope": (lambda a, b: ca.atan2((a * a - 1.0) * b, 1.0), (1 + 2**-12 + 2**-23, 1024.0), 2.5),
+    # e_a e_b, of factors that are zero but for rounding
+    "two errors": (lambda a, b: zero(a, b) * zero(b, a), TWICE, 12.0),
+    "an error twice": (lambda a, b: zero(a, b) ** 2, TWICE, 12.0),
     # a^2 is larger than b, but not when it is rounded
     "a choice": (lambda a, b: ca.if_else(a * a <= b, 3.0, 7.0), (1 + 2**-12, 1 + 2**-11), 2.6),
 }
@@ -161,6 +178,30 @@ def test_a_difference_is_exact_within_a_factor_of_two_only():
         assert (seen == 0.0) == exact
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_differences_are_exact_where_all_corners_are_within_a_factor_of_two(seed):
+    """Both conditions at all four corners, of either sign. Mutants: an end exchanged, one left out.
+
+    With zero everything is exact.
+    """
+    rng, kinds = np.random.default_rng(seed), set()
+    difference, together = one(lambda a, b: a - b), one(lambda a, b: a + b)
+    for sign in (1.0, -1.0):
+        for _ in range(40):
+            ends = np.sort(np.round(rng.uniform(2, 8, (2, 2)), 1) / 10, axis=1)
+            a, b = np.sort(sign * ends, axis=1)
+            exact = all(x <= 2 * y and y <= 2 * x for x in abs(a) for y in abs(b))
+            lo, hi = np.array([[a[0]], [b[0]]]), np.array([[a[1]], [b[1]]])
+            assert (bound(difference, lo, hi, "double")[0] == 0.0) == exact
+            lo[1], hi[1] = -hi[1], -lo[1]
+            assert (bound(together, lo, hi, "double")[0] == 0.0) == exact
+            kinds.add(exact)
+    assert kinds == {True, False}
+    for function in (difference, together):
+        assert bound(function, *at(1.3, 0.0), "double")[0] == 0.0
+        assert bound(function, *at(0.0, 1.3), "double")[0] == 0.0
+
+
 def test_a_form_is_cut_with_what_the_box_says_of_it():
     """(a + b) - (a - b) is 2 b, however large a is. Mutant: forms dropped, or cut to half."""
     rng = np.random.default_rng(1)
@@ -173,6 +214,24 @@ def test_a_form_is_cut_with_what_the_box_says_of_it():
     assert bound(kept, lo, hi, "double")[0] < 1e-14
 
 
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda a, b: ca.atan2(a * a, b * a),
+        lambda a, b: ca.hypot(a * a, b * a),
+        lambda a, b: ca.sqrt(a * a),
+        lambda a, b: (a * a) ** 1.7,
+        lambda a, b: ca.exp(a * b),
+        lambda a, b: a * a / (a + 3.0 * b + 4.0),
+        lambda a, b: ca.fmin(a * a, b * b),
+    ],
+)
+def test_wide_cells_keep_a_bound(formula):
+    """A few hundred units, not as wide as the cell. Mutant: a distance that becomes zero."""
+    lo, hi = np.array([[1.0], [-1.0]]), np.array([[2.0], [1.0]])
+    assert bound(one(formula), lo, hi, "double")[0] < 400 * 2.0**-53
+
+
 def test_what_is_undefined_has_no_bound():
     lo, hi = np.array([[-1.0], [0.0]]), np.array([[1.0], [1.0]])
     for formula in (lambda a, b: 1 / a, lambda a, b: ca.sqrt(a), lambda a, b: ca.log(b)):
@@ -183,6 +242,36 @@ def test_what_is_undefined_has_no_bound():
     large = at(1e30, 1e30)
     assert bound(one(lambda a, b: a * b), *large, "single")[0] == np.inf
     assert bound(one(lambda a, b: a * b), *large, "double")[0] < np.inf
+    # a number of the precision, but not when it is rounded twice
+    beside = at(1 + 905390 * 2.0**-23, 27335342 * 2.0**-24)
+    assert bound(one(lambda a, b: a * a * b * 2.0**127), *beside, "single")[0] == np.inf
+    assert bound(one(lambda a, b: a * a * b * 2.0**126), *beside, "single")[0] < np.inf
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_choice_has_the_range_of_both_branches(turned, sign):
+    """Here one is around zero and the other is not. Mutants: an end of one branch alone."""
+
+    def formula(a, b):
+        branches = sign * a, sign * (5.0 + a)
+        return 1 / ca.if_else(a < 1, *(branches[::-1] if turned else branches))
+
+    lo, hi = np.array([[-1.0], [0.0]]), np.array([[3.0], [1.0]])
+    assert bound(one(formula), lo, hi, "double")[0] == np.inf
+    assert bound(one(formula), lo + 1.5, hi + 1.5, "double")[0] < 1e-14
+
+
+def test_what_is_known_of_an_output_counts():
+    """Of a b, for which 1 / (a b) has a bound. Mutant: nothing is taken as known."""
+    v = ca.SX.sym("v", 2)
+    z = v[0] * v[1]
+    function = ca.Function("F", [v], [z, 1 / z], ["v"], ["z", "out"])
+    lo, hi = np.array([[-2.0], [1.0]]), np.array([[2.0], [2.0]])
+    assert bound(function, lo, hi, "double")[1] == np.inf
+    known = {"z": (np.array([[1.0]]), np.array([[2.0]]))}
+    error = rounding_bound(function, {"v": (lo, hi)}, "double", known)["out"].error[0]
+    assert 2.0**-53 <= error <= 5.01 * 2.0**-53
 
 
 def test_numbers_that_stand_for_others_count():
