@@ -133,6 +133,7 @@ def motor_turning() -> ob.Scenario:
     )
 
 
+# Further ways of a method stand behind a point.
 METHODS = {
     "bounded_error_uio": Entry(
         ob.BoundedErrorUIO(gamma=0.005),
@@ -150,6 +151,24 @@ METHODS = {
         outside=ob.plants.quadruple_tank,
         spoilt=(("bound", "b", 3), 0.9, "peak"),
         option={"weights": -1.0},
+        gains=("L",),
+    ),
+    "general_uio.ellipsoid": Entry(
+        GeneralUIO(bounds="ellipsoid"),
+        motor,
+        motor_turning,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("bound", "tau", 0), 0.5, "lmi"),
+        option={"gamma": 1.5},
+        gains=("L",),
+    ),
+    "general_uio.l2": Entry(
+        GeneralUIO(bounds="l2"),
+        motor,
+        motor_turning,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("bound", "mu"), 0.99, "lmi"),
+        option={"bounds": "none"},
         gains=("L",),
     ),
     "hinf_uio": Entry(

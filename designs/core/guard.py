@@ -102,7 +102,7 @@ class Guard:
     Ts: float
     precision: str = "double"
     shared: tuple[str, ...] = ()
-    settle: Callable[[FloatArray, int | None], tuple[int, FloatArray]] | None = None
+    settle: Callable[[FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
 
     @property
     def discrete(self) -> bool:
@@ -161,8 +161,8 @@ class Guard:
             begun[n:] = np.minimum(begun[n:] + self.contractor.rates, 0.5 * declared[:, 0])
             if np.isfinite(begun).all():
                 late = _LATE if horizon is None else min(_LATE, horizon - 1)
-                calls, widths = self.settle(begun, None if horizon is None else horizon - late)
-                return calls + late, widths
+                found = self.settle(begun, None if horizon is None else horizon - late)
+                return (self.watch.calls, None) if found is None else (found[0] + late, found[1])
             # what begins from a set without bounds would be lost for good
             return MOST_CALLS if horizon is None else horizon, None
         return self.watch.calls, None

@@ -71,7 +71,8 @@ class Contract(Generic[D]):
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
     settle: of a design, half widths of the sets that its core begins from, and a number of calls
-        or None: how many calls its bounds take to settle, or that number, and its half widths then
+        or None: how many calls its bounds take to settle, or that number, and its half widths then;
+        None of a design without bounds
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """
@@ -90,7 +91,7 @@ class Contract(Generic[D]):
     ode: Callable[[D], ca.Function] | None = None
     fault_delay: int = 0
     step_covered: bool = False
-    settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray]] | None = None
+    settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
     quiet: bool = False
 
     def to_record(self, design: Any) -> dict[str, Any]:

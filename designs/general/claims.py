@@ -8,11 +8,13 @@ from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.general.fading import prove_fading
+from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
 from obsynth.designs.general.peak import error_sums, prove_peak
-from obsynth.designs.general.record import GeneralDesign
+from obsynth.designs.general.record import EnergyBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import prove_rounding
 from obsynth.designs.general.step import Limits, curved, steady
+from obsynth.designs.general.storage import prove_storage
 from obsynth.designs.general.system import error_system, extra_inputs
 
 
@@ -20,7 +22,10 @@ def claims(design: GeneralDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     yield _prove_boxes(design)
     yield prove_rounding(design)
-    yield from prove_peak_claims(design)
+    if isinstance(design.bound, PeakBound):
+        yield from prove_peak_claims(design, design.bound)
+    else:
+        yield from prove_storage(design)
 
 
 def _prove_boxes(design: GeneralDesign) -> Claim:
@@ -41,9 +46,9 @@ def _prove_boxes(design: GeneralDesign) -> Claim:
     )
 
 
-def prove_peak_claims(design: GeneralDesign) -> Iterator[Claim]:
+def prove_peak_claims(design: GeneralDesign, bound: PeakBound) -> Iterator[Claim]:
     """Prove the stored peak bounds from the stored data."""
-    b, statement = design.bound.b, "n + G b <= b: the stored b bounds every error at every k"
+    b, statement = bound.b, "n + G b <= b: the stored b bounds every error at every k"
     system = error_system(design)
     try:
         sums = error_sums(system, extra_inputs(system, design))
@@ -66,7 +71,7 @@ def prove_peak_claims(design: GeneralDesign) -> Iterator[Claim]:
         1.0 - proof.small_gain,
         "max (G v)_i / v_i for a positive v, rounded up",
     )
-    yield from prove_fading(system, design.bound.fading)
+    yield from prove_fading(system, bound.fading)
 
 
 def covers(design: GeneralDesign, fresh: GeneralModel) -> Iterator[Claim]:
@@ -99,12 +104,17 @@ def covers(design: GeneralDesign, fresh: GeneralModel) -> Iterator[Claim]:
 
 def numbers(design: GeneralDesign) -> Numbers:
     """Return gains, performance and steady half widths."""
+    bound = design.bound
+    if isinstance(bound, EnergyBound):
+        levels = {"l2_gain": bound.mu, "mu": bound.mu, "attained_gain": bound.attained}
+        return Numbers({"L": design.L}, levels, searched=("attained_gain",))
     widths = steady(design)
     finite = widths[np.isfinite(widths)]
-    performance = {
-        "sum_half_widths": float(finite.sum()),
-        "decay": design.bound.fading.decay,
-    }
+    performance = {"sum_half_widths": float(finite.sum())}
+    if isinstance(bound, PeakBound):
+        performance["decay"] = bound.fading.decay
+    else:
+        performance |= {"gamma": bound.gamma, "decay": 1.0 - bound.gamma}
     return Numbers({"L": design.L}, performance, widths)
 
 
@@ -120,7 +130,12 @@ def guarantee(design: GeneralDesign) -> Guarantee:
     )
     inputs = zip(extended.plant.names("w"), extended.plant.box("w").tolist(), strict=True)
     noise = ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in inputs)
-    claims = [f"{', '.join(names)} lie inside the returned (peak) intervals while this holds"]
+    bound = design.bound
+    if isinstance(bound, EnergyBound):
+        claims = [*_energy_claims(design, bound)]
+    else:
+        kind = "peak" if isinstance(bound, PeakBound) else "ellipsoidal"
+        claims = [f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds"]
     if extended.free:
         claims.append(f"whatever {', '.join(extended.free)} does")
     if design.unfollowed:
@@ -133,11 +148,36 @@ def guarantee(design: GeneralDesign) -> Guarantee:
         *([f"{where} [monitored in part: status bit 8]"] if where else []),
         "the first state and fault lie in the boxes given to memory0",
     ]
+    if isinstance(bound, EnergyBound):
+        assumptions.append(
+            "every reading arrives (status bit 32); one that is missing counts as a new initial "
+            "error, and rounding errors of the step are not counted as disturbances"
+        )
     if noise:
         steps = " (steps of faults per sample)" if extended.followed else ""
         assumptions.append(f"{noise}{steps} [monitored in part: status bit 8]")
     assumptions.append(_on_rounding(design))
     return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def _energy_claims(design: GeneralDesign, bound: EnergyBound) -> Iterator[str]:
+    """Say what an energy gain promises, in the user's names."""
+    states, v = design.extended.plant.x, design.extended.plant.names("w")
+    loop = error_loop(error_system(design))
+    parts = [
+        f"{weight:.6g} ({s.name} - {s.name}hat)"
+        for s, weight in zip(states, bound.weights.tolist(), strict=True)
+        if weight
+    ]
+    at_k, next_k = (
+        ", ".join(f"{v[i]} / {design.v_radius[i]:.6g}" for i in which)
+        for which in (loop.before, loop.after)
+    )
+    yield (
+        f"sum_k |z_k|^2 <= mu^2 sum_k (|a_k|^2 + |b_(k+1)|^2) + e_0'Pe_0 over every horizon with "
+        f"mu = {bound.mu:.9g}, z = ({', '.join(parts)}), a = ({at_k}), b = ({next_k}), these about "
+        "their middles, e the errors after a reading is used; what stands in both counts twice"
+    )
 
 
 def _on_rounding(design: GeneralDesign) -> str:

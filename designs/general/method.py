@@ -1,18 +1,21 @@
 """The observer of the general class, as the methods that serve it design it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds
+from obsynth.derive.errors import StructureError
+from obsynth.derive.rigour import TINY
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.core.given import Number, read_gains
+from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.general.claims import claims, covers, guarantee, numbers
 from obsynth.designs.general.fading import fade
+from obsynth.designs.general.frozen import attained_gain
 from obsynth.designs.general.gain import find_gain, refuse_hidden
 from obsynth.designs.general.model import CLASS, GeneralModel, read, read_again, without
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
@@ -25,11 +28,14 @@ from obsynth.designs.general.step import (
     memory_sizes,
     settling,
 )
+from obsynth.designs.general.storage import with_ellipsoid, with_energy
+from obsynth.designs.general.synthesis import Units, solve_ellipsoid, solve_energy, units
 from obsynth.designs.general.system import error_system, extra_inputs
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
 WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 
 
@@ -37,8 +43,11 @@ WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and
 class GeneralUIO(Method):
     """Guaranteed intervals for plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form.
 
-    bounds: what holds the errors
-    weights: of the half widths (states, then faults), 1 / range by default
+    bounds: what holds the errors: peak bounds, an ellipsoid, or an energy gain ("l2"), which holds
+        no set
+    gamma: contraction per step of the ellipsoid, searched where not given
+    weights: of the half widths (states, then faults), 1 / range by default; of their squares for
+        ellipsoids, and of the errors for an energy gain, there of faults alone by default
     """
 
     CLASS = CLASS
@@ -58,8 +67,14 @@ class GeneralUIO(Method):
         shared=("prediction",),
     )
 
-    bounds: Literal["peak"] = "peak"
+    bounds: Literal["peak", "ellipsoid", "l2"] = "peak"
+    gamma: Annotated[float | None, CONTRACTION] = None
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
+
+    def check(self) -> None:
+        """Refuse options that do not fit each other."""
+        if self.bounds != "ellipsoid":
+            refuse_idle(self, f'bounds="{self.bounds}", which has no ellipsoid', "gamma")
 
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""
@@ -72,9 +87,10 @@ class GeneralUIO(Method):
 
     def solve(self, model: GeneralModel) -> GeneralDesign:
         """Find a gain and its bounds."""
-        given = replace(model.design, options=self.options())
-        Z = find_gain(given, self._weights(model))
-        return bound_peak(settle(replace(given, Z=Z)))
+        given, weights = model.design.changed(options=self.options()), self._weights(model)
+        if self.bounds == "peak":
+            return bound_peak(settle(given.changed(Z=find_gain(given, weights))))
+        return self._stored(given, weights, units(given, weights))
 
     def fix(self, model: GeneralModel, gains: Mapping[str, ArrayLike]) -> GeneralDesign:
         """Bound the errors of a given ``L`` of shape (n + n_f, m)."""
@@ -82,14 +98,32 @@ class GeneralUIO(Method):
         L = read_gains(gains, {"L": blank.L0.shape})["L"]
         Z = L.copy()
         Z[:, list(model.extended.picked)] = 0.0
-        design = replace(blank, Z=Z, options=self.options())
+        design = blank.changed(Z=Z, options=self.options())
         if not np.allclose(design.L, L, rtol=1e-9, atol=1e-12 * np.abs(L).max(initial=0.0)):
             raise ObsynthError(
                 f"L does not take {', '.join(model.extended.free)} away: (I - L C) D0 has to be "
                 "zero",
                 option="gains",
             )
-        return bound_peak(settle(design))
+        if self.bounds == "peak":
+            return bound_peak(settle(design))
+        weights = self._weights(model)
+        return self._stored(design, weights, units(design, weights), Z)
+
+    def _stored(
+        self,
+        given: GeneralDesign,
+        weights: FloatArray,
+        measured: Units,
+        Z: FloatArray | None = None,
+    ) -> GeneralDesign:
+        """Find an ellipsoid or an energy gain, for a given Z or with it."""
+        if self.bounds == "ellipsoid":
+            found = solve_ellipsoid(given, weights, measured, self.gamma, Z)
+            return settle(with_ellipsoid(given, found))
+        found = solve_energy(given, weights, measured, Z)
+        chosen = given.changed(Z=found.Z)
+        return settle(with_energy(given, found, weights, attained_gain(chosen, weights)))
 
     def _weights(self, model: GeneralModel) -> FloatArray:
         """Return the weights of states and followed faults."""
@@ -98,7 +132,16 @@ class GeneralUIO(Method):
         box = states.box("x")
         half = 0.5 * np.diff(box, axis=1)[:, 0]
         if self.weights is None:
-            return np.where(np.isfinite(half) & (half > 0.0), 1.0 / half, 1.0)
+            found = np.where(np.isfinite(half) & (half > 0.0), 1.0 / np.maximum(half, TINY), 1.0)
+            if self.bounds == "l2":
+                found[: len(plant.x)] = 0.0
+            if not found.any():
+                raise StructureError(
+                    f"{plant.name} has no fault that the outputs tell from its states, so there is "
+                    "no fault error to bound the energy of",
+                    condition="faults",
+                )
+            return found
         if len(self.weights) != len(names):
             raise ObsynthError(
                 f"weights are {len(self.weights)} numbers; {len(names)} are needed "
@@ -125,4 +168,4 @@ def bound_peak(design: GeneralDesign) -> GeneralDesign:
         )
     b = small_gain_solution(sums.G, sums.n)
     widest = np.diff(Limits.of(design.extended.plant).x, axis=1)[:, 0]
-    return replace(design, bound=PeakBound(b, fade(system, b, widest)))
+    return design.changed(bound=PeakBound(b, fade(system, b, widest)))

@@ -1,7 +1,7 @@
 """From a plant to the numbers of the general class: the extended plant and its Jacobians."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -62,6 +62,7 @@ def read(model: Plant, unfollowed: Sequence[str] = ()) -> GeneralModel:
         bound=PeakBound(np.zeros(2 * N), Fading(nothing, nothing, nothing, 0.0, None)),
         options={},
     )
+    design.__dict__["extended"] = extended
     return GeneralModel(extended, bounds, design)
 
 
@@ -77,4 +78,4 @@ def without(model: GeneralModel, names: Sequence[str]) -> GeneralModel:
 
 def with_gain(design: GeneralDesign, Z: FloatArray) -> GeneralDesign:
     """Return a design with a gain."""
-    return replace(design, Z=Z)
+    return design.changed(Z=Z)

@@ -1,7 +1,7 @@
 """The stored design of the general class: plain data from which step and proofs are made."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -69,6 +69,43 @@ class PeakBound(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class EllipsoidBound(Record):
+    """An invariant ellipsoid ``e_c'P e_c <= 1`` of the errors, see `storage_block`.
+
+    gamma: contraction per sample
+    noise: diagonal of N, of the components of v_k and v_{k+1} in units of their bounds
+    tau: multipliers of the channels, those of F and then those of h
+    inverse_diagonal: upper bounds of ``(P^-1)_ii``
+    """
+
+    KIND = "ellipsoid"
+
+    P: Annotated[FloatArray, "N N"]
+    gamma: float
+    noise: Annotated[FloatArray, "n_both"]
+    tau: Annotated[FloatArray, "n_q"]
+    inverse_diagonal: Annotated[FloatArray, "N"]
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBound(Record):
+    """A gain mu from the energy of v, in units of its bounds, to that of the weighted errors.
+
+    weights: of the errors, C is their diagonal
+    tau: multipliers, as of `EllipsoidBound`
+    attained: the largest gain at a frozen Jacobian that a search found, which no claim proves
+    """
+
+    KIND = "l2"
+
+    P: Annotated[FloatArray, "N N"]
+    mu: float
+    weights: Annotated[FloatArray, "N"]
+    tau: Annotated[FloatArray, "n_q"]
+    attained: float
+
+
+@dataclass(frozen=True, eq=False)
 class Rounding(Record):
     """Bounds of what rounding adds, each (N,): to xq, to xc and to the next prediction."""
 
@@ -99,7 +136,7 @@ class GeneralDesign(Record):
     Z: Annotated[FloatArray, "N m"]
     family: Annotated[AffineFamily, "N+m N+n_v"]
     rounding: Rounding
-    bound: PeakBound
+    bound: PeakBound | EllipsoidBound | EnergyBound
     options: Mapping[str, Any]
 
     def check(self) -> None:
@@ -110,6 +147,12 @@ class GeneralDesign(Record):
                 f"the stored design names faults {list(self.unfollowed)}; the plant has "
                 f"{list(self.plant.names('f'))}"
             )
+
+    def changed(self, **changes: Any) -> "GeneralDesign":
+        """Return a copy with other numbers, the derived plant kept: of the same plant, not read."""
+        found = replace(self, **changes)
+        found.__dict__["extended"] = self.extended
+        return found
 
     @cached_property
     def extended(self) -> Extended:

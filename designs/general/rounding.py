@@ -6,8 +6,6 @@ that an admissible plant shows there. What is left of the unknown inputs by a ro
 rounding of the first stage. All of it is at most `GeneralDesign.rounding`.
 """
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 
@@ -74,7 +72,7 @@ def needed(design: GeneralDesign) -> Rounding:
 def settle(design: GeneralDesign) -> GeneralDesign:
     """Return a design with gains, its allowances those that its step needs."""
     found = needed(design)
-    return replace(design, rounding=Rounding(found.q * ROOM, found.c * ROOM, found.p * ROOM))
+    return design.changed(rounding=Rounding(found.q * ROOM, found.c * ROOM, found.p * ROOM))
 
 
 def prove_rounding(design: GeneralDesign) -> Claim:

@@ -6,13 +6,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive.rigour import add_up
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.signals import LARGEST_SIGNAL
 from obsynth.designs.core.stepping import clip, inside
-from obsynth.designs.general.record import GeneralDesign
+from obsynth.designs.general.lmis import rounding_in
+from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign, PeakBound
+from obsynth.designs.general.system import error_system, magnitude
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
@@ -113,8 +116,15 @@ def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> c
         ca.vertcat(x.lower, _followed(design, f.lower)),
         ca.vertcat(x.upper, _followed(design, f.upper)),
     )
-    apart = ca.fmax(high - prediction, prediction - low)
-    return ca.sparsify(ca.DM(design.bound.fading.start * UP)) @ (apart * UP)
+    apart = ca.fmax(high - prediction, prediction - low) * UP
+    if isinstance(design.bound, PeakBound):
+        return ca.sparsify(ca.DM(design.bound.fading.start * UP)) @ apart
+    M, other, added = start_of_ellipsoid(design)
+    # sqrt V of M e_p, and of what channels, disturbances and rounding add to it
+    rest = ca.DM(other) @ apart + added
+    size = np.abs(design.bound.P)
+    parts = [ca.sqrt(ca.dot(a, ca.DM(W) @ a)) for a, W in ((apart, M), (rest, size))]
+    return (parts[0] + parts[1]) ** 2 * UP
 
 
 def _followed(design: GeneralDesign, f: ca.SX) -> ca.SX:
@@ -124,22 +134,75 @@ def _followed(design: GeneralDesign, f: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """How half widths evolve: ``s+ = decay s``, half widths ``reach s + add``, (N,)."""
+    """How half widths evolve: ``s+ = decay s + offset``, half widths ``reach s + add``, (N,).
+
+    root: of ``reach s`` the square root, for ellipsoids, where s bounds V
+    """
 
     decay: FloatArray
+    offset: FloatArray
     reach: FloatArray
     add: FloatArray
+    root: bool
 
     @classmethod
     def of(cls, design: GeneralDesign) -> "Running":
-        """Read the recursion of a design; underflow is far below what `add` counts twice."""
+        """Read the recursion of a design; underflow is far below what `add` counts twice.
+
+        In the norm of P, rounding is at most rho: V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho +
+        rho^2.
+        """
         bound = design.bound
-        add = bound.b[design.size :] * ROUND_UP
-        return cls(bound.fading.G * UP, bound.fading.reach * UP, add)
+        if isinstance(bound, PeakBound):
+            add = bound.b[design.size :] * ROUND_UP
+            nothing = np.zeros(len(bound.fading.G))
+            return cls(bound.fading.G * UP, nothing, bound.fading.reach * UP, add, root=False)
+        if not isinstance(bound, EllipsoidBound):
+            raise TypeError("an energy gain has no half widths")
+        step, gamma = rounding_in(error_system(design), design.rounding), bound.gamma
+        rho = float(np.sqrt(step @ np.abs(bound.P) @ step)) * UP
+        return cls(
+            decay=np.array([[(1.0 - gamma) * (1.0 + rho) * UP]]),
+            offset=np.array([(gamma * (1.0 + rho) + rho + rho**2) * UP]),
+            reach=bound.inverse_diagonal[:, None] * UP,
+            add=np.zeros(design.size),
+            root=True,
+        )
 
     def half_widths(self, s: FloatArray) -> FloatArray:
         """Return the half widths that belong to a value of s."""
-        return np.asarray(self.reach @ s * ROUND_UP + self.add)
+        inner = self.reach @ s
+        return np.asarray((np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add)
+
+    @property
+    def steady(self) -> FloatArray:
+        """The half widths after long, (N,)."""
+        limit = np.linalg.solve(np.eye(len(self.decay)) - self.decay, self.offset)
+        return self.half_widths(np.asarray(limit, dtype=float))
+
+
+def start_of_ellipsoid(design: GeneralDesign) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``|M'PM|`` and what bounds ``e_c - M e_p`` by ``|e_p|``: (N, N), (N, N), (N,)."""
+    system, N = error_system(design), design.size
+    bound = design.bound
+    if not isinstance(bound, EllipsoidBound):
+        raise TypeError("the design has no ellipsoid")
+    shaped = system.M.T @ bound.P @ system.M
+    h, Z = system.of_h, np.abs(system.Z)
+    # M holds the rest of the outputs that L0 reads alone
+    seen = np.abs(h.columns) @ h.coupling(N) + system.rest[N:, :N]
+    other = Z @ (seen @ magnitude(system.T))
+    radius = system.v_radius
+    through = magnitude(system.through) @ radius
+    drawn = np.abs(h.columns) @ h.sizes(N, radius) + system.rest[N:, N:] @ radius
+    added = magnitude(system.direct) @ radius + Z @ (seen @ through + drawn)
+    rounding = add_up(design.rounding.q, design.rounding.c)
+    kept = np.eye(N) + Z @ (np.abs(system.C0) + seen)
+    return (
+        magnitude(shaped) * UP,
+        other * UP,
+        (added + kept @ rounding) * UP,
+    )
 
 
 def per_signal(design: GeneralDesign, widths: FloatArray) -> FloatArray:
@@ -154,33 +217,42 @@ def per_signal(design: GeneralDesign, widths: FloatArray) -> FloatArray:
 
 def steady(design: GeneralDesign) -> FloatArray:
     """Return the steady half widths of the core, states then faults, (n + n_f,)."""
-    return per_signal(design, Running.of(design).add)
+    return per_signal(design, Running.of(design).steady)
 
 
 def settling(
     design: GeneralDesign, box: FloatArray, calls: int | None = None
-) -> tuple[int, FloatArray]:
+) -> tuple[int, FloatArray] | None:
     """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
 
     They begin from boxes of half widths `box` (n + n_f,), around estimates that are as near as the
-    limits say; with `calls` given, the half widths after so many.
+    limits say; with `calls` given, the half widths after so many. None of an energy gain.
     """
+    if isinstance(design.bound, EnergyBound):
+        return None
     running = Running.of(design)
     n, names = len(design.plant.x), design.plant.names("f")
     pick = [*range(n), *(n + names.index(name) for name in design.extended.followed)]
-    near = running.add * (1.0 + SETTLED)
-    s = np.asarray(design.bound.fading.start @ (2.0 * box[pick] + near)) * (1.0 + 2.0**-40)
+    near = running.steady * (1.0 + SETTLED)
+    half, middle = box[pick], ca.SX(ca.DM(near + box[pick]))
+    ends = np.zeros((n + len(names), 2))
+    ends[pick] = np.column_stack([-half, half])
+    first = start_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), middle)
+    s = np.array(ca.evalf(first)).ravel() * (1.0 + 2.0**-40)
     k = 0
     while k < (MOST_CALLS if calls is None else calls):
         if calls is None and np.all(running.half_widths(s) <= near):
             break
-        s, k = running.decay @ s, k + 1
+        s, k = running.decay @ s + running.offset, k + 1
     return k, per_signal(design, running.half_widths(s) * (1.0 + 2.0**-30))
 
 
 def memory_sizes(design: GeneralDesign) -> dict[str, int]:
     """Return the parts of the memory: the prediction of states and followed faults, and s."""
-    return {"prediction": design.size, "bound": len(design.bound.fading.G)}
+    bound, sizes = design.bound, {"prediction": design.size}
+    if isinstance(bound, EnergyBound):
+        return sizes
+    return {**sizes, "bound": len(bound.fading.G) if isinstance(bound, PeakBound) else 1}
 
 
 def first_memory(design: GeneralDesign, start: Start) -> dict[str, ArrayLike]:
@@ -198,8 +270,8 @@ def build_core(design: GeneralDesign) -> Core:
     """
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
-    running, limits = Running.of(design), Limits.of(plant)
-    reach, decay = (ca.sparsify(ca.DM(part)) for part in (running.reach, running.decay))
+    limits = Limits.of(plant)
+    running = None if isinstance(design.bound, EnergyBound) else Running.of(design)
     names, followed = design.plant.names("f"), design.extended.followed
     own = curved(plant)[:n]
     domain = np.where(own[:, None], design.plant.box("x"), [-np.inf, np.inf])
@@ -213,29 +285,36 @@ def build_core(design: GeneralDesign) -> Core:
         return ca.vertcat(*entries) if entries else ca.SX(0, 1)
 
     def run(seen: Seen) -> Known:
-        prediction, s = seen.memory["prediction"], seen.memory["bound"]
+        prediction = seen.memory["prediction"]
         u = ca.vertcat(seen.u, seen.theta)
         expected = outputs(prediction, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
         y = seen.readings(expected)
         q = first(prediction, u, y)
         c = second(q, u, y)
-        half = (reach @ s) * ROUND_UP + ca.DM(running.add)
-        half = half + ULPS * ca.fabs(c)
-        low, high = c - half, c + half
         sound = ca.logic_and(inside(prediction, prediction, limits.x), inside(q, q, limits.x))
         sound = ca.logic_and(sound, inside(c, c, limits.x))
         sound = ca.logic_and(sound, inside(u, u, limits.u))
+        moved = {"prediction": third(c, u)}
+        if running is None:
+            return Known(c[:n], spread(c, 0.0), None, None, moved, sound=sound)
+        s = seen.memory["bound"]
+        reach, decay = (ca.sparsify(ca.DM(part)) for part in (running.reach, running.decay))
+        inner = reach @ s
+        half = (ca.sqrt(inner) if running.root else inner) * ROUND_UP + ca.DM(running.add)
+        half = half + ULPS * ca.fabs(c)
+        low, high = c - half, c + half
+        moved["bound"] = decay @ s + ca.DM(running.offset) if running.root else decay @ s
         return Known(
             c[:n],
             spread(c, 0.0),
             Ends(low[:n], high[:n]),
             Ends(spread(low, -FAR), spread(high, FAR)) if names else None,
-            {"prediction": third(c, u), "bound": decay @ s},
+            moved,
             sound=sound,
         )
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
-        return {"bound": start_bound(design, x, f, kept["prediction"])}
+        return {} if running is None else {"bound": start_bound(design, x, f, kept["prediction"])}
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         near = x.nearest(kept["prediction"][:n])

@@ -87,7 +87,8 @@ def outputs(observer, memory, given):
 
 def test_the_table_holds_every_method():
     assert {entry.method.CONTRACT.name for entry in METHODS.values()} == set(CONTRACTS)
-    assert [entry.method.CONTRACT.name for entry in METHODS.values()] == list(METHODS)
+    names = [name.partition(".")[0] for name in METHODS]
+    assert [entry.method.CONTRACT.name for entry in METHODS.values()] == names
 
 
 # -- design and refusals -----------------------------------------------------------------------

@@ -1,0 +1,126 @@
+"""One storage function ``V = e_c'P e_c`` for the error system of the general class, stated once.
+
+With ``s = [e_c; v_k; v_{k+1}; q]``, v in units of its bound and q one entry per channel, the next
+errors are linear in s (see `ErrorSystem`),
+
+    e_q+ = E s ,   e_c+ = (E - Z Y) s ,    Y s = C0 e_q+ + V0 v_{k+1} + b' q' ,
+
+and a channel allows ``q_j = delta z_j s`` with ``|delta| <= 1``, z_j a component of e_c or v_k for
+F, of e_q+ or v_{k+1} for h, times the radius. So for any multipliers ``tau_j >= 0``
+
+    V+ <= keep V + v'N v - |C e_c|^2     follows from
+
+    [ keep P (+) N (+) tau - sum_j tau_j z_j'z_j - C'C        *  ]
+    [ P (E - Z Y)                                             P  ]  > 0 ,
+
+at once for all Jacobians: ``tau_j (|z_j s|^2 - q_j^2)`` is not negative where q is what a channel
+allows. With ``keep = 1 - gamma``, C = 0 and a trace of N of at most gamma, V <= 1 is invariant;
+with keep = 1 and ``N = mu^2 I`` the energy of ``C e_c`` is at most mu^2 times that of v. What the
+family varies beside its channels is the radius of the enclosures.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.derive.rigour import Enclosure, add_up, product_up
+from obsynth.designs.general.record import Rounding
+from obsynth.designs.general.system import Channels, ErrorSystem, magnitude
+from obsynth.designs.lmi import he, symmetric_block
+from obsynth.symbolic.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The maps above. Shapes: N errors, n_w entries of v_k and v_{k+1}, n_q channels, K in all.
+
+    E, Y: shapes (N, K), (m, K)
+    z: rows of the channels, (n_q, K)
+    before, after: which components of v stand for v_k and v_{k+1}, n_w in all
+    """
+
+    E: Enclosure
+    Y: Enclosure
+    z: Enclosure
+    before: IntArray
+    after: IntArray
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """N, n_w, n_q."""
+        return self.E.shape[0], len(self.before) + len(self.after), self.z.shape[0]
+
+
+def error_loop(system: ErrorSystem) -> Loop:
+    """Form the maps of an error system; v in units of its bound."""
+    N, radius, rest = system.size, system.v_radius, system.rest
+    h, F = system.of_h, system.of_F
+    A0, W0 = (
+        Enclosure(system.A0, rest[:N, :N]),
+        Enclosure(system.W0, rest[:N, N:]),
+    )
+    C0, V0 = (
+        Enclosure(system.C0, rest[N:, :N]),
+        Enclosure(system.V0, rest[N:, N:]),
+    )
+    moves = np.any((system.W0 != 0.0) | (rest[:N, N:] != 0.0), axis=0)
+    shows = np.any((system.V0 != 0.0) | (rest[N:, N:] != 0.0), axis=0)
+    moves[F.sources[F.sources >= N] - N] = True
+    shows[h.sources[h.sources >= N] - N] = True
+    before, after = (np.flatnonzero(which & (radius > 0.0)) for which in (moves, shows))
+    at = np.cumsum([N, len(before), len(after), len(F.radii), len(h.radii)])
+    eye = np.eye(at[-1])
+    e, first, second, q_F, q_h = (eye[a:b] for a, b in zip([0, *at], at, strict=False))
+    scaled = [np.diag(radius)[:, which] for which in (before, after)]
+    next_p = A0 @ e + W0 @ (scaled[0] @ first) + Enclosure.of(F.columns) @ q_F
+    E = system.T @ next_p - system.through @ (scaled[1] @ second)
+    Y = C0 @ E + V0 @ (scaled[1] @ second) + Enclosure.of(h.columns) @ q_h
+    # z_j: the errors before for F and those of e_q after for h, or a component of v
+    seen = [
+        _rows(F, Enclosure.of(e), scaled[0] @ first),
+        _rows(h, E, scaled[1] @ second),
+    ]
+    z = Enclosure(np.vstack([s.mid for s in seen]), np.vstack([s.rad for s in seen]))
+    return Loop(E, Y, z, before, after)
+
+
+def _rows(channels: Channels, errors: Enclosure, v: FloatArray) -> Enclosure:
+    """Return what drives every channel, times its radius."""
+    drives = Enclosure(np.vstack([errors.mid, v]), np.vstack([errors.rad, np.zeros_like(v)]))
+    picked = Enclosure(drives.mid[channels.sources], drives.rad[channels.sources])
+    return picked * channels.radii[:, None]
+
+
+def closed_rows(loop: Loop, Z: FloatArray) -> Enclosure:
+    """Return ``E - Z Y`` of a gain, (N, K)."""
+    return loop.E - Enclosure.of(Z) @ loop.Y
+
+
+def storage_block(
+    P: Any, X: Any, keep: Any, noise: Any, tau: Any, z: Any, output: Any = None
+) -> Any:
+    """Return the block above, in any arithmetic.
+
+    Shapes: P (N, N), X = P (E - Z Y) (N, K), keep (1, 1), noise (n_w, n_w) and tau (n_q, n_q) or
+    None where there are none, z (n_q, K), output C'C (N, N) or None.
+    """
+    first = P * keep if output is None else P * keep - output
+    parts = [part for part in (first, noise, tau) if part is not None]
+    inner = symmetric_block([[0] * i + [part] for i, part in enumerate(parts)])
+    if tau is not None:
+        seen = z.T @ tau @ z
+        inner = inner - he(seen) * 0.5
+    return symmetric_block([[inner], [X, P]])
+
+
+def rounding_in(system: ErrorSystem, rounding: Rounding) -> FloatArray:
+    """Bound what rounding of the three stages adds to the next e_c, (N,), rounded up."""
+    N, h = system.size, system.of_h
+    # what reaches e_q, which the readings' slopes see as well
+    moved = add_up(product_up(magnitude(system.T), rounding.p), rounding.q)
+    slopes = add_up(
+        np.abs(system.C0), system.rest[N:, :N], product_up(np.abs(h.columns), h.coupling(N))
+    )
+    back = product_up(np.abs(system.Z), product_up(slopes, moved))
+    return add_up(moved, back, rounding.c)

@@ -1,0 +1,190 @@
+"""Ellipsoids and energy gains as they are stored: backed off until they are proved, and proofs."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from obsynth.derive.rigour import Enclosure, prove_positive_definite
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.errors import CertificateError, SolverTrouble
+from obsynth.designs.general.lmis import Loop, closed_rows, error_loop, storage_block
+from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign
+from obsynth.designs.general.synthesis import Found
+from obsynth.designs.general.system import error_system
+from obsynth.designs.lmi import symmetric_block
+from obsynth.symbolic.arrays import FloatArray
+
+RUMP = "floating-point Cholesky after Rump, formation of the block enclosed"
+# What P gives up until rounding and the solver's tolerance have their margin.
+LOSSES = (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+
+
+def with_ellipsoid(design: GeneralDesign, found: Found) -> GeneralDesign:
+    """Attach an ellipsoid to a design with a gain, backed off until it is proved.
+
+    A smaller P asks less of the disturbances' part of the block.
+    """
+    design = design.changed(Z=found.Z)
+    loop = error_loop(error_system(design))
+    for loss in LOSSES:
+        P = found.P * (1.0 - loss)
+        bound = EllipsoidBound(P, found.gamma, found.noise, found.tau * (1.0 - loss), np.ones(0))
+        if invariance(design, bound, loop).holds:
+            bound = replace(bound, inverse_diagonal=inverse_diagonal_bounds(P))
+            return design.changed(bound=bound)
+    raise SolverTrouble(
+        "the ellipsoid that was found is not proved",
+        ['give another gamma=, or bounds="peak"'],
+        gamma=found.gamma,
+    )
+
+
+def with_energy(
+    design: GeneralDesign, found: Found, weights: FloatArray, attained: float
+) -> GeneralDesign:
+    """Attach an energy gain to a design with a gain, raised until it is proved."""
+    design = design.changed(Z=found.Z)
+    loop = error_loop(error_system(design))
+    for loss in LOSSES:
+        bound = EnergyBound(found.P, found.level * (1.0 + loss), weights, found.tau, attained)
+        if dissipation(design, bound, loop).holds:
+            return design.changed(bound=bound)
+    raise SolverTrouble(
+        f"an energy gain of {found.level:.6g} was found, but none up to .1 % above it is proved",
+        ["give other weights="],
+        level=found.level,
+    )
+
+
+def prove_storage(design: GeneralDesign) -> Iterator[Claim]:
+    """Prove every inequality behind the stored ellipsoid or energy gain."""
+    bound = design.bound
+    loop = error_loop(error_system(design))
+    if isinstance(bound, EllipsoidBound):
+        yield _simplex(bound)
+        yield invariance(design, bound, loop)
+        yield _half_widths(bound)
+    elif isinstance(bound, EnergyBound):
+        yield _multipliers(bound)
+        yield dissipation(design, bound, loop)
+
+
+def _tau(loop: Loop, tau: FloatArray) -> Enclosure | None:
+    _, _, n_q = loop.sizes
+    if len(tau) != n_q:
+        raise CertificateError(
+            f"the stored design has {len(tau)} multipliers; the error system has {n_q} channels"
+        )
+    return Enclosure.of(np.diag(tau)) if n_q else None
+
+
+def _one(value: float) -> Enclosure:
+    return Enclosure.of(np.array([[value]]))
+
+
+def _closed(design: GeneralDesign, P: FloatArray, loop: Loop) -> Enclosure:
+    return Enclosure.of(P) @ closed_rows(loop, design.Z)
+
+
+def invariance(design: GeneralDesign, bound: EllipsoidBound, loop: Loop) -> Claim:
+    """Prove that V <= 1 is invariant."""
+    _, n_w, _ = loop.sizes
+    if len(bound.noise) != n_w:
+        raise CertificateError(
+            f"the stored design has {len(bound.noise)} weights; the error system has {n_w} "
+            "disturbances"
+        )
+    block = storage_block(
+        Enclosure.of(bound.P),
+        _closed(design, bound.P, loop),
+        _one(1.0) - _one(bound.gamma),
+        Enclosure.of(np.diag(bound.noise)) if n_w else None,
+        _tau(loop, bound.tau),
+        loop.z,
+    )
+    return _definite(
+        "lmi", "V+ <= (1 - gamma) V + v'N v for every Jacobian of the stored family", block
+    )
+
+
+def dissipation(design: GeneralDesign, bound: EnergyBound, loop: Loop) -> Claim:
+    """Prove the energy gain."""
+    _, n_w, _ = loop.sizes
+    C = Enclosure.of(np.diag(bound.weights))
+    block = storage_block(
+        Enclosure.of(bound.P),
+        _closed(design, bound.P, loop),
+        _one(1.0),
+        Enclosure.of(np.eye(n_w)) * (_one(bound.mu) * bound.mu) if n_w else None,
+        _tau(loop, bound.tau),
+        loop.z,
+        C @ C,
+    )
+    return _definite(
+        "lmi",
+        f"V+ - V + |C e|^2 < mu^2 |v|^2 with mu = {bound.mu:.9g} for every Jacobian of the stored "
+        "family",
+        block,
+    )
+
+
+def _definite(name: str, statement: str, block: Enclosure) -> Claim:
+    result = prove_positive_definite(block)
+    return Claim(name, statement, result.all_proved, float(result.relative.min()), RUMP)
+
+
+def _simplex(bound: EllipsoidBound) -> Claim:
+    room = Fraction(bound.gamma) - sum(map(Fraction, bound.noise.tolist()), Fraction(0))
+    least = min([0.0, *bound.noise.tolist(), *bound.tau.tolist()])
+    return Claim(
+        "weights",
+        "v'N v <= gamma for every admissible v, multipliers are not negative and 0 < gamma < 1",
+        bool(room >= 0 and least >= 0.0 and 0.0 < bound.gamma < 1.0),
+        float(room) if least >= 0.0 else least,
+        "exact sum of the weights over the boxes",
+    )
+
+
+def _multipliers(bound: EnergyBound) -> Claim:
+    least = min([bound.mu, *bound.tau.tolist()])
+    return Claim(
+        "multipliers",
+        "multipliers are not negative and mu > 0",
+        bool(least >= 0.0 and bound.mu > 0.0),
+        float(least),
+        "comparison",
+    )
+
+
+def _corner(P: FloatArray, component: int, upper: float) -> Enclosure:
+    unit = np.zeros((len(P), 1))
+    unit[component] = 1.0
+    block: Enclosure = symmetric_block([[_one(upper)], [Enclosure.of(unit), Enclosure.of(P)]])
+    return block
+
+
+def _half_widths(bound: EllipsoidBound) -> Claim:
+    results = [
+        prove_positive_definite(_corner(bound.P, i, upper))
+        for i, upper in enumerate(bound.inverse_diagonal.tolist())
+    ]
+    return Claim(
+        "half_widths",
+        "(P^-1)_ii stays below the stored value for every component",
+        all(result.all_proved for result in results),
+        min(float(result.relative.min()) for result in results),
+        RUMP,
+    )
+
+
+def inverse_diagonal_bounds(P: FloatArray) -> FloatArray:
+    """Return doubles just above ``(P^-1)_ii`` that are proved, (N,)."""
+    near, values = np.diag(np.linalg.inv(P)), np.empty(len(P))
+    for i in range(len(P)):
+        for slack in 10.0 ** np.arange(-12, -5):
+            values[i] = near[i] * (1.0 + slack)
+            if prove_positive_definite(_corner(P, i, values[i]), sharp=False).all_proved:
+                break
+    return values

@@ -1,0 +1,338 @@
+"""Gains, ellipsoids and energy gains by `storage_block`: solved here, proved in `claims`.
+
+The unknowns are scaled by bounds that some gain already has where there is one: then P is near the
+identity. Scaled by ranges alone, a solver has called values optimal that were a tenth off.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.general.gain import GainSearch, riccati_starts, scaled
+from obsynth.designs.general.lmis import Loop, error_loop, storage_block
+from obsynth.designs.general.peak import spectral_radius
+from obsynth.designs.general.record import GeneralDesign
+from obsynth.designs.general.system import error_system
+from obsynth.designs.lmi import (
+    Affine,
+    Problem,
+    diagonal,
+    full,
+    scalar,
+    solve_with_retries,
+    symmetric,
+    trace,
+)
+from obsynth.designs.lmi.conic import Solution
+from obsynth.symbolic.arrays import FloatArray, IntArray
+
+# Room between the solver's answer and the boundary, relative to blocks scaled to about one.
+MARGIN = 1e-7
+# An answer with such a gap of the objective serves, as a proof follows.
+GAP = 1e-5
+# Of the search for gamma: the first step, and the gain that is worth another solve.
+STEP, WORTH, MOST = 1.8, 2e-3, 9
+LEAST_GAMMA, LARGEST_GAMMA = 1e-5, 0.98
+# What keeps rounded weights inside the simplex.
+BELOW_ONE = 1.0 - 2.0**-44
+# Of P against the units, for energy gains: several infima are reached as P grows without bound.
+CAPS = (1e5, 1e4, 1e3)
+LEAST_LEVEL = 1e-24
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Numbers that a solver found, in the units of the plant.
+
+    Z (N, m), P (N, N), gamma; noise (n_w,) and tau (n_q,): diagonals; level: mu
+    """
+
+    Z: FloatArray
+    P: FloatArray
+    gamma: float
+    noise: FloatArray
+    tau: FloatArray
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """A start, and what the unknowns are measured in: errors x (N,), readings y (m,).
+
+    bounded: whether a small-gain matrix below one was found, so that a design exists
+    """
+
+    Z: FloatArray
+    x: FloatArray
+    y: FloatArray
+    bounded: bool
+
+
+def units(design: GeneralDesign, weights: FloatArray) -> Units:
+    """Take the peak bounds of the best Riccati gain as units, or the ranges."""
+    data, m = scaled(design), design.L0.shape[1]
+    share = weights * data.x
+    share = share / share.sum() if share.sum() > 0 else np.full(len(share), 1.0 / len(share))
+    search, best = GainSearch(data, share), None
+    for Z in riccati_starts(data):
+        value = search.value(Z)
+        key = (value.mean, value.rho, value.radius)
+        if best is None or key < best[0]:
+            best = key, value, Z
+    y = np.ones(m)
+    y[data.free] = data.y
+    if best is None:
+        return Units(np.zeros((len(data.x), m)), data.x, y, bounded=False)
+    _, value, Z = best
+    bounded = bool(np.isfinite(value.b).all())
+    size = np.maximum(value.b[len(data.x) :], 1e-5) if bounded else np.ones(len(data.x))
+    return Units(data.deployed(Z, m), size * data.x, y, bounded)
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """The maps of a loop in units, as doubles; see `Loop`. free: columns of Z."""
+
+    loop: Loop
+    E: FloatArray
+    Y: FloatArray
+    z: FloatArray
+    q: FloatArray
+    units: Units
+    free: IntArray
+
+
+def state(design: GeneralDesign, measured: Units) -> Stated:
+    """Put the loop of a design in units."""
+    system = error_system(design)
+    loop = error_loop(system)
+    _, n_w, _ = loop.sizes
+    sources = np.concatenate([system.of_F.sources, system.of_h.sources])
+    radii = np.concatenate([system.of_F.radii, system.of_h.radii])
+    q = radii * np.concatenate([measured.x, system.v_radius])[sources]
+    columns = np.concatenate([measured.x, np.ones(n_w), q])
+    free = np.array([i for i in range(len(measured.y)) if i not in design.extended.picked], int)
+    return Stated(
+        loop,
+        loop.E.mid * columns / measured.x[:, None],
+        loop.Y.mid * columns / measured.y[:, None],
+        loop.z.mid * columns / q[:, None],
+        q,
+        measured,
+        free,
+    )
+
+
+def ellipsoid_problem(
+    stated: Stated, gamma: float, weights: FloatArray, gain: FloatArray | None = None
+) -> Problem:
+    """State the LMI for the smallest sum of the weighted squares of half widths at a gamma."""
+    _, n_w, n_q = stated.loop.sizes
+    problem = Problem(f"bounded-error design of the general class at gamma = {gamma:.6g}")
+    P, X = _unknowns(stated, gain)
+    noise = diagonal("noise", n_w) if n_w else None
+    tau = diagonal("tau", n_q) if n_q else None
+    if noise is not None:
+        problem.add("noise.sum", trace(noise) <= gamma)
+    block = storage_block(P, X, 1.0 - gamma, noise, tau, stated.z)
+    problem.add_lmi("invariance", block, ">>", margin=MARGIN)
+    cost = weights * stated.units.x
+    cost = cost / cost.max()
+    problem.minimise_trace_inverse(P, np.diag(cost)[:, cost > 0.0])
+    return problem
+
+
+def energy_problem(
+    stated: Stated, weights: FloatArray, cap: float, gain: FloatArray | None = None
+) -> Problem:
+    """State the LMI for the least energy gain to the weighted errors; mu2 in their units."""
+    _, n_w, n_q = stated.loop.sizes
+    problem = Problem("energy gain of the general class")
+    P, X = _unknowns(stated, gain)
+    mu2 = scalar("mu2")
+    noise = mu2 * np.eye(n_w) if n_w else None
+    tau = diagonal("tau", n_q) if n_q else None
+    cost = weights * stated.units.x
+    output = np.diag((cost / cost.max()) ** 2)
+    block = storage_block(P, X, 1.0, noise, tau, stated.z, output)
+    problem.add_lmi("dissipation", block, ">>", margin=1e-2 / cap)
+    problem.add("size", P << cap * np.eye(P.shape[0]))
+    problem.add("level", mu2 >= 0.0)
+    problem.minimise(mu2)
+    return problem
+
+
+def _unknowns(stated: Stated, gain: FloatArray | None) -> tuple[Affine, Affine]:
+    """Return P and P (E - Z Y), with the gain free or given."""
+    N, x = len(stated.E), stated.units.x
+    P = symmetric("P", N)
+    if gain is None and not len(stated.free):
+        gain = np.zeros((N, len(stated.units.y)))
+    if gain is None:
+        return P, P @ stated.E - full("H", N, len(stated.free)) @ stated.Y[stated.free]
+    Z = gain * stated.units.y / x[:, None]
+    return P, P @ (stated.E - Z @ stated.Y)
+
+
+def recovered(
+    stated: Stated, solution: Solution, gamma: float, level: float, gain: FloatArray | None
+) -> Found:
+    """Return a solution in the units of the plant."""
+    x, y = stated.units.x, stated.units.y
+    N, n_w, n_q = stated.loop.sizes
+    Z = gain
+    if Z is None:
+        Z = np.zeros((N, len(y)))
+    if gain is None and len(stated.free):
+        Z[:, stated.free] = np.linalg.solve(solution["P"], solution["H"])
+        Z = Z * x[:, None] / y
+    P = solution["P"] / np.outer(x, x)
+    noise = np.diag(solution["noise"]) if n_w and "noise" in solution.values else np.zeros(n_w)
+    noise = np.maximum(noise, 0.0)
+    noise = noise * min(1.0, gamma * BELOW_ONE / max(float(noise.sum()), 1e-300))
+    tau = np.diag(solution["tau"]) if n_q else np.zeros(0)
+    return Found(
+        Z,
+        0.5 * (P + P.T),
+        gamma,
+        noise,
+        np.maximum(tau, 0.0) / stated.q**2,
+        level,
+    )
+
+
+def solve_ellipsoid(
+    design: GeneralDesign,
+    weights: FloatArray,
+    measured: Units,
+    gamma: float | None = None,
+    gain: FloatArray | None = None,
+) -> Found:
+    """Find an ellipsoid; over gamma, where not given, that of the least sum of weighted widths."""
+    stated = state(design, measured)
+    refusals: list[Exception] = []
+
+    def solve(gamma: float) -> tuple[float, Found] | None:
+        problem = ellipsoid_problem(stated, gamma, weights, gain)
+        try:
+            solution = solve_with_retries(problem, (), lambda s: 0.0 <= s.gap < GAP)
+            found = recovered(stated, solution, gamma, 0.0, gain)
+            size = weights @ np.sqrt(np.diag(np.linalg.inv(found.P)))
+        except (InfeasibleDesign, SolverTrouble, np.linalg.LinAlgError) as refusal:
+            refusals.append(refusal)
+            return None
+        return (float(size), found) if size > 0.0 else None
+
+    if gamma is not None:
+        one = solve(gamma)
+        best = None if one is None else one[1]
+    else:
+        best = search_gamma(solve, guess_gamma(stated, weights))
+    if best is None:
+        raise _no_ellipsoid(measured, gamma, refusals)
+    return best
+
+
+def _no_ellipsoid(
+    measured: Units, gamma: float | None, refusals: list[Exception]
+) -> InfeasibleDesign | SolverTrouble:
+    """Refuse: infeasible only what exact arithmetic showed at the smallest gamma that was tried."""
+    last = refusals[-1] if refusals else None
+    where = "" if gamma is None else f" at gamma = {gamma:.6g}"
+    details = [] if last is None else [str(last).splitlines()[0]]
+    if isinstance(last, InfeasibleDesign) and (gamma is not None or not measured.bounded):
+        return InfeasibleDesign(
+            f"no gain makes the error contract{where} with one P and one multiplier per column",
+            [
+                *details,
+                "bounds of disturbances do not enter this: they only scale P; narrow the ranges of "
+                "the states"
+                + ("" if gamma is None else ", or leave gamma= out, which searches a smaller one"),
+            ],
+            gamma=gamma,
+        )
+    mend = 'bounds="peak" has a design for this plant' if measured.bounded else "give gamma="
+    return SolverTrouble(f"no ellipsoid was found{where}", [*details, mend], gamma=gamma)
+
+
+def guess_gamma(stated: Stated, weights: FloatArray) -> float:
+    """Return the gamma that would be best for the start, its channels taken for disturbances."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    N, units = len(stated.E), stated.units
+    closed = stated.E - (units.Z * units.y / units.x[:, None]) @ stated.Y
+    A, B = closed[:, :N], closed[:, N:]
+    top = 1.0 - spectral_radius(A) ** 2
+    if not top > LEAST_GAMMA:
+        return 10.0 * LEAST_GAMMA
+    W, sizes = np.diag((weights * units.x) ** 2), []
+    # what the search for the other gain wins in decay
+    grid = np.geomspace(max(1e-3 * top, LEAST_GAMMA), 0.97 * top, 24)
+    for gamma in grid:
+        S = solve_discrete_lyapunov((A / np.sqrt(1.0 - gamma)).T, W)
+        shares = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", B, S, B), 0.0))
+        sizes.append(float(shares.sum() / np.sqrt(gamma)))
+    return float(np.clip(grid[int(np.argmin(sizes))], 10.0 * LEAST_GAMMA, LARGEST_GAMMA))
+
+
+def search_gamma(
+    solve: Callable[[float], tuple[float, Found] | None], start: float
+) -> Found | None:
+    """Walk from a guess to the smallest size, and once to where a parabola has its minimum."""
+    tried: dict[int, tuple[float, Found] | None] = {}
+
+    def at(step: int) -> float:
+        if step not in tried:
+            gamma = start * STEP**step
+            fits = LEAST_GAMMA <= gamma <= LARGEST_GAMMA
+            tried[step] = solve(gamma) if fits and len(tried) < MOST else None
+        found = tried[step]
+        return np.inf if found is None else found[0]
+
+    place = 0
+    while at(place) == np.inf and start * STEP ** (place - 3) >= LEAST_GAMMA and len(tried) < MOST:
+        place -= 3
+    if at(place) == np.inf:
+        return None
+    way = 1 if at(place + 1) < at(place) else -1
+    while at(place + way) < at(place) * (1.0 - WORTH):
+        place += way
+    low, middle, high = (np.log(at(place + k)) for k in (-1, 0, 1))
+    best = min((pair for pair in tried.values() if pair is not None), key=lambda pair: pair[0])
+    if np.isfinite([low, high]).all() and low + high - 2.0 * middle > 0.0:
+        shift = 0.5 * (low - high) / (low + high - 2.0 * middle)
+        won = 0.5 * (low + high - 2.0 * middle) * shift**2
+        last = solve(start * STEP ** (place + shift)) if won > WORTH else None
+        if last is not None and last[0] < best[0]:
+            best = last
+    return best[1]
+
+
+def solve_energy(
+    design: GeneralDesign,
+    weights: FloatArray,
+    measured: Units,
+    gain: FloatArray | None = None,
+) -> Found:
+    """Find the least energy gain to the weighted errors."""
+    stated = state(design, measured)
+    unit = float((weights * measured.x).max())
+    last: Exception | None = None
+    for cap in CAPS:
+        try:
+            solution = solve_with_retries(
+                energy_problem(stated, weights, cap, gain), (), lambda s: 0.0 <= s.gap < GAP
+            )
+        except (InfeasibleDesign, SolverTrouble) as refusal:
+            last = refusal
+            continue
+        found = recovered(stated, solution, 0.0, 0.0, gain)
+        level = unit * np.sqrt(max(solution.number("mu2"), LEAST_LEVEL))
+        return Found(found.Z, found.P * unit**2, 0.0, found.noise, found.tau * unit**2, level)
+    text = "no energy gain was found"
+    details = [] if last is None else [str(last).splitlines()[0]]
+    if isinstance(last, InfeasibleDesign) and not measured.bounded:
+        raise InfeasibleDesign(text, details)
+    raise SolverTrouble(text, [*details, "give other weights=, or narrow the ranges"])
