@@ -11,6 +11,7 @@ proved by `prove_peak`.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ ERRORS = (0.02, 0.2)
 # Evaluations of a search, and numbers that all of them together may handle.
 MOST_EVALUATIONS, WORK = 1500, 6e10
 SMALL = 1e-12
+MOST_DENSE = 400
 # Relative gain of a search that is worth another one.
 WORTH = 5e-4
 # Searches: from which start (-1 for the best so far), in which units of small entries of a gain
@@ -231,12 +233,18 @@ class GainSearch:
                     evaluate,
                     point.ravel() / unit,
                     jac=True,
-                    method="BFGS",
-                    options={"maxiter": steps, "gtol": 1e-10},
+                    **_options(point.size, steps),
                 )
         except StopIteration:
             pass
         return best[0][1].reshape(point.shape)
+
+
+def _options(size: int, steps: int) -> dict[str, Any]:
+    """Return the method of descent: with many gains one that keeps no matrix of their number."""
+    if size <= MOST_DENSE:
+        return {"method": "BFGS", "options": {"maxiter": steps, "gtol": 1e-10}}
+    return {"method": "L-BFGS-B", "options": {"maxiter": steps, "maxcor": 30, "ftol": 1e-9}}
 
 
 def _units(point: FloatArray, share: float) -> FloatArray:
@@ -384,22 +392,22 @@ def _strongest(data: Scaled, design: GeneralDesign) -> list[str]:
 
 
 def refuse_hidden(design: GeneralDesign) -> list[str]:
-    """Return the followed faults of modes that no output sees; refuse those of states alone."""
+    """Return a followed fault of a mode that no output sees, if any; refuse modes of states alone.
+
+    Of several faults that are told from each other by nothing, the one with the smallest range.
+    """
     data, plant = scaled(design), design.extended.plant
-    names = plant.names("x")
-    hidden = hidden_modes(data)
-    n = len(design.plant.x)
-    lost: list[str] = []
-    for value, vector in hidden:
+    names, n = plant.names("x"), len(design.plant.x)
+    for value, vector in hidden_modes(data):
         moved = [i for i in np.argsort(-vector) if vector[i] > 1e-6 * vector.max()]
-        faults = [names[i] for i in moved if i >= n]
-        if not faults:
-            raise StructureError(
-                f"a mode {abs(value):.6g} of {', '.join(names[i] for i in moved)} does not decay "
-                f"and no output shows it ({', '.join(design.plant.output_names)}); measure one of "
-                "them",
-                symbols=tuple(names[i] for i in moved),
-                condition="detectability",
-            )
-        lost.append(faults[0])
-    return lost
+        faults = [int(i) for i in moved if i >= n]
+        if faults:
+            return [names[min(faults, key=lambda i: float(data.x[i]))]]
+        raise StructureError(
+            f"a mode {abs(value):.6g} of {', '.join(names[i] for i in moved)} does not decay "
+            f"and no output shows it ({', '.join(design.plant.output_names)}); measure one of "
+            "them",
+            symbols=tuple(names[i] for i in moved),
+            condition="detectability",
+        )
+    return []

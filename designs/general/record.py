@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,6 +13,12 @@ from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
+
+
+@lru_cache(maxsize=16)
+def _extended(plant: Plant, unfollowed: tuple[str, ...]) -> Extended:
+    """Return the extended plant, one for all designs of a plant."""
+    return extend(plant, unfollowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +163,7 @@ class GeneralDesign(Record):
     @cached_property
     def extended(self) -> Extended:
         """The plant with its faults as states, derived from the stored equations."""
-        return extend(self.plant, self.unfollowed)
+        return _extended(self.plant, self.unfollowed)
 
     @property
     def size(self) -> int:

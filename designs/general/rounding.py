@@ -42,8 +42,8 @@ def _over(
     plant = design.extended.plant
     bends = np.flatnonzero(curved(plant))
     x_lo, x_hi = _ends(boxes["x"])
-    if bends.size:
-        pieces = max(1, min(16, int(CELLS ** (1.0 / len(bends)))))
+    pieces = min(16, int(CELLS ** (1.0 / max(len(bends), 1))))
+    if bends.size and pieces > 1:
         lo, hi = cut_box(boxes["x"][bends], pieces)
         x_lo, x_hi = (np.repeat(end, lo.shape[1], axis=1) for end in (x_lo, x_hi))
         x_lo[bends], x_hi[bends] = lo, hi
