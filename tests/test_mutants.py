@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOOL = ROOT / "tools" / "mutants.py"
 sys.path.insert(0, str(TOOL.parent))
 
+from mutants import Job  # noqa: E402
 from mutation import changes, pick  # noqa: E402
 
 LISTS = {
@@ -56,6 +57,37 @@ def test_every_change_is_one_expression_of_a_function_that_is_not_left_aside():
         "comparison",
         "swap",
     }
+
+
+CODE = """
+def step(X, other, near, y):
+    inner = ca.logic_and(near, ca.logic_not(y > 0.5))
+    return X.where(inner, other), ca.if_else(near, y, ULPS * X.lower.numel())
+"""
+
+
+def test_choices_in_code_are_made_too():
+    """Flags stay flags, and how many ends there are is the same for both."""
+    chosen, negated = "ca.if_else(near, y, ULPS * X.lower.numel())", "ca.logic_not(y > 0.5)"
+    assert made(CODE) == {
+        ("choice", "X.where(inner, other)", "(X)"),
+        ("choice", "X.where(inner, other)", "(other)"),
+        ("choice", chosen, "(y)"),
+        ("choice", chosen, "(ULPS * X.lower.numel())"),
+        ("condition", f"ca.logic_and(near, {negated})", "(near)"),
+        ("condition", f"ca.logic_and(near, {negated})", f"({negated})"),
+        ("condition", negated, "(y > 0.5)"),
+        ("comparison", "y > 0.5", "((y) <= (0.5))"),
+        ("rounding", "ULPS", "(0.0 * ULPS)"),
+    }
+
+
+def test_a_mutant_is_known_again_in_what_a_run_printed():
+    """Wherever it stands by then."""
+    job = Job(("tests",), "derive/a.py", where="7 bound", says="[sign] -x -> (x)   in: return -x")
+    assert job.told_in(f"2.0 s  SURVIVES derive/a.py:9 bound {job.says}")
+    assert not job.told_in(f"2.0 s  SURVIVES designs/derive/a.py:7 bound {job.says}")
+    assert not job.told_in(f"2.0 s  SURVIVES derive/a.py:7 bound {job.says} + y")
 
 
 def test_a_change_leaves_the_rest_as_it_is():

@@ -210,7 +210,10 @@ class _Finder(ast.NodeVisitor):
             self.add(
                 "comparison", node, f"(({sides[0]}) {_NEGATED[type(node.ops[0])]} ({sides[1]}))"
             )
-        self.generic_visit(node)
+        for part in (node.left, *node.comparators):
+            # flags are told apart by anything between 0 and 1
+            if not (isinstance(part, ast.Constant) and part.value == 0.5):
+                self.visit(part)
 
     def visit_Call(self, node: ast.Call) -> None:
         name = _name(node.func)

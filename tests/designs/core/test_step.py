@@ -52,10 +52,13 @@ def counting(f=None, x=None, mean=False, bridges=False, **told):
 class Calls:
     """A step over a core, called with numbers; `count` is of the older copy."""
 
-    def __init__(self, core, plant=None, delay=0, cuts=None, horizon=HORIZON):
+    def __init__(
+        self, core, plant=None, delay=0, cuts=None, horizon=HORIZON, shared=(), precision="double"
+    ):
         self.plant = tank() if plant is None else plant
         watch = Watch.of({"horizon": horizon, "recovery": 2, "cuts": cuts})
-        self.guard = Guard(self.plant, {"count": 1}, watch, delay, 1.0)
+        sizes = {"count": 1, **dict.fromkeys(shared, 1)}
+        self.guard = Guard(self.plant, sizes, watch, delay, 1.0, precision, shared)
         self.step = Step(self.guard, core).build()
         self.layout = self.guard.layout()
         parts = self.guard.first({"count": [0.0]}, self.plant.box("x"), self.plant.box("f"))
@@ -73,6 +76,19 @@ class Calls:
         self.x = [told["x_lower"][0], told["x_upper"][0]]
         self.xhat, self.fhat = told["xhat"][0], told["fhat"][0]
         return self
+
+
+def estimating():
+    """A core that also keeps an estimate, placed in the middle of a box."""
+
+    def run(seen):
+        moved = {"count": seen.memory["count"] + 1.0, "z": seen.memory["z"]}
+        return Known(seen.memory["z"], ca.SX(0.0), None, None, moved)
+
+    def begin(x, f, kept):
+        return {"count": kept["z"]}
+
+    return Core(run, begin, place=lambda x, f, kept: {"z": x.middle})
 
 
 def counts(calls, given):
@@ -121,6 +137,18 @@ def test_copies_take_turns():
     old = [*range(1, 2 * N), *[N + k % N for k in range(2 * N + 1)]]
     assert [c for c, _ in found] == old
     assert [y for _, y in found][N:] == [1 + k % N for k in range(3 * N)]
+
+
+def test_an_estimate_is_placed_where_both_copies_begin():
+    """And each is begun around it. Mutants: never placed; placed where one copy begins."""
+    calls = Calls(estimating(), shared=("z",), cuts=["ranges", "strips"])
+    calls(1.0)
+    assert (calls.xhat, calls.count) == pytest.approx((1.0, 2.0))
+    told = [(calls(0.5).xhat, calls.young) for _ in range(HORIZON)]
+    assert [xhat for xhat, _ in told] == pytest.approx([1.0] * HORIZON)
+    assert told[-1][1] == pytest.approx(2.0), "begun around the estimate"
+    calls(99.0)
+    assert calls(-0.5).xhat == pytest.approx(-0.5)
 
 
 def test_an_unsound_memory_and_an_endless_set_begin_anew():
@@ -202,6 +230,24 @@ def test_words_of_a_core_reach_the_status():
     calls = Calls(core, horizon=400)
     assert [calls().status for _ in range(3)] == [0, 4, 4 + 16]
     assert calls(99.0).status & 4 == 0
+
+
+def test_declared_ranges_are_numbers_of_the_precision_outside_of_what_is_declared():
+    """Mutant: ends that single precision rounds inwards."""
+    plant = ob.Plant("tenths")
+    (a,) = plant.states("a", range=(-0.7, 0.1))
+    (u,) = plant.inputs("u", range=(-1, 1))
+    (f,) = plant.process_faults("f", range=(-0.1, 0.7), rate=0.1)
+    (v,) = plant.disturbances("v", bound=0.1)
+    plant.dynamics([sp.sin(a) / 2 + f / 2 + u / 8], Ts=1)
+    plant.outputs([a + v])
+    calls = Calls(counting(), plant, precision="single")
+    calls()
+    assert calls(99.0).status & 8
+    for ends, (low, high) in ((calls.x, (-0.7, 0.1)), (calls.f, (-0.1, 0.7))):
+        assert ends == np.array(ends).astype(np.float32).astype(float).tolist()
+        assert ends[0] < low and ends[1] > high
+        assert ends == pytest.approx([low, high], rel=1e-6)
 
 
 def test_recovering_lasts_as_many_calls_as_is_said():
