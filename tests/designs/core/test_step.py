@@ -1,5 +1,7 @@
 """What a step makes of a core: when it begins anew, which of its sets count, what is told of it."""
 
+from fractions import Fraction
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from obsynth.designs.core.core import Core, Known
 from obsynth.designs.core.guard import YOUNG, Guard, Watch
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.step import Step
-from obsynth.designs.core.stepping import fill
+from obsynth.designs.core.stepping import all_finite, clip, extended, fill, largest_level
 
 HORIZON = 6
 OUTPUTS = ("memory", "xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper", "status")
@@ -151,6 +153,29 @@ def test_an_estimate_is_placed_where_both_copies_begin():
     assert calls(-0.5).xhat == pytest.approx(-0.5)
 
 
+def test_where_both_begin_the_older_sets_place_the_estimate():
+    """They know more. An input above a half is what ends both copies. Mutant: the younger's."""
+    plant = ob.Plant("hidden")
+    a, b = plant.states("a b", range=[(-4, 4), (-9, 9)])
+    (u,) = plant.inputs("u", range=(-1, 1))
+    (v,) = plant.disturbances("v", bound=0.1)
+    plant.dynamics([sp.sin(a) / 2 + a * b / 10**6 + u**2 / 10**6, b - b**3 / 10**6], Ts=1)
+    plant.outputs([a + v])
+
+    def run(seen):
+        return Known(seen.memory["z"], ca.SX(0, 1), None, None, seen.memory, seen.u[0] < 0.5)
+
+    core = Core(run, lambda x, f, kept: {}, place=lambda x, f, kept: {"z": x.middle})
+    watch = Watch.of({"horizon": HORIZON, "recovery": 2, "cuts": None})
+    guard = Guard(plant, {"z": 2}, watch, 0, 1.0, shared=("z",))
+    step, first = Step(guard, core).build(), np.array([[-0.1, 0.1], [1.9, 2.1]])
+    memory, told = fill(guard.layout(), guard.first({"z": [0, 0]}, first, np.zeros((0, 2)))), None
+    for k in range(HORIZON + 4):
+        told = step(memory, float(k == HORIZON + 2), 0.0)
+        memory = told[0]
+    assert float(told[1][1]) == pytest.approx(2.0, abs=1e-3)
+
+
 def test_an_unsound_memory_and_an_endless_set_begin_anew():
     """Mutants: soundness not asked; the width not looked at."""
     unsound = Calls(counting(sound=lambda count, _: count < 2.5), horizon=400)
@@ -267,3 +292,61 @@ def test_scheduling_outside_of_its_range_or_missing():
         calls([np.nan, np.nan], 1.0, theta)
         assert calls.status == 32 + status
         assert calls.memory[before].tolist() == [1.0, used]
+
+
+# -- parts -------------------------------------------------------------------------------------
+
+
+def test_a_right_hand_side_moves_both_copies_and_nothing_of_the_guard():
+    """And nothing at all before the start. Mutants: a copy that stands still, or everything."""
+    own = ca.SX.sym("m", 3)
+    ode = ca.Function(
+        "ode", [own, ca.SX.sym("u", 1)], [ca.vertcat(2, 3, 5) * own], ["memory", "u"], ["d"]
+    )
+    sizes = {"p": 2, "q": 1}
+    parts = {"p": 2, "q": 1, "p_2": 2, "begin": 1, "age": 1, "initialised": 1}
+    ends = np.cumsum([0, *parts.values()]).tolist()
+    layout = {name: slice(a, b) for name, a, b in zip(parts, ends, ends[1:], strict=False)}
+    whole = extended(ode, sizes, layout, "_2")
+    moved = np.array(whole([1, 10, 100, 7, 8, 9, 9, 1], 0)).ravel().tolist()
+    assert moved == [2, 30, 500, 2, 30, 0, 0, 0]
+    assert not np.array(whole([1, 10, 100, 7, 8, 9, 9, 0], 0)).any()
+
+
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+def test_one_entry_that_is_no_number_is_seen_wherever_it_stands(place, bad):
+    v = ca.SX.sym("v", 3)
+    function, given = ca.Function("f", [v], [all_finite(v)]), [1.0, -2.0, 1e80]
+    assert float(function(given)) == 1.0
+    given[place] = bad
+    assert float(function(given)) == 0.0
+
+
+def test_the_nearest_point_of_a_box_with_ends_that_do_not_bind():
+    v = ca.SX.sym("v", 4)
+    box = np.array([[-1.0, 2.0], [-np.inf, 2.0], [-1.0, np.inf], [-np.inf, np.inf]])
+    function = ca.Function("f", [v], [clip(v, box)])
+    assert np.array(function([5.0] * 4)).ravel().tolist() == [2.0, 2.0, 5.0, 5.0]
+    assert np.array(function([-5.0] * 4)).ravel().tolist() == [-1.0, -5.0, -1.0, -5.0]
+    assert np.array(function([0.5] * 4)).ravel().tolist() == [0.5] * 4
+
+
+@pytest.mark.parametrize("size", [3, 14, 15, 20])
+def test_the_largest_level_is_not_below_that_of_any_point(size):
+    """Against rationals, at corners or by the sum of sizes. Mutant: its rounding subtracted."""
+    rng = np.random.default_rng(size)
+    root = rng.uniform(0.1, 1.0, (size, size))
+    P, low, high = root @ root.T, -rng.uniform(0.1, 1.0, size), rng.uniform(0.1, 1.0, size)
+    found = Fraction(largest_level(P, low, high))
+    reach = [max(Fraction(b), -Fraction(a)) for a, b in zip(low, high, strict=True)]
+    sums = [sum(Fraction(P[i, j]) * reach[j] for j in range(size)) for i in range(size)]
+    most = sum(r * s for r, s in zip(reach, sums, strict=True))
+    # all entries are positive: the level is that of the upper corner, or of the lower one
+    corners = [[Fraction(v) for v in end] for end in (low, high)]
+    levels = [
+        sum(c[i] * Fraction(P[i, j]) * c[j] for i in range(size) for j in range(size))
+        for c in corners
+    ]
+    assert max(levels) <= found <= most * (1 + Fraction(1, 2**39))
+    assert size <= 14 or found >= most
