@@ -135,8 +135,10 @@ def settling(
     """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
 
     They begin from boxes of half widths `box`, around estimates that are as near as the limits say;
-    with `calls` given, the half widths after so many.
+    with `calls` given, the half widths after so many; infinite where a box has no bound.
     """
+    if not np.isfinite(box).all():
+        return 0, np.full(box.shape, np.inf)
     bound, n = running_bound(design), len(design.A)
     steady = bound.steady
     near = steady * (1.0 + SETTLED)
@@ -147,7 +149,7 @@ def settling(
     first = first_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), kept)
     s = np.array(ca.evalf(first)).ravel()
     k = 0
-    while k < (MOST_CALLS if calls is None else calls):
+    while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
         if calls is None and np.all(bound.half_widths(s) <= near):
             break
         s, k = bound.decay @ s + bound.offset, k + 1

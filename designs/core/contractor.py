@@ -35,8 +35,7 @@ Cut = Literal["ranges", "strips", "image", "inversion", "rates"]
 CUTS: tuple[Cut, ...] = get_args(Cut)
 """Parts of the contractor, for an option that names those that are used."""
 
-_SWEEPS = 2
-_PASSES = 200
+SWEEPS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +113,7 @@ class Contractor:
             return X
         low, high = ca.SX(X.lower), ca.SX(X.upper)
         several = any(s is not None and np.count_nonzero(s.row) > 1 for s in self.strips)
-        for _ in range(_SWEEPS if several else 1):
+        for _ in range(SWEEPS if several else 1):
             for i, strip in enumerate(self.strips):
                 if strip is None:
                     continue
@@ -182,64 +181,6 @@ class Contractor:
                 low[j] = self.rounding.down(low[j] - rate)
                 high[j] = self.rounding.up(high[j] + rate)
         return Ends(low, high)
-
-    def half_widths(self, core: FloatArray, delay: int) -> FloatArray:
-        """Return half widths of the cut sets, states then faults, from those of the core.
-
-        In the steady state of the core, with all readings. Every pass holds for what the passes
-        before gave: strips, the image ``sum_j max|J_ij| h_j``, the inversion and the rates.
-        """
-        n, slopes = len(self.plant.x), np.abs(self.equations.slopes).max(axis=2)
-        up = 1.0 + 2.0**-30
-        fixed = 0.5 * np.diff(self.equations.box[n + len(self.plant.f) :], axis=1)[:, 0]
-        f_half = 0.5 * np.diff(self.plant.box("f").reshape(-1, 2), axis=1)[:, 0]
-        x_half = 0.5 * np.diff(self.domain, axis=1)[:, 0]
-        if "ranges" not in self.cuts:
-            x_half, f_half = np.full(n, np.inf), np.full(f_half.size, np.inf)
-        x = np.minimum(core[:n], x_half)
-        # late: of the fault one call before, now: of the fault at this one
-        late, now = f_half.copy(), f_half.copy()
-        (late if delay else now)[:] = np.minimum(f_half, core[n:])
-        for _ in range(_PASSES):
-            was = np.concatenate([x, late, now])
-            for strip in filter(None, self.strips if "strips" in self.cuts else ()):
-                for j in np.flatnonzero(strip.row).tolist():
-                    others = np.abs(np.delete(strip.row, j)) @ _finite(
-                        np.delete(x, j), strip.row, j
-                    )
-                    told = 0.5 * (strip.high - strip.low) + others
-                    x[j] = min(x[j], told / abs(strip.row[j]) * up)
-            late = np.minimum(late, now)
-            for i in np.flatnonzero(self.equations.usable).tolist():
-                halves = np.concatenate([x, late, fixed])
-                size = slopes[i]
-                for j, row in self.equations.invertible if "inversion" in self.cuts else ():
-                    low, high = self.equations.slopes[i, n + j].tolist()
-                    if row == i and high - low <= 1e-9 * abs(high):
-                        rest = np.where(np.arange(size.size) == n + j, 0.0, size)
-                        told = (x[i] + _times(rest, halves)) / min(abs(low), abs(high))
-                        late[j] = min(late[j], told * up)
-                if "image" in self.cuts:
-                    x[i] = min(x[i], _times(size, np.concatenate([x, late, fixed])) * up)
-            if "rates" in self.cuts:
-                now = np.minimum(now, late + self.rates)
-            if np.all(np.concatenate([x, late, now]) >= was * (1.0 - 1e-9)):
-                break
-        size = np.concatenate(
-            [np.abs(self.plant.box("x")), np.abs(self.plant.box("f")).reshape(-1, 2)]
-        )
-        slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
-        found: FloatArray = np.concatenate([x, late if delay else now]) + slack
-        return found
-
-
-def _finite(halves: FloatArray, row: FloatArray, j: int) -> FloatArray:
-    """Return half widths with zero where the row does not ask for them."""
-    return np.where(np.delete(row, j) != 0.0, halves, 0.0)
-
-
-def _times(size: FloatArray, halves: FloatArray) -> float:
-    return float(np.where(size > 0.0, size * np.where(size > 0.0, halves, 0.0), 0.0).sum())
 
 
 def _strips(plant: Plant) -> tuple[Strip | None, ...]:

@@ -22,7 +22,7 @@ Estimates need no second copy: a core is begun around whatever its estimate is.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +33,7 @@ from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.stepping import slices
 from obsynth.symbolic import Plant
@@ -146,26 +147,32 @@ class Guard:
         return Contractor(self.plant, self.Ts, self.watch.cuts, self.precision)
 
     @cached_property
-    def settled(self) -> tuple[int, FloatArray | None]:
-        """N, and the half widths of a core that began N calls ago; None where that is not known.
+    def half_widths(self) -> HalfWidths:
+        """How wide the sets are that the contractor leaves."""
+        return HalfWidths(self.contractor, self.delay)
 
-        A core begins from what one instant says: ranges, strips, the inversion, two calls late
-        where a fault has no declared range.
+    @cached_property
+    def settled(self) -> tuple[int, FloatArray | None, int]:
+        """N, the half widths of a core that has settled, and the calls that the contractor has.
+
+        The older copy began N calls ago. Its core takes some of them to settle from where it
+        began, and what the contractor makes of the core's sets comes some calls after them.
         """
         horizon = self.watch.horizon
-        if self.settle is not None:
-            unbounded = np.full(len(self.plant.x) + len(self.plant.f), np.inf)
-            cuts = tuple(cut for cut in self.contractor.cuts if cut != "image")
-            begun = replace(self.contractor, cuts=cuts).half_widths(unbounded, self.delay)
-            n, declared = len(self.plant.x), np.diff(self.plant.box("f").reshape(-1, 2), axis=1)
-            begun[n:] = np.minimum(begun[n:] + self.contractor.rates, 0.5 * declared[:, 0])
-            if np.isfinite(begun).all():
-                late = _LATE if horizon is None else min(_LATE, horizon - 1)
-                found = self.settle(begun, None if horizon is None else horizon - late)
-                return (self.watch.calls, None) if found is None else (found[0] + late, found[1])
+        late = _LATE if horizon is None else min(_LATE, horizon - 1)
+        passes = MOST_PASSES if horizon is None else min(MOST_PASSES, (horizon - late) // 2)
+        given = None if horizon is None else horizon - late - passes
+        found = None if self.settle is None else self.settle(self.half_widths.begun, given)
+        if found is None:
+            return self.watch.calls, None, min(MOST_PASSES, self.watch.calls - 1)
+        calls, widths = found
+        if np.isinf(widths).all():
             # what begins from a set without bounds would be lost for good
-            return MOST_CALLS if horizon is None else horizon, None
-        return self.watch.calls, None
+            return MOST_CALLS if horizon is None else horizon, None, passes
+        if horizon is not None:
+            return horizon, widths, passes
+        passes = self.half_widths.steady(widths)[1]
+        return calls + late + passes, widths, passes
 
     @property
     def horizon(self) -> int:
@@ -174,10 +181,10 @@ class Guard:
 
     def widths(self, core: FloatArray | None) -> FloatArray | None:
         """Return steady half widths of the returned sets from the core's; None without any."""
-        n, n_f = len(self.plant.x), len(self.plant.f)
-        own = np.full(n + n_f, np.inf) if core is None else core
-        own = own if self.settled[1] is None else self.settled[1]
-        found = self.contractor.half_widths(own, self.delay)
+        _, own, passes = self.settled
+        own = core if own is None else own
+        own = np.full(len(self.plant.x) + len(self.plant.f), np.inf) if own is None else own
+        found, _ = self.half_widths.steady(own, passes)
         return found if np.isfinite(found).any() else None
 
 

@@ -71,8 +71,8 @@ class Contract(Generic[D]):
     ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`
     settle: of a design, half widths of the sets that its core begins from, and a number of calls
-        or None: how many calls its bounds take to settle, or that number, and its half widths then;
-        None of a design without bounds
+        or None: how many calls its bounds take to settle, or that number, and its half widths from
+        then on, all infinite where they cannot begin from such sets; None without any bounds
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """

@@ -226,7 +226,8 @@ def settling(
     """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
 
     They begin from boxes of half widths `box` (n + n_f,), around estimates that are as near as the
-    limits say; with `calls` given, the half widths after so many. None of an energy gain.
+    limits say; with `calls` given, the half widths after so many, infinite where a box has no
+    bound. None of an energy gain.
     """
     if isinstance(design.bound, EnergyBound):
         return None
@@ -234,13 +235,15 @@ def settling(
     n, names = len(design.plant.x), design.plant.names("f")
     pick = [*range(n), *(n + names.index(name) for name in design.extended.followed)]
     near = running.steady * (1.0 + SETTLED)
+    if not np.isfinite(box[pick]).all():
+        return 0, np.full(box.shape, np.inf)
     half, middle = box[pick], ca.SX(ca.DM(near + box[pick]))
     ends = np.zeros((n + len(names), 2))
     ends[pick] = np.column_stack([-half, half])
     first = start_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), middle)
     s = np.array(ca.evalf(first)).ravel() * (1.0 + 2.0**-40)
     k = 0
-    while k < (MOST_CALLS if calls is None else calls):
+    while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
         if calls is None and np.all(running.half_widths(s) <= near):
             break
         s, k = running.decay @ s + running.offset, k + 1

@@ -19,7 +19,12 @@ from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, r
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
 from obsynth.designs.interval.rows import Precision
-from obsynth.designs.interval.step import build_core, first_memory, memory_sizes
+from obsynth.designs.interval.step import (
+    build_core,
+    first_memory,
+    half_widths_after,
+    memory_sizes,
+)
 from obsynth.designs.interval.synthesis import (
     fitting_gains,
     given_gains,
@@ -128,6 +133,7 @@ class IntervalObserver(Method):
         first=first_memory,
         core=build_core,
         fault_delay=1,
+        settle=half_widths_after,
     )
 
     gains: Any = "lp"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from obsynth.derive.rigour import UNIT, Exact, above, exact, inverse, nearest
+from obsynth.derive.rigour import UNIT, Exact, above, exact, inverse, magnitude, nearest
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.designs.interval.decoupling import (
@@ -192,12 +192,33 @@ class IntervalDesign(Record):
     @cached_property
     def half_widths(self) -> FloatArray:
         """Steady half widths of states, then faults, from e* and w*, rounded upwards."""
-        share = row_widths(self._width_of(self.share, self.share_rows), self.error, self.width)
+        return self.half_widths_of(self.error, self.width)
+
+    def half_widths_of(self, e: FloatArray, w: FloatArray) -> FloatArray:
+        """Return half widths of states, then faults, for errors and widths of r, rounded upwards.
+
+        Of r at an instant and the one before.
+        """
+        share = row_widths(self._share_width, e, w)
         size = self.share.size + exact(share)
-        x = self._linear_widths(self.state_rows)
-        f = self._linear_widths(self.estimate_rows, share_upper=size, share_lower=size)
+        x = self._linear_widths(self.state_rows, w)
+        f = self._linear_widths(self.estimate_rows, w, share_upper=size, share_lower=size)
         total = np.concatenate([exact(x), exact(f) + exact(share)])
         return above(total * exact(1.0 + 4.0 * UNIT[self.precision]) / 2)
 
-    def _linear_widths(self, rows: Rows, **more: Exact) -> FloatArray:
-        return linear_widths(rows, rows.slack(self.precision), self.prediction, self.width, more)
+    def first_width(self, x: FloatArray) -> FloatArray:
+        """Return the widths of r that begins from a box of states of half widths x."""
+        table = magnitude(exact(self.P) @ self.decoupled.T2)
+        slack = exact(2.0 * self.first_rows.slack(self.precision))
+        size = np.concatenate([self.model.size("x")] * 2 + [exact(np.ones(1))])
+        used = np.where((table != 0).any(axis=0), x, 0.0)
+        if not np.isfinite(used).all():
+            return np.full(len(table), np.inf)
+        return above(table @ exact(2.0 * used) + slack @ size)
+
+    @cached_property
+    def _share_width(self) -> PartWidth:
+        return self._width_of(self.share, self.share_rows)
+
+    def _linear_widths(self, rows: Rows, w: FloatArray, **more: Exact) -> FloatArray:
+        return linear_widths(rows, rows.slack(self.precision), self.prediction, w, more)

@@ -15,6 +15,7 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.interval.record import SWEEPS, IntervalDesign
 from obsynth.designs.interval.rows import Rows
+from obsynth.designs.interval.widths import settling
 from obsynth.symbolic.arrays import FloatArray
 
 
@@ -31,6 +32,25 @@ def memory_sizes(design: IntervalDesign) -> dict[str, int]:
 def first_memory(design: IntervalDesign, start: Start) -> dict[str, ArrayLike]:
     """Start with nothing: everything begins from the box of the first state."""
     return {}
+
+
+def half_widths_after(
+    design: IntervalDesign, box: FloatArray, calls: int | None = None
+) -> tuple[int, FloatArray] | None:
+    """Return how many calls the sets take to settle, and their half widths from then on.
+
+    They begin from boxes of half widths `box`, of the states alone; with `calls` given, the half
+    widths after so many, infinite where a state that matters has no bound.
+    None if nothing is proved.
+    """
+    declared = 0.5 * np.diff(design.plant.box("x"), axis=1)[:, 0]
+    first = design.first_width(np.minimum(box[: len(declared)], declared))
+    if design.error.shape != first.shape:
+        return None
+    if not np.isfinite(first).all():
+        return 0, np.full(box.shape, np.inf)
+    calls, e, w = settling(design.width_map, design.error, design.width, first, calls)
+    return calls, design.half_widths_of(e, w)
 
 
 @dataclass(frozen=True, eq=False)

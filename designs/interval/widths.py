@@ -31,6 +31,11 @@ from obsynth.symbolic.arrays import FloatArray
 DELTA = exact([2.0**-40])[0]
 INFLATION = 1.0 + 1e-6
 LARGEST = 1e12
+# above the relative rounding errors of one step in doubles
+UP = 1.0 + 2.0**-40
+# bounds that are no more than this multiple of their limits have settled
+SETTLED = 1.01
+MOST_CALLS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +78,14 @@ class WidthMap:
 
     def error(self, e: Any) -> Any:
         """Map the bound of the error."""
-        return self._contract(self.part.E @ e + self.part.e_rest)
+        return self.contract(self.part.E @ e + self.part.e_rest)
 
     def width(self, w: Any, e: Any) -> Any:
         """Map the width, for errors of at most e."""
-        return self._contract(self.part.width(w, e))
+        return self.contract(self.part.width(w, e))
 
-    def _contract(self, values: Any) -> Any:
+    def contract(self, values: Any) -> Any:
+        """Cut errors or widths with the measurement, in place."""
         for row in self.contractions:
             bound = row.others @ values + row.rest
             values[row.component] = min(values[row.component], bound)
@@ -249,6 +255,28 @@ def _ascend(size: int, step: Callable[[FloatArray], FloatArray]) -> FloatArray |
             return moved * INFLATION
         value = moved
     return None
+
+
+def settling(
+    step: WidthMap, e: FloatArray, w: FloatArray, first: FloatArray, calls: int | None
+) -> tuple[int, FloatArray, FloatArray]:
+    """Return how many calls errors and widths take to within 1 % of e* and w*, and both then.
+
+    They begin with widths of at most `first`; with `calls` given, what both are after so many. The
+    multiple of e* and w* that the first ones are below is mapped below itself, so what it becomes
+    falls from call to call and holds for all later ones.
+    """
+    quick = step.rounded()
+    begun = quick.contract(first * UP)
+    scale = float((begun / np.minimum(e, w)).max(initial=1.0))
+    error, width = scale * UP * e, scale * UP * w
+    most = MOST_CALLS if calls is None else min(calls, MOST_CALLS)
+    for k in range(1, most):
+        if calls is None and np.all(error <= SETTLED * e) and np.all(width <= SETTLED * w):
+            return k, error, width
+        after = quick.error(error) * UP, quick.width(width, error) * UP
+        error, width = np.minimum(error, after[0]), np.minimum(width, after[1])
+    return most, error, width
 
 
 def steady_holds(step: WidthMap, e: FloatArray, w: FloatArray) -> tuple[bool, float]:

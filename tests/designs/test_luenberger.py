@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import sympy as sp
 
@@ -37,3 +38,20 @@ def test_coefficients_that_doubles_do_not_hold_are_refused_by_name():
     plant.outputs([h / sp.Integer(3) + v])
     with pytest.raises(ob.StructureError, match=r"tank: .*rounded: C"):
         Luenberger().design(plant)
+
+
+@pytest.mark.parametrize("horizon", [None, 60])
+def test_half_widths_hold_when_a_copy_has_taken_over(horizon):
+    """Mutant: `settling` stops at half of its calls."""
+    observer = Luenberger(horizon=horizon).design(two_tanks())
+    design, contract = observer.certificate.design, observer.certificate.contract
+    N = contract.guard(design).horizon
+    memory, widths = observer.memory0([9, 9]), []
+    for _ in range(2 * N + 10):
+        told = [np.array(part).ravel() for part in observer.step(memory, [3.0], [9.0])]
+        memory = told[0]
+        widths.append(0.5 * (told[4] - told[3]))
+    assert np.all(np.array(widths)[N:] <= observer.half_widths)
+    if horizon is None:
+        assert 400 < N < 700
+        assert np.all(observer.half_widths <= 1.0100001 * observer.performance["core_half_widths"])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from luenberger.claims import claims, covers, guarantee, numbers
 from luenberger.model import CLASS, LuenbergerModel, read
 from luenberger.record import LuenbergerDesign
-from luenberger.step import build_core, first_memory, memory_sizes
+from luenberger.step import build_core, first_memory, memory_sizes, settling
 from luenberger.synthesis import solve_gain, with_gain
 from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.given import read_gains
@@ -40,6 +40,7 @@ class Luenberger(Method):
         first=first_memory,
         core=build_core,
         shared=("prediction",),
+        settle=settling,
     )
 
     def read(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> LuenbergerModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import numpy as np
 from numpy.typing import ArrayLike
 
 from luenberger.record import LuenbergerDesign
@@ -12,9 +13,12 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import clip, select
+from obsynth.symbolic.arrays import FloatArray
 
 UP = 1.0 + 2.0**-40
 """Above the relative rounding errors of the sums of one step."""
+SETTLED = 1.01
+MOST_CALLS = 100_000
 
 
 def memory_sizes(design: LuenbergerDesign) -> dict[str, int]:
@@ -26,6 +30,23 @@ def memory_sizes(design: LuenbergerDesign) -> dict[str, int]:
 def first_memory(design: LuenbergerDesign, start: Start) -> dict[str, ArrayLike]:
     """Start at the guess; how far off it is follows from the box of the first state."""
     return {"prediction": start.guess}
+
+
+def settling(
+    design: LuenbergerDesign, box: FloatArray, calls: int | None = None
+) -> tuple[int, FloatArray]:
+    """Return how many calls the bound takes to within 1 % of b, and what it is from then on.
+
+    It begins from a box of half widths `box` around an estimate that is within 1 % of b itself.
+    The multiple of b that the first bound is below falls from call to call, as N b + n <= b.
+    """
+    N, n, b, k = design.closed.N, design.closed.n, design.b, 0
+    s = float(((2.0 * box + SETTLED * b) / b).max()) * UP * b
+    while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
+        if calls is None and np.all(s <= SETTLED * b):
+            break
+        s, k = np.minimum(s, (N @ s + n) * UP**3), k + 1
+    return k, s
 
 
 def build_core(design: LuenbergerDesign) -> Core:

@@ -30,6 +30,7 @@ from obsynth.designs.core.contractor import CUTS, Contractor
 from obsynth.designs.core.core import Core, Known
 from obsynth.designs.core.equations import Equations
 from obsynth.designs.core.guard import Guard, Watch
+from obsynth.designs.core.half_widths import HalfWidths
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import fill
 from obsynth.evaluate.truth import Call, dense
@@ -372,7 +373,7 @@ def test_promised_half_widths_are_those_of_the_formulas(delay):
 
     def widths(cuts, core=None):
         own = np.full(7, inf) if core is None else core
-        return Contractor(plant, 1.0, cuts).half_widths(own, delay).tolist()
+        return HalfWidths(Contractor(plant, 1.0, cuts), delay).steady(own)[0].tolist()
 
     def near(numbers):
         return pytest.approx(numbers, rel=1e-6)

@@ -152,9 +152,9 @@ def test_widths_and_inclusion_over_100_seeds(case, hundred):
 
 
 def test_the_default_is_the_vertex_form_with_contraction(example, run_many, feedback, seeds_100):
-    observer = ob.IntervalObserver(cuts=()).design(example)
+    observer = ob.IntervalObserver(cuts=(), horizon=10**9).design(example)
     run = run_many(observer, *seeds_100, feedback, BOX)
-    cut = run_many(ob.IntervalObserver().design(example), *seeds_100, feedback, BOX)
+    cut = run_many(ob.IntervalObserver(horizon=10**9).design(example), *seeds_100, feedback, BOX)
     assert cut.x_inside().all() and cut.f_inside().all() and not cut.status[1:].any()
     assert np.all(cut.x_lower >= run.x_lower) and np.all(cut.x_upper <= run.x_upper)
     # the declared range of the fault, at the crests of its cosine

@@ -1,0 +1,131 @@
+"""How wide the sets of a step are, at most: the contractor followed call by call, in half widths.
+
+One call maps the half widths of the states and of the faults that a copy carries, in the order of
+the step: the image ``sum_j max|J_ij| h_j``, strips, the core, the inversion, rates. The map is
+monotone. From an envelope that it maps into itself it falls with every call, so what p calls make
+of the envelope holds for every copy that began p calls ago or earlier.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from obsynth.designs.core.contractor import SWEEPS, Contractor
+from obsynth.symbolic.arrays import FloatArray
+
+MOST_PASSES = 200
+_UP = 1.0 + 2.0**-30
+
+
+@dataclass(frozen=True, eq=False)
+class HalfWidths:
+    """Half widths of the cut sets, states then faults, shape (n + n_f,), with all readings.
+
+    contractor: the cuts
+    delay: of the fault interval, 0 or 1
+    """
+
+    contractor: Contractor
+    delay: int
+
+    @cached_property
+    def declared(self) -> FloatArray:
+        """Half of the declared ranges."""
+        plant = self.contractor.plant
+        boxes = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
+        half: FloatArray = 0.5 * np.diff(boxes, axis=1)[:, 0]
+        return half
+
+    @cached_property
+    def ranges(self) -> FloatArray:
+        """Half of the ranges that every call cuts with."""
+        half = self.declared.copy()
+        n = len(self.contractor.domain)
+        half[:n] = 0.5 * np.diff(self.contractor.domain, axis=1)[:, 0]
+        return half if "ranges" in self.contractor.cuts else np.full(half.size, np.inf)
+
+    @cached_property
+    def envelope(self) -> FloatArray:
+        """What holds at every call of a copy that begins from the declared ranges.
+
+        Where a call would add to it, as in states that enter linearly, it has no bound.
+        """
+        held = self.declared.copy()
+        nothing = np.full(held.size, np.inf)
+        while True:
+            grown = self._call(held, nothing)[0] > held
+            if not grown.any():
+                return held
+            held[grown] = np.inf
+
+    @property
+    def begun(self) -> FloatArray:
+        """What a core begins from: what one instant says.
+
+        A fault without a declared range is known by the inversion one call late, to a core that
+        begins from what the call before left.
+        """
+        n = len(self.contractor.domain)
+        waits = not np.isfinite(self.declared[n:]).all()
+        found = (self.envelope if waits else self.declared).copy()
+        found[:n] = self._strips(np.minimum(found[:n], self.ranges[:n]))
+        if waits:
+            after = self._call(found, np.full(found.size, np.inf))[0][n:]
+            found[n:] = np.minimum(self.declared[n:], after + self.contractor.rates)
+        return found
+
+    def steady(self, core: FloatArray, passes: int = MOST_PASSES) -> tuple[FloatArray, int]:
+        """Return half widths for a core of given ones, and by how many calls they lag behind it.
+
+        passes: of the lag; the copy that they speak of has had one call more
+        """
+        plant, held, taken = self.contractor.plant, self.envelope, 0
+        while True:
+            after, shown = self._call(held, core)
+            if taken == passes or np.all(after >= held * (1.0 - 1e-9)):
+                break
+            held, taken = after, taken + 1
+        size = np.vstack([np.abs(plant.box("x")), np.abs(plant.box("f")).reshape(-1, 2)])
+        slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
+        found: FloatArray = shown + slack
+        return found, taken
+
+    def _call(self, held: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what one call carries on, and what it returns."""
+        cuts, equations = self.contractor.cuts, self.contractor.equations
+        n, slopes = len(self.contractor.domain), np.abs(equations.slopes).max(axis=2)
+        fixed = 0.5 * np.diff(equations.box[held.size :], axis=1)[:, 0]
+        x = self.ranges[:n].copy()
+        for i in np.flatnonzero(equations.usable).tolist() if "image" in cuts else ():
+            x[i] = min(x[i], _times(slopes[i], np.append(held, fixed)) * _UP)
+        x = np.minimum(self._strips(x), core[:n])
+        late = held[n:].copy()
+        for j, i in equations.invertible if "inversion" in cuts else ():
+            low, high = equations.slopes[i, n + j].tolist()
+            if high - low <= 1e-9 * abs(high):
+                rest = np.where(np.arange(slopes.shape[1]) == n + j, 0.0, slopes[i])
+                moved = x[i] + _times(rest, np.concatenate([held[:n], late, fixed]))
+                late[j] = min(late[j], moved / min(abs(low), abs(high)) * _UP)
+        late = np.minimum(late, core[n:]) if self.delay else late
+        now = np.minimum(
+            self.ranges[n:], late + self.contractor.rates if "rates" in cuts else np.inf
+        )
+        now = now if self.delay else np.minimum(now, core[n:])
+        return np.append(x, now), np.append(x, late if self.delay else now)
+
+    def _strips(self, x: FloatArray) -> FloatArray:
+        """Cut states with what readings say of them."""
+        x = x.copy()
+        strips = [s for s in self.contractor.strips if s is not None]
+        for strip in strips * SWEEPS if "strips" in self.contractor.cuts else ():
+            for j in np.flatnonzero(strip.row).tolist():
+                others = np.where(np.arange(len(x)) == j, 0.0, np.abs(strip.row))
+                told = 0.5 * (strip.high - strip.low) + _times(others, x)
+                x[j] = min(x[j], told / abs(strip.row[j]) * _UP)
+        return x
+
+
+def _times(size: FloatArray, halves: FloatArray) -> float:
+    """Return a product in which what is not asked for may be without bound."""
+    return float(np.where(size > 0.0, size * np.where(size > 0.0, halves, 0.0), 0.0).sum())

@@ -1,0 +1,125 @@
+"""Half widths of the cut sets hold for the sets of the step, in its order and at its ages."""
+
+import casadi as ca
+import numpy as np
+import pytest
+import sympy as sp
+
+import obsynth as ob
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.core import Core, Known
+from obsynth.designs.core.guard import Guard, Watch
+from obsynth.designs.core.step import Step
+from obsynth.designs.core.stepping import fill
+
+R = sp.Rational
+OPTIONS = {"horizon": 9, "recovery": 1, "cuts": None}
+
+
+def plant(rows, outputs, x=9, f=None, rate=None):
+    """Two states, a fault and a reading with noise of .01; rows and outputs of (x1, x2, f, v)."""
+    p = ob.Plant("two")
+    x1, x2 = p.states("x1 x2", range=(-x, x))
+    faults = p.faults("f", range=f, rate=rate) if f is not None else [0]
+    w, v = p.disturbances("w v", bound=0.01)
+    p.dynamics([row + w for row in rows(x1, x2, faults[0])], Ts=1)
+    p.outputs([outputs(x1, x2) + v])
+    return p
+
+
+def widths(given, horizon, knows=(np.inf, np.inf), delay=0, steps=None):
+    """Promised half widths, and the largest from call N on, over a core of fixed sets."""
+    guard = Guard(given, {}, Watch.of({**OPTIONS, "horizon": horizon}), delay, 1.0)
+    n_f, zero = len(given.f), ca.SX.zeros(2)
+    ends = Ends(-ca.DM(knows), ca.DM(knows))
+    core = Core(lambda seen: Known(zero, ca.SX.zeros(n_f), ends, None, {}), lambda x, f, kept: {})
+    step = Step(guard, core).build()
+    parts = guard.first({}, given.box("x"), given.box("f").reshape(-1, 2))
+    memory, found = fill(guard.layout(), parts), []
+    for _ in range(3 * horizon + 5 if steps is None else steps):
+        told = [np.array(part).ravel() for part in step(memory, [], [0.0])]
+        memory = told[0]
+        found.append(0.5 * np.concatenate([told[4] - told[3], told[6] - told[5]]))
+    return guard.widths(np.array([*knows, *([np.inf] * n_f)])), np.max(found[horizon:], axis=0)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("rate", [None, 0.5])
+def test_an_image_knows_of_a_fault_what_the_call_before_did(rate, delay):
+    """The inversion tells a fault one call late. Mutant: the image takes what it will tell."""
+    given = plant(lambda a, b, f: (a / 2 + f, b / 5 + f), lambda a, b: a, f=(-3, 3), rate=rate)
+    promised, found = widths(given, 30, delay=delay)
+    assert np.all(found <= promised)
+    assert found[1] == pytest.approx(promised[1], rel=0.01)
+
+
+def test_strips_come_before_the_core():
+    """Mutant: a strip takes the other state from the core's set of the same call."""
+    given = plant(lambda a, b, f: (R(9, 10) * a, R(9, 10) * b), lambda a, b: a + b)
+    promised, found = widths(given, 60, knows=(1e-3, np.inf))
+    assert np.all(found <= promised)
+    assert found == pytest.approx(promised, rel=0.01)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+def test_a_copy_that_is_young_has_had_few_images(horizon):
+    """Mutant: as many passes as it takes, whatever the horizon."""
+    given = plant(lambda a, b, f: (a / 2, R(9, 10) * b), lambda a, b: a)
+    promised, found = widths(given, horizon)
+    assert np.all(found <= promised)
+    assert found[1] > 9 * 0.9**horizon
+    assert found[1] == pytest.approx(promised[1], rel=1e-6)
+
+
+def test_a_state_that_may_leave_its_range_has_no_promised_width():
+    """Mutant: the declared range taken for what holds at every call."""
+    given = plant(lambda a, b, f: (a / 2, R(11, 10) * b), lambda a, b: a)
+    promised, found = widths(given, 10)
+    assert np.isfinite(promised[0]) and np.isinf(promised[1]) and found[1] > 9
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_a_core_begins_from_the_declared_range_of_a_fault_or_from_the_inversion(bounded):
+    """Mutants: the inversion where the core does not wait for it; one rate where it takes two."""
+    given = plant(
+        lambda a, b, f: (a / 2 + f, b / 5),
+        lambda a, b: a,
+        f=(-3, 3) if bounded else (-np.inf, np.inf),
+        rate=0.25,
+    )
+    for delay in (0, 1):
+        begun = Guard(given, {}, Watch.of(OPTIONS), delay, 1.0).half_widths.begun
+        told = 3.0 if bounded else 0.01 + 0.005 + 0.01 + 0.5
+        assert begun == pytest.approx([0.01, 9.0, told])
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("bounded", [True, False])
+def test_the_step_begins_a_core_from_no_wider_sets(bounded, delay):
+    """From a step that remembers what its core was given; mutant: one rate where it takes two."""
+    given = plant(
+        lambda a, b, f: (a / 2 + f, b / 5),
+        lambda a, b: a,
+        f=(-3, 3) if bounded else (-np.inf, np.inf),
+        rate=0.25,
+    )
+
+    def begin(x, f, kept):
+        return {"given": ca.vertcat(x.upper - x.lower, f.upper - f.lower)}
+
+    def run(seen):
+        width = seen.memory["given"]
+        knows = ca.vertcat(ca.if_else(width[2] > 1e6, 1e60, 1e9), 1e9)
+        return Known(ca.SX.zeros(2), ca.SX.zeros(1), Ends(-knows, knows), None, seen.memory)
+
+    guard = Guard(given, {"given": 3}, Watch.of(OPTIONS), delay, 1.0)
+    step = Step(guard, Core(run, begin)).build()
+    parts = guard.first({"given": np.zeros(3)}, given.box("x"), given.box("f"))
+    memory, place, found = fill(guard.layout(), parts), guard.layout()["given"], []
+    for _ in range(40):
+        memory = np.array(step(memory, [], [0.0])[0]).ravel()
+        found.append(0.5 * memory[place])
+    late = 0 if bounded else 2
+    begun = guard.half_widths.begun
+    assert np.all(np.array(found)[late:] <= begun * (1 + 1e-12))
+    assert found[late][::2] == pytest.approx(begun[::2], rel=1e-6)
