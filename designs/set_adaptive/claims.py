@@ -34,6 +34,8 @@ def claims(design: SetDesign) -> Iterator[Claim]:
     yield _metzler(design)
     yield _decay(design, "decay", design.A_upper, design.alpha, "the continuous form")
     yield _decay(design, "decay_step", design.A_upper_step, design.alpha_step, "the frozen bounds")
+    if design.coordinates is not None:
+        yield _coordinates(design)
     yield _uniformisation(design)
     yield _law(design)
 
@@ -46,11 +48,13 @@ def covers(design: SetDesign, fresh: SetModel) -> Iterator[Claim]:
 
 
 def _signs(design: SetDesign) -> Claim:
-    low = float(design.plant.box("x")[:, 0].min())
+    own = design.coordinates is None
+    low = float(design.plant.box("x")[:, 0].min()) if own else 0.0
     smallest = float(design.C.min(initial=np.inf))
+    where = "x >= 0 over the declared ranges and C >= 0 (Assumption 1)" if own else "C >= 0"
     return Claim(
         "signs",
-        "x >= 0 over the declared ranges and C >= 0 (Assumption 1); G of any sign",
+        f"{where}; {'' if own else 'x and '}G of any sign",
         bool(low >= 0.0 and smallest >= 0.0),
         min(low, smallest),
         "comparison",
@@ -73,13 +77,16 @@ def _boxes(design: SetDesign) -> Claim:
 
 
 def _metzler(design: SetDesign) -> Claim:
-    exact = metzler_conditions(*map(ExactMatrix.of, (design.A_lower_box, design.L, design.C)))
+    own = design.coordinates is None
+    exact = metzler_conditions(*_error_system(design, design.A_lower_box))
     entries = exact.to_fractions()
     outside = [entries[i][j] for i in range(len(entries)) for j in range(len(entries)) if i != j]
     margin = min(outside, default=0)
     return Claim(
         "metzler",
-        "A_m - L C is a Metzler matrix for all ends of the outputs in their ranges",
+        "A_m - L C is a Metzler matrix for all ends of the outputs in their ranges"
+        if own
+        else "D is a Metzler matrix",
         margin >= 0,
         float(margin),
         _EXACT,
@@ -87,12 +94,12 @@ def _metzler(design: SetDesign) -> Claim:
 
 
 def _decay(design: SetDesign, name: str, A_upper: Any, alpha: float, what: str) -> Claim:
-    A, L, C, p = map(ExactMatrix.of, (A_upper, design.L, design.C, design.p[None]))
-    exact = decay_conditions(A, L, C, p, alpha)
+    p, own = ExactMatrix.of(design.p[None]), design.coordinates is None
+    exact = decay_conditions(*_error_system(design, A_upper), p, alpha)
     margin = min(exact.to_fractions()[0])
     return Claim(
         name,
-        f"p'(A_M - L C) <= -{alpha:.7g} p' with p > 0: {what} decays",
+        f"p'{'(A_M - L C)' if own else 'D'} <= -{alpha:.7g} p' with p > 0: {what} decays",
         bool(margin >= 0 and alpha > 0.0 and design.p.min() > 0.0),
         float(margin),
         _EXACT,
@@ -100,16 +107,41 @@ def _decay(design: SetDesign, name: str, A_upper: Any, alpha: float, what: str) 
 
 
 def _uniformisation(design: SetDesign) -> Claim:
-    diagonal = np.diag(np.array(metzler_conditions(design.A_lower_box, design.L, design.C)))
+    diagonal = np.diag(design.error_matrix(design.A_lower_box))
+    matrix = "(A_o - L C)" if design.coordinates is None else "D"
     room = float((design.mu + diagonal).min())
     product = design.Ts * design.mu
     return Claim(
         "transition",
-        f"I + (A_o - L C) / mu is nonnegative for mu = {design.mu:.6g}, so every term of the "
+        f"I + {matrix} / mu is nonnegative for mu = {design.mu:.6g}, so every term of the "
         f"exponential over Ts = {design.Ts:g} is",
         bool(room > 1e-13 * design.mu and 0.0 < product <= LARGEST_PRODUCT),
         room,
         "comparison",
+    )
+
+
+def _error_system(design: SetDesign, A: Any) -> tuple[ExactMatrix, ExactMatrix, ExactMatrix]:
+    """Return A, L and C of A - L C, or what makes D of them."""
+    if design.coordinates is None:
+        return ExactMatrix.of(A), ExactMatrix.of(design.L), ExactMatrix.of(design.C)
+    none = np.zeros((len(design.L), 1))
+    return ExactMatrix.of(design.coordinates.D), ExactMatrix.of(none), ExactMatrix.of(none.T)
+
+
+def _coordinates(design: SetDesign) -> Claim:
+    """Prove that S tells the states apart: its exact inverse exists, or reading it had failed."""
+    frame, given = design.frame, design.coordinates
+    size = 0.0
+    if frame.back is not None and given is not None:
+        size = float(np.abs(given.S).sum(axis=1).max() * np.abs(frame.back).sum(axis=1).max())
+    return Claim(
+        "coordinates",
+        "z = S x tells the states apart; z' = D z + (S A - D S - L C) x + L C x + ... for the "
+        "stored S, D and L, the second term between bounds of x",
+        bool(size > 0.0 and np.isfinite(size)),
+        1.0 / max(size, 1.0),
+        _EXACT,
     )
 
 
@@ -163,14 +195,18 @@ def _bounds(design: SetDesign, fresh: SetModel) -> Claim:
 
 
 def _speed(design: SetDesign, fresh: SetModel) -> Claim:
+    pairs = [(design.rate, design.input_rate, fresh.rate, fresh.input_rate)]
+    if design.coordinates is not None:
+        pairs.append((design.coordinates.rate, design.coordinates.input_rate, *fresh.motion))
     room = min(
-        float((fresh.rate[:, 0] - design.rate[:, 0]).min(initial=np.inf)),
-        float((design.rate[:, 1] - fresh.rate[:, 1]).min(initial=np.inf)),
+        min(float((new[:, 0] - old[:, 0]).min()), float((old[:, 1] - new[:, 1]).min()))
+        for old, _, new, _ in pairs
     )
-    same = np.array_equal(design.input_rate, fresh.input_rate)
+    same = all(np.array_equal(old, new) for _, old, _, new in pairs)
+    who = "outputs" if design.coordinates is None else "outputs and states"
     return Claim(
         "speed",
-        "between two samples the outputs move no faster than the stored rates",
+        f"between two samples the {who} move no faster than the stored rates",
         bool(room >= 0.0 and same),
         room,
         "interval branch and bound with outward rounding",
@@ -180,6 +216,8 @@ def _speed(design: SetDesign, fresh: SetModel) -> Claim:
 def numbers(design: SetDesign) -> Numbers:
     """Return gains and performance; the steady widths are not predicted."""
     gains = {"L": design.L, "p": design.p, "Gamma": design.Gamma}
+    if design.coordinates is not None and design.frame.back is not None:
+        gains |= {"L": design.frame.back @ design.L, "S": design.coordinates.S}
     return Numbers(gains, _performance(design))
 
 
@@ -236,8 +274,9 @@ def guarantee(design: SetDesign) -> Guarantee:
 
 
 def _performance(design: SetDesign) -> dict[str, float]:
-    fastest = float((-np.diag(design.A_lower - design.L @ design.C)).max())
-    shown = settled_response(design.L @ design.C - design.A_upper, design.C, design.G)
+    fastest = float((-np.diag(design.error_matrix(design.A_lower))).max())
+    frame, M = design.frame, design.error_matrix(design.A_upper)
+    shown = settled_response(-M, frame.C, frame.G)
     shown = shown[design.fault_outputs, np.arange(len(design.Gamma))]
     return {
         "decay": design.alpha,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from obsynth.designs.set_adaptive.coordinates import image, product
 from obsynth.designs.set_adaptive.record import SetDesign
-from obsynth.symbolic.arrays import FloatArray
 
 _PARTS = {
     "zeta_m": "n",
@@ -98,52 +98,89 @@ def ends(design: SetDesign, low: ca.SX, high: ca.SX, clipped: bool) -> tuple[ca.
     return ca.vertcat(*first), ca.vertcat(*second)
 
 
-def drives(
-    design: SetDesign,
-    states: tuple[ca.SX, ca.SX],
-    outputs: tuple[ca.SX, ca.SX],
-    u: ca.SX,
-    exact: ca.SX,
-) -> tuple[Drive, Drive]:
-    """Return the lower and the upper bounding system."""
+Pair = tuple[ca.SX, ca.SX]
+"""Lower and upper ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """The plant between ends of its measured states.
+
+    A, forced: ends of A(rho) and of B u + offset
+    size (n, 1): sum of the magnitudes of what forced is made of
+    """
+
+    A: Pair
+    forced: Pair
+    size: ca.SX
+
+
+def balance(design: SetDesign, states: Pair, u: ca.SX, exact: ca.SX) -> Balance:
+    """Bound the plant between ends of the measured states."""
     values = design.bounds.function()(*states, exact)
     A, B, offset = (values[2 * i : 2 * i + 2] for i in range(3))
-    L = design.L
-    up, down = np.maximum(L, 0.0), np.minimum(L, 0.0)
     push, pull = ca.fmax(u, 0.0), ca.fmin(u, 0.0)
-    bias = ca.DM(design.W1 @ design.w_centre)
-    spread = ca.DM(np.abs(design.W1) @ design.w_radius)
+    low, high = (B[o] @ push + B[1 - o] @ pull + offset[o] for o in (0, 1))
+    size = ca.fmax(ca.fabs(B[0]), ca.fabs(B[1])) @ ca.fabs(u)
+    size = size + ca.fmax(ca.fabs(offset[0]), ca.fabs(offset[1]))
+    return Balance((A[0], A[1]), (low, high), size)
+
+
+def drives(
+    design: SetDesign, states: Pair, outputs: Pair, u: ca.SX, exact: ca.SX, x: Pair
+) -> tuple[Drive, Drive]:
+    """Return the lower and the upper bounding system; x are ends of all states.
+
+    In the plant's own coordinates x >= 0 is left to the bounding systems.
+    """
+    found, frame, given = balance(design, states, u, exact), design.frame, design.coordinates
+    A, forced, size = found.A, found.forced, found.size
+    M = [end - ca.DM(design.L @ design.C) for end in A]
+    if given is not None and frame.own is not None:
+        own, S, M = ca.DM(frame.own), np.abs(given.S), [ca.SX(ca.DM(given.D))] * 2
+        low, high = image(given.S, *A)
+        rest = product((low - own, high - own), x)
+        low, high = image(given.S, *forced)
+        forced = low + rest[0], high + rest[1]
+        terms = ca.DM(S) @ ca.fmax(ca.fabs(A[0]), ca.fabs(A[1])) + ca.fabs(own)
+        size = ca.DM(S) @ size + terms @ ca.fmax(ca.fabs(x[0]), ca.fabs(x[1]))
+    centre, radius = design.w_centre, design.w_radius
+    spread = ca.DM(np.abs(frame.W1) @ radius)
+    size = size + ca.DM(np.abs(frame.W1) @ (np.abs(centre) + radius))
+    size = size + ca.DM(np.abs(design.L)) @ ca.fmax(ca.fabs(outputs[0]), ca.fabs(outputs[1]))
     made = []
-    for o in (0, 1):
-        fed = ca.DM(up) @ outputs[o] + ca.DM(down) @ outputs[1 - o]
-        forced = ca.mtimes(B[o], push) + ca.mtimes(B[1 - o], pull)
-        c = forced + offset[o] + bias + (spread if o else -spread) + fed
-        size = (
-            ca.mtimes(ca.fmax(ca.fabs(B[0]), ca.fabs(B[1])), ca.fabs(u))
-            + ca.fabs(offset[o])
-            + ca.fabs(bias)
-            + spread
-            + ca.DM(np.abs(L)) @ ca.fmax(ca.fabs(outputs[0]), ca.fabs(outputs[1]))
-        )
-        made.append(Drive(A[o] - ca.DM(L @ design.C), ca.densify(c), ca.densify(size)))
+    for o, fed in enumerate(image(design.L, *outputs)):
+        c = forced[o] + ca.DM(frame.W1 @ centre) + (spread if o else -spread) + fed
+        made.append(Drive(M[o], ca.densify(c), ca.densify(size)))
     return made[0], made[1]
 
 
-def image(matrix: FloatArray, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return the ends of M a for every a between two ends, columns or matrices."""
-    plus, minus = ca.DM(np.maximum(matrix, 0.0)), ca.DM(np.minimum(matrix, 0.0))
-    return plus @ low + minus @ high, plus @ high + minus @ low
+def speeds(design: SetDesign, states: Pair, u: ca.SX, exact: ca.SX, x: Pair) -> Pair:
+    """Return the ends of x' for states between ends and faults in their declared ranges."""
+    found = balance(design, states, u, exact)
+    low, high = product(found.A, x)
+    w, f = design.w_radius, design.plant.box("f")
+    bias = ca.DM(design.W1 @ design.w_centre)
+    spread = ca.DM(np.abs(design.W1) @ w)
+    faults = image(design.G, *(ca.SX(ca.DM(end)) for end in f.T))
+    size = ca.fmax(ca.fabs(found.A[0]), ca.fabs(found.A[1])) @ ca.fmax(ca.fabs(x[0]), ca.fabs(x[1]))
+    size = size + found.size + ca.DM(np.abs(design.W1) @ (np.abs(design.w_centre) + w))
+    size = design.rounding * (size + ca.DM(np.abs(design.G) @ np.abs(f).max(axis=1)))
+    return (
+        low + found.forced[0] + bias - spread + faults[0] - size,
+        high + found.forced[1] + bias + spread + faults[1] + size,
+    )
 
 
 def responses(design: SetDesign, memory: Memory) -> tuple[ca.SX, ca.SX]:
     """Return N_m and N_M, (m, q) each: N_m theta <= r_m and r_M <= N_M theta, see `residuals`."""
-    low, high = image(design.C, memory["Omega_m"], memory["Omega_M"])
+    low, high = image(design.frame.C, memory["Omega_m"], memory["Omega_M"])
     return -low, -high
 
 
 def residuals(design: SetDesign, memory: Memory, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return r_m = y_high - C zeta_m and r_M = y_low - C zeta_M, shape (m, 1) each."""
-    ends = image(design.C, memory["zeta_m"], memory["zeta_M"])
+    """Return r_m = y_high - C zeta_m and r_M = y_low - C zeta_M, (m, 1) each, C by its signs."""
+    ends = image(design.frame.C, memory["zeta_m"], memory["zeta_M"])
     return high - ends[0], low - ends[1]
 
 
@@ -191,7 +228,7 @@ def shown_size(design: SetDesign, memory: Memory) -> ca.SX:
         ca.fmax(ca.fabs(memory[f"{name}_m"]), ca.fabs(memory[f"{name}_M"]))
         for name in ("zeta", "Omega")
     )
-    size: ca.SX = ca.DM(np.abs(design.C)) @ (zeta + Omega @ faults)
+    size: ca.SX = ca.DM(np.abs(design.frame.C)) @ (zeta + Omega @ faults)
     return size
 
 

@@ -10,6 +10,7 @@ range of the outputs. The largest alpha is found by a ratio iteration in which e
 design. (The paper's L = p w' solves neither p'L = w' nor the Metzler condition.)
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from obsynth.symbolic.arrays import FloatArray
 _ITERATIONS = 40
 _SHIFT = 1e-12
 _LEAST = 1e-9
+_OTHER = 'in other coordinates it may be: coordinates="auto"'
 # Rounds gains down to a grid: a smaller entry only raises the off-diagonal entries of A - L C.
 _GRID = 2.0**40
 
@@ -45,18 +47,22 @@ def design_gain(
     C: FloatArray,
     cap: float,
     names: tuple[str, ...] = (),
+    judge: Callable[[FloatArray], Gain] | None = None,
 ) -> Gain:
     """Return the gain of the fastest decay with entries of size at most `cap`.
 
-    Without a cap the supremum need not be attained.
+    Without a cap the supremum need not be attained. judge: what a gain is worth; without, what it
+    certifies where outputs show single states, its entries lowered to what is Metzler
     """
     alpha, best = -np.inf, None
+    if judge is None:
+        _require_metzler(A_lower, C, cap, names)
     bound = float(np.abs(A_upper).sum() + cap * np.abs(C).sum())
     guess = -bound
     for _ in range(_ITERATIONS):
         p, W = _feasible(A_lower, A_upper, C, cap, guess)
         L = np.clip(W / p[:, None], -cap, cap)
-        gain = analyse_gain(A_lower, A_upper, C, _make_metzler(L, A_lower, C))
+        gain = judge(L) if judge else analyse_gain(A_lower, A_upper, C, _metzler(L, A_lower, C))
         if best is None or gain.alpha > alpha:
             step, alpha, best = gain.alpha - alpha, gain.alpha, gain
             if step <= _SHIFT * bound:
@@ -80,7 +86,7 @@ def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: Flo
         i, j = np.unravel_index(np.argmin(lacking), lacking.shape)
         raise InfeasibleDesign(
             "A_m - L C is not Metzler for this gain",
-            [f"entry ({i + 1}, {j + 1}) is as low as {lacking[i, j]:.6g}: lower L there"],
+            [f"entry ({i + 1}, {j + 1}) is as low as {lacking[i, j]:.6g}: lower L there", _OTHER],
             entry=(int(i), int(j)),
         )
     M = A_upper - L @ C
@@ -187,7 +193,7 @@ def _feasible(
     return np.maximum(x[:n], _LEAST), x[n:-1].reshape(n, m)
 
 
-def _make_metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArray:
+def _metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArray:
     """Lower a gain by what the solver's tolerance left of the Metzler condition."""
     L = np.where(np.abs(L) < 1e-9 * np.abs(L).max(initial=0.0), 0.0, L)
     L = np.floor(L * _GRID) / _GRID
@@ -199,6 +205,44 @@ def _make_metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArr
                 k = int(np.argmax(C[:, j]))
                 L[i, k] -= (excess / C[k, j]) * (1.0 + 1e-9) + 2.0**-50 * abs(L[i, k])
     return L
+
+
+def least_excess(A: FloatArray, C: FloatArray, cap: float) -> FloatArray:
+    """Return what A lacks beside its diagonal for A - L C to be Metzler, the least sum of it."""
+    from scipy.optimize import linprog
+
+    n, m = len(A), len(C)
+    lacks = np.zeros((n, n))
+    beside = ~np.eye(n, dtype=bool)
+    for i in range(n):
+        shown, own = C[:, beside[i]].T, A[i, beside[i]]
+        rows = np.hstack([shown, -np.eye(n - 1)])
+        objective = np.r_[np.zeros(m), np.ones(n - 1)]
+        limits = [(-cap, cap)] * m + [(0.0, None)] * (n - 1)
+        found = linprog(objective, rows, own, bounds=limits, method="highs-ds")
+        if found.x is None:
+            raise SolverTrouble(f"the gain program was not solved: {found.message}")
+        lacks[i, beside[i]] = found.x[m:] * (1.0 + 1e-9) + 1e-9 * np.abs(A).max()
+    return lacks
+
+
+def _require_metzler(
+    A_lower: FloatArray, C: FloatArray, cap: float, names: tuple[str, ...]
+) -> None:
+    """Refuse what no gain within the cap makes Metzler, where outputs show single states."""
+    best = off_diagonal(A_lower + cap * C.sum(axis=0))
+    if best.min(initial=0.0) >= 0.0:
+        return
+    i, j = np.unravel_index(np.argmin(best), best.shape)
+    to, of = (names[k] if names else f"state {k + 1}" for k in (i, j))
+    why = f"no output shows {of}, so that no gain changes it"
+    if C[:, j].any():
+        why = f"an entry of L of {A_lower[i, j] / C[:, j].max():.6g} would do: raise gain_cap"
+    raise InfeasibleDesign(
+        "no gain makes A_m - L C Metzler",
+        [f"what {of} does to {to} is as low as {A_lower[i, j]:.6g}; {why}", _OTHER],
+        entry=(int(i), int(j)),
+    )
 
 
 def _refusal(

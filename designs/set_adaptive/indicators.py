@@ -81,8 +81,9 @@ def fault_indicators(
     low, high = shown - design.noise, shown + design.noise
 
     def outside(name: str) -> Flags:
-        first = parts[..., layout[f"{name}_m"]] @ design.C.T
-        second = parts[..., layout[f"{name}_M"]] @ design.C.T
+        plus, minus = np.maximum(design.frame.C.T, 0.0), np.minimum(design.frame.C.T, 0.0)
+        lower, upper = parts[..., layout[f"{name}_m"]], parts[..., layout[f"{name}_M"]]
+        first, second = lower @ plus + upper @ minus, upper @ plus + lower @ minus
         return np.asarray((high < first) | (low > second))
 
     first, second = parts[..., layout["theta_m"]], parts[..., layout["theta_M"]]

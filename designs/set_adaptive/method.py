@@ -1,6 +1,6 @@
 """`SetAdaptiveObserver`: options of the method, and the way from a plant to an observer."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.core.given import POSITIVE, read_gains, refuse_idle
+from obsynth.designs.core.given import POSITIVE, read_gains, read_rows, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi import Problem
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
+from obsynth.designs.set_adaptive.coordinates import Coordinates, build_frame, read_coordinates
 from obsynth.designs.set_adaptive.equations import MONITORS, memory_sizes
 from obsynth.designs.set_adaptive.gain import (
     Gain,
@@ -22,6 +23,14 @@ from obsynth.designs.set_adaptive.gain import (
     design_gain,
     gain_problem,
     settled_response,
+)
+from obsynth.designs.set_adaptive.modal import (
+    Choice,
+    complete,
+    given_coordinates,
+    middle,
+    modal_coordinates,
+    modes_of,
 )
 from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
 from obsynth.designs.set_adaptive.printed import printed_gain
@@ -75,6 +84,13 @@ class SetAdaptiveObserver(Method):
         In which the step runs: what its rounding may do is added to the bounds.
     form : {"corrected", "printed"}
         ``"printed"``: the printed gain condition, law and bounds.
+    coordinates : None, "auto" or array_like of shape (n, n)
+        S of the coordinates z = S x in which the bounding systems run, for plants whose A - L C
+        cannot be made Metzler in their own, or whose states may be negative. Their bounds are
+        carried back by the exact inverse, rounded outwards; what S leaves of D, and what A varies
+        by, is added to the drive between bounds of x. With a matrix the cap holds for S L. By
+        default x itself; ``"auto"``: x where that has a design, else real modal coordinates of
+        A - L C, for the middle of the bounds of A, with the smallest predicted widths.
 
     Raises
     ------
@@ -145,10 +161,19 @@ class SetAdaptiveObserver(Method):
     region: tuple[tuple[float, float], ...] | None = None
     precision: Literal["double", "single"] = "double"
     form: Literal["corrected", "printed"] = "corrected"
+    coordinates: Literal["auto"] | tuple[tuple[float, ...], ...] | None = None
 
     def check(self) -> None:
         """Refuse a printed bank; the printed form has the printed law and no noise."""
-        own, bank = ("law", "Gamma", "gain_cap", "noise", "window"), ("filters", "region")
+        if self.coordinates is not None and not isinstance(self.coordinates, str):
+            object.__setattr__(self, "coordinates", read_rows("coordinates", self.coordinates))
+        elif self.coordinates not in (None, "auto"):
+            raise ObsynthError(
+                f'coordinates is {self.coordinates!r}; it takes "auto" or S of z = S x',
+                option="coordinates",
+            )
+        own = ("law", "Gamma", "gain_cap", "noise", "window", "coordinates")
+        bank = ("filters", "region")
         refuse_idle(self, f"robust={self.robust}", *(own if self.robust else bank))
         if self.form == "printed":
             if self.robust:
@@ -157,7 +182,7 @@ class SetAdaptiveObserver(Method):
                     "the paper",
                     option="form",
                 )
-            refuse_idle(self, 'form="printed"', "gain_cap")
+            refuse_idle(self, 'form="printed"', "gain_cap", "coordinates")
             object.__setattr__(self, "law", "printed")
             object.__setattr__(self, "noise", False)
 
@@ -178,28 +203,55 @@ class SetAdaptiveObserver(Method):
 
     def read(self, given: Plant | Split) -> SetModel:
         """Bring the plant into the form (3) and bound its matrices elementwise."""
-        return read(given, self.noise)
+        found = read(given, self.noise, own=self.coordinates is None)
+        if isinstance(self.coordinates, tuple):
+            read_coordinates(self.coordinates, found.plant.names("x"))
+        return found
 
     def solve(self, model: SetModel) -> SetDesign:
-        """Find the gain of the fastest decay within the cap, or the printed one."""
+        """Find the gain of the fastest decay within the cap, or the printed one, or coordinates."""
         A_lower, A_upper = model.A_span
         if self.form == "printed":
             return self._complete(model, printed_gain(A_lower, A_upper, model.C))
-        names = model.plant.names("x")
-        gain = design_gain(model.A_lower_box, A_upper, model.C, self.gain_cap, names)
-        return self._complete(model, gain)
+        names, cap = model.plant.names("x"), self.gain_cap
+        return self._in_coordinates(
+            model,
+            lambda: design_gain(model.A_lower_box, A_upper, model.C, cap, names),
+            lambda S: given_coordinates(model, S, cap),
+            lambda: modal_coordinates(model, cap, self.Ts),
+        )
 
     def fix(self, model: SetModel, gains: Mapping[str, ArrayLike]) -> SetDesign:
-        """Find the decay of a given ``L`` of shape (n, m)."""
+        """Find the decay of a given ``L`` of shape (n, m), of the plant's own coordinates."""
         L = read_gains(gains, {"L": model.C.T.shape})["L"]
-        gain = analyse_gain(model.A_lower_box, model.A_span[1], model.C, L)
-        if gain.alpha <= 0.0:
-            raise InfeasibleDesign(
-                "A_M - L C is not Hurwitz for this gain",
-                [f"its largest eigenvalue over the range of the outputs is {-gain.alpha:.6g}"],
-                alpha=gain.alpha,
-            )
-        return self._complete(model, gain)
+        return self._in_coordinates(
+            model,
+            lambda: analyse_gain(model.A_lower_box, model.A_span[1], model.C, L),
+            lambda S: complete(model, S, S @ L),
+            lambda: modes_of(model, L),
+        )
+
+    def _in_coordinates(
+        self,
+        model: SetModel,
+        own: Callable[[], Gain],
+        given: Callable[[FloatArray], Choice],
+        modal: Callable[[], Choice],
+    ) -> SetDesign:
+        """Complete what was found in the coordinates of the option."""
+        found: Gain | Choice
+        if isinstance(self.coordinates, tuple):
+            found = given(np.array(self.coordinates))
+        elif self.coordinates == "auto" and model.plant.box("x").min() < 0.0:
+            found = modal()
+        else:
+            try:
+                return self._complete(model, _decaying(own()))
+            except InfeasibleDesign:
+                if self.coordinates is None:
+                    raise
+            found = modal()
+        return self._complete(model, _decaying(found.gain), found)
 
     def problem(self, model: Plant | Split, alpha: float) -> Problem:
         """Return the gain program for a decay alpha, see `Problem.to_cvxpy`.
@@ -211,6 +263,11 @@ class SetAdaptiveObserver(Method):
         ObsynthError
             For the bank, which needs no program.
         """
+        if self.coordinates is not None:
+            raise ObsynthError(
+                "the program is that of the plant's own coordinates: leave coordinates out",
+                option="coordinates",
+            )
         found: SetModel = self._checked(model)
         return gain_problem(found.A_lower_box, found.A_span[1], found.C, self.gain_cap, alpha)
 
@@ -222,21 +279,29 @@ class SetAdaptiveObserver(Method):
             )
         return super()._checked(given, bounds)
 
-    def _complete(self, model: SetModel, gain: Gain) -> SetDesign:
+    def _complete(self, model: SetModel, gain: Gain, choice: Choice | None = None) -> SetDesign:
         """Add what the step needs to a gain, or refuse its sample time."""
         A_lower, A_upper = model.A_span
-        C, q = model.C, len(model.plant.f)
-        Gamma = self._adaptation(model.plant)
-        outputs = output_of_fault(C, model.A_lower_box, model.G, model.plant.names("f"))
+        Gamma, names = self._adaptation(model.plant), model.plant.names("f")
+        flow = np.maximum(model.A_lower_box, 0.0) if choice is None else middle(model)[0]
+        outputs = output_of_fault(model.C, flow, model.G, names)
+        coordinates = None if choice is None else Coordinates(choice.S, choice.D, *model.motion)
+        frame = build_frame(model.C, model.G, model.W1, gain.L, coordinates)
+
+        def error_matrix(A: FloatArray) -> FloatArray:
+            return A - gain.L @ model.C if choice is None else choice.D
+
         # Gamma N^2 is how fast theta moves when N has settled
-        settled = settled_response(gain.L @ C - A_upper, C, model.G)
-        adaptation = Gamma * settled[outputs, np.arange(q)] ** 2
-        longest = 1.0 / float((-np.diag(A_lower - gain.L @ C)).max())
+        settled = settled_response(-error_matrix(A_upper), frame.C, frame.G)
+        if choice is not None:
+            outputs = np.argmax(settled, axis=0).tolist()
+        adaptation = Gamma * settled[outputs, np.arange(len(names))] ** 2
+        longest = 1.0 / float((-np.diag(error_matrix(A_lower))).max())
         shortest = min(longest / 32.0, 1.0 / float(adaptation.max()))
         Ts = round_down(shortest) if self.Ts is None else self.Ts
-        uniformisation(Ts, float((-np.diag(model.A_lower_box - gain.L @ C)).max()))
+        uniformisation(Ts, float((-np.diag(error_matrix(model.A_lower_box))).max()))
         A_upper_step = model.extremes(Ts)[1]
-        M = A_upper_step - gain.L @ C
+        M = error_matrix(A_upper_step)
         alpha_step = float((-(gain.p @ M) / gain.p).min())
         if alpha_step <= 0.0:
             raise InfeasibleDesign(
@@ -263,6 +328,7 @@ class SetAdaptiveObserver(Method):
             fault_outputs=np.array(outputs),
             window=self.window,
             precision=self.precision,
+            coordinates=coordinates,
             options=self.settling(_SETTLED / min(alpha_step, float(adaptation.min())), Ts),
         )
 
@@ -276,6 +342,17 @@ class SetAdaptiveObserver(Method):
                 option="Gamma",
             )
         return np.broadcast_to(Gamma, (len(plant.f),)).copy()
+
+
+def _decaying(gain: Gain) -> Gain:
+    """Refuse a gain that is not stable."""
+    if gain.alpha <= 0.0:
+        raise InfeasibleDesign(
+            "A_M - L C is not Hurwitz for this gain",
+            [f"its largest eigenvalue over the range of the outputs is {-gain.alpha:.6g}"],
+            alpha=gain.alpha,
+        )
+    return gain
 
 
 def round_down(value: float) -> float:

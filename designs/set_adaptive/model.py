@@ -50,6 +50,11 @@ class SetModel(System):
         return self.bounds.extremes((self.noise + Ts * speed)[rows] / scale)
 
     @cached_property
+    def motion(self) -> tuple[FloatArray, FloatArray]:
+        """As rate and input_rate, of all states."""
+        return _speed(self.plant, np.eye(len(self.plant.x)))
+
+    @cached_property
     def A_span(self) -> tuple[FloatArray, FloatArray]:
         """The extremes of the continuous form."""
         return self.extremes(0.0)
@@ -60,15 +65,19 @@ class SetModel(System):
         return self.bounds.extremes(np.inf)[0]
 
 
-def read(given: Plant | Split, noise: bool = True) -> SetModel:
-    """Read a plant, with or without its disturbances, or refuse it by name."""
+def read(given: Plant | Split, noise: bool = True, own: bool = True) -> SetModel:
+    """Read a plant, with or without its disturbances, or refuse it by name.
+
+    own: for bounds in the plant's own coordinates, which needs states that are not negative
+    """
     plant = CLASS.check(given if isinstance(given, Plant) else given.model)
     plant.check()
     for signal in plant.x:
-        if signal.lower < 0.0:
+        if own and signal.lower < 0.0:
             raise StructureError(
                 f"the state {signal.name} may be negative ({signal.lower:g}); A_m x <= A x <= A_M "
-                f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state",
+                f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state, or "
+                'coordinates="auto"',
                 symbol=signal.name,
                 condition="nonnegative states",
             )
@@ -129,23 +138,22 @@ def read(given: Plant | Split, noise: bool = True) -> SetModel:
 
 def read_again(design: SetDesign) -> SetModel:
     """Derive it from the stored equations."""
-    return read(design.plant, design.noisy)
+    return read(design.plant, design.noisy, own=design.coordinates is None)
 
 
 def output_of_fault(
-    C: FloatArray, A_lower: FloatArray, G: FloatArray, names: tuple[str, ...]
+    C: FloatArray, flow: FloatArray, G: FloatArray, names: tuple[str, ...]
 ) -> list[int]:
     """Return for every fault the output that shows it first, by derivatives, then by size.
 
     What it does to one state may cancel what it does to another: the output that is found then
     tells little of it, or nothing.
     """
-    flow = np.maximum(A_lower, 0.0)
-    np.fill_diagonal(flow, 0.0)
+    flow = flow - np.diag(np.diag(flow))
     found = []
     for j, name in enumerate(names):
         reached = G[:, j]
-        for _ in range(len(A_lower)):
+        for _ in range(len(flow)):
             shown = np.abs(C @ reached)
             if shown.max() > 0.0:
                 found.append(int(np.argmax(shown)))

@@ -12,6 +12,7 @@ from obsynth.derive.rigour import allowance
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.designs.set_adaptive.bounds import EndBounds
+from obsynth.designs.set_adaptive.coordinates import Coordinates, Frame, build_frame
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
@@ -40,6 +41,13 @@ class System(Record):
     input_rate: Annotated[FloatArray, "m n_u"]
 
     @property
+    def output_box(self) -> FloatArray:
+        """Ranges of C x, every output a positive multiple of one state, shape (m, 2)."""
+        shown = self.plant.box("x")[np.argmax(self.C, axis=1)]
+        box: FloatArray = self.C.max(axis=1)[:, None] * shown
+        return box
+
+    @property
     def noise(self) -> FloatArray:
         """Bound of the measurement noise, shape (m,)."""
         bound: FloatArray = np.abs(self.W2) @ self.w_radius
@@ -59,6 +67,7 @@ class SetDesign(System):
     fault_outputs: the output that adapts each fault
     window: time constant of the monitors in seconds, None for all time
     precision: in which the step runs
+    coordinates: z = S x in which the bounds move, None for x itself; L is the gain in them
     options: the options of the method, as given
     """
 
@@ -77,7 +86,18 @@ class SetDesign(System):
     fault_outputs: Annotated[IntArray, "n_f"]
     window: float | None
     precision: Literal["double", "single"]
+    coordinates: Coordinates | None
     options: Mapping[str, Any]
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The plant in the coordinates of the bounds."""
+        return build_frame(self.C, self.G, self.W1, self.L, self.coordinates)
+
+    def error_matrix(self, A: FloatArray) -> FloatArray:
+        """Return A - L C for a bound of A, or D in coordinates of their own, rounded."""
+        own: FloatArray = A - self.L @ self.C
+        return own if self.coordinates is None else self.coordinates.D
 
     @cached_property
     def assumed(self) -> Plant:
@@ -90,12 +110,14 @@ class SetDesign(System):
     @property
     def rounding(self) -> float:
         """What the rounding of one step may be, relative to the size of its terms."""
-        return allowance(self.precision, len(self.plant.x), self.Ts * self.mu)
+        count = len(self.plant.x) * (1 if self.coordinates is None else 4)
+        return allowance(self.precision, count, self.Ts * self.mu)
 
     @property
     def mu(self) -> float:
         """Not below any diagonal entry of L C - A_m."""
-        return float((-np.diag(self.A_lower_box - self.L @ self.C)).max()) * (1.0 + 2.0**-40)
+        fastest = float((-np.diag(self.error_matrix(self.A_lower_box))).max())
+        return fastest * (1.0 + 2.0**-40)
 
     def check(self) -> None:
         """Refuse numbers of outputs that there are not."""

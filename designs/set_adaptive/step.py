@@ -20,18 +20,20 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import select, slices
+from obsynth.designs.set_adaptive.coordinates import carried, image
 from obsynth.designs.set_adaptive.equations import (
     MONITORS,
     Drive,
     Memory,
+    Pair,
     columns,
     drives,
     ends,
-    image,
     memory_sizes,
     pulls,
     residuals,
     responses,
+    speeds,
     theta_rates,
 )
 from obsynth.designs.set_adaptive.record import SetDesign
@@ -42,15 +44,23 @@ from obsynth.symbolic.errors import ObsynthError
 
 def first_memory(design: SetDesign, start: Start) -> dict[str, FloatArray]:
     """Start from boxes of the state and of the constant faults; guess and y0 are not used."""
-    if np.any(start.x[:, 0] < 0.0):
+    if design.coordinates is None and np.any(start.x[:, 0] < 0.0):
         raise ObsynthError("x_range reaches below zero, which the method excludes")
     f_box = design.plant.box("f") if start.f_range is None else start.f_range
-    x, f = (outward(box, design.precision).T for box in (start.x, f_box))
+    z = into(design, *(ca.DM(end) for end in start.x.T))
+    z_box = np.column_stack([np.array(end).ravel() for end in z])
+    x, f = (outward(box, design.precision).T for box in (z_box, f_box))
     return begun([*x], [*f])
 
 
+def into(design: SetDesign, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return the ends of z, in which the bounds move, for ends of the state."""
+    given = design.coordinates
+    return carried(None if given is None else given.S, low, high, design.rounding)
+
+
 def begun(x: Sequence[Any], f: Sequence[Any]) -> dict[str, Any]:
-    """Return the parts of the memory that are not zero, for ends of the state and the faults."""
+    """Return the parts of the memory that are not zero, for ends of z and of the faults."""
     bounds = {"zeta_m": x[0], "zeta_M": x[1], "xi_m": x[0], "xi_M": x[1]}
     return {**bounds, "theta_m": f[1], "theta_M": f[0]}
 
@@ -64,12 +74,9 @@ def build_core(design: SetDesign) -> Core:
     """
     plant, sizes = design.plant, memory_sizes(design)
     m = len(plant.output)
-    row_of = [int(np.flatnonzero(row)[0]) for row in design.C]
-    scale = np.array([design.C[k, i] for k, i in enumerate(row_of)])
     x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
-    y_box = scale[:, None] * x_box[row_of]
+    y_box = outward(design.output_box, design.precision)
     guaranteed = design.law == "cooperative"
-    C = ca.DM(design.C)
 
     def run(seen: Seen) -> Known:
         memory = Memory(seen.memory, design)
@@ -84,23 +91,25 @@ def build_core(design: SetDesign) -> Core:
         theta_m = select(seen.all_used, theta_m, memory["theta_m"])
         theta_M = select(seen.all_used, theta_M, memory["theta_M"])
         smallest, largest = ca.fmin(theta_m, theta_M), ca.fmax(theta_m, theta_M)
-        empty = ca.SX(0)
+        xi, empty = (memory["xi_m"], memory["xi_M"]), ca.SX(0)
+        least, most = carried(design.frame.C, *xi, design.rounding)
         for k in range(m):
-            empty = ca.logic_or(empty, (C @ memory["xi_m"])[k] > high[k])
-            empty = ca.logic_or(empty, (C @ memory["xi_M"])[k] < low[k])
+            empty = ca.logic_or(empty, ca.logic_or(least[k] > high[k], most[k] < low[k]))
         exact = _exact_arguments(design, seen.u, seen.theta)
-        lower, upper = _frozen(design, low, high, seen.u, exact)
+        x = Ends(*carried(design.frame.back, *xi, design.rounding))
+        lower, upper = _frozen(design, low, high, x, seen.u, exact)
         changed = {"theta_m": theta_m, "theta_M": theta_M}
         changed |= _predict(design, memory, lower, upper, smallest, largest)
         changed |= _monitor(design, memory, r, seen.all_used)
-        x, f = Ends(memory["xi_m"], memory["xi_M"]), Ends(smallest, largest)
+        f = Ends(smallest, largest)
         known = Known(x.middle, f.middle, x, f, columns(changed), empty=empty)
         return known if guaranteed else replace(known, x=None, f=None, empty=no, valid=no)
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
         nothing = {name: ca.SX.zeros(sizes[name]) for name in ("Omega_m", "Omega_M")}
-        near = [one.meet(Ends.of(box)) for one, box in ((x, x_box), (f, f_box))]
-        return {**nothing, **begun(*((one.lower, one.upper) for one in near))}
+        near, faults = x.meet(Ends.of(x_box)), f.meet(Ends.of(f_box))
+        z = into(design, near.lower, near.upper)
+        return {**nothing, **begun(z, (faults.lower, faults.upper))}
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         return {name: ca.SX.zeros(sizes[name]) for name in MONITORS}
@@ -127,13 +136,15 @@ def build_ode(design: SetDesign) -> ca.Function:
     v = ca.DM(design.noise)
     low, high = shown - v, shown + v
     exact = _exact_arguments(design, u, theta)
-    lower, upper = drives(design, ends(design, low, high, design.noisy), (low, high), u, exact)
-    G = ca.DM(design.G)
+    xi = Ends(*carried(design.frame.back, memory["xi_m"], memory["xi_M"], 0.0))
+    x, states = _state(design, low, high, xi), ends(design, low, high, design.noisy)
+    lower, upper = drives(design, states, (low, high), u, exact, (x.lower, x.upper))
+    G = ca.DM(design.frame.G)
     r = residuals(design, memory, low, high)
     d_theta = theta_rates(design, memory, r)
     smallest = ca.fmin(memory["theta_m"], memory["theta_M"])
     largest = ca.fmax(memory["theta_m"], memory["theta_M"])
-    faults = image(design.G, smallest, largest)
+    faults = image(design.frame.G, smallest, largest)
     changed = {"theta_m": d_theta[0], "theta_M": d_theta[1]}
     forget = 0.0 if design.window is None else 1.0 / design.window
     both = zip(("m", "M"), (lower, upper), faults, r, responses(design, memory), strict=True)
@@ -181,24 +192,62 @@ def _adapt(
     return results[0], results[1]
 
 
-def _frozen(
-    design: SetDesign, low: ca.SX, high: ca.SX, u: ca.SX, exact: ca.SX
-) -> tuple[Drive, Drive]:
-    """Return the bounding systems for everything that C x may show until the next sample."""
-    push = ca.DM(design.input_rate) @ u
-    size = ca.DM(np.abs(design.rate).max(axis=1)) + ca.fabs(push)
-    fall = ca.fmin(ca.DM(design.rate[:, 0]) + push - SHOWN[design.precision] * size, 0.0)
-    rise = ca.fmax(ca.DM(design.rate[:, 1]) + push + SHOWN[design.precision] * size, 0.0)
-    box = []
-    for row in design.C:
-        i = int(np.flatnonzero(row)[0])
-        box.append(row[i] * design.plant.box("x")[i])
-    y_box = outward(np.array(box), design.precision)
-    reached = (low + design.Ts * fall, high + design.Ts * rise)
-    outputs = tuple(
-        ca.fmin(ca.fmax(side, ca.DM(y_box[:, 0])), ca.DM(y_box[:, 1])) for side in reached
+def _state(design: SetDesign, low: ca.SX, high: ca.SX, x: Ends) -> Ends:
+    """Return ends of all states from ends of C x, of themselves and of their ranges."""
+    names, lower, upper = design.plant.names("x"), ca.SX(x.lower), ca.SX(x.upper)
+    for state, first, second in zip(
+        design.bounds.states, *map(ca.vertsplit, ends(design, low, high, False)), strict=True
+    ):
+        i = names.index(state.name)
+        lower[i], upper[i] = ca.fmax(lower[i], first), ca.fmin(upper[i], second)
+    return Ends(lower, upper).meet(Ends.of(outward(design.plant.box("x"), design.precision)))
+
+
+def _reached(design: SetDesign, now: Ends, speed: Pair, box: FloatArray) -> Pair:
+    """Return ends that hold until the next sample for what moves at some speeds inside a box."""
+    low, high = map(ca.DM, outward(box, design.precision).T)
+    moved = (
+        now.lower + design.Ts * ca.fmin(speed[0], 0.0),
+        now.upper + design.Ts * ca.fmax(speed[1], 0.0),
     )
-    return drives(design, ends(design, *reached, clipped=True), (outputs[0], outputs[1]), u, exact)
+    first, second = (ca.fmin(ca.fmax(side, low), high) for side in moved)
+    return first, second
+
+
+def _declared(design: SetDesign, rate: FloatArray, input_rate: FloatArray, u: ca.SX) -> Pair:
+    """Return speeds over the declared ranges."""
+    push, size = ca.DM(input_rate) @ u, ca.DM(np.abs(rate).max(axis=1))
+    wide = SHOWN[design.precision] * (size + ca.fabs(push))
+    return ca.DM(rate[:, 0]) + push - wide, ca.DM(rate[:, 1]) + push + wide
+
+
+def _frozen(
+    design: SetDesign, low: ca.SX, high: ca.SX, x: Ends, u: ca.SX, exact: ca.SX
+) -> tuple[Drive, Drive]:
+    """Return the bounding systems for everything that C x may show until the next sample.
+
+    In coordinates of their own, for all that the states may be: what moves them from where they
+    are is bounded by what does in the declared ranges first, then by what does within that reach.
+    """
+    given, states = design.coordinates, (x.lower, x.upper)
+    if given is None:
+        speed = _declared(design, design.rate, design.input_rate, u)
+        outputs = _reached(design, Ends(low, high), speed, design.output_box)
+        return drives(design, ends(design, *outputs, True), outputs, u, exact, states)
+    x_box, now = design.plant.box("x"), _state(design, low, high, x)
+    states = _reached(design, now, _declared(design, given.rate, given.input_rate, u), x_box)
+    speed = speeds(design, ends(design, *_shown(design, states), True), u, exact, states)
+    near = Ends(*_reached(design, now, speed, x_box)).meet(Ends(*states))
+    states = near.lower, near.upper
+    outputs = _shown(design, states)
+    return drives(design, ends(design, *outputs, True), outputs, u, exact, states)
+
+
+def _shown(design: SetDesign, states: Pair) -> Pair:
+    """Return the ends of C x, each a positive multiple of one state."""
+    C = ca.DM(design.C)
+    slack = design.rounding * (C @ ca.fmax(ca.fabs(states[0]), ca.fabs(states[1])))
+    return C @ states[0] - slack, C @ states[1] + slack
 
 
 def _predict(
@@ -206,10 +255,10 @@ def _predict(
 ) -> dict[str, ca.SX]:
     """Move zeta, Omega and xi over one step; the last column collects what rounding may do."""
     weights = uniformisation(design.Ts, design.mu)
-    G, q = ca.DM(design.G), len(design.Gamma)
+    G, q = ca.DM(design.frame.G), len(design.Gamma)
     declared = ca.DM(np.abs(design.plant.box("f")).max(axis=1))
     allowed = ca.fmax(declared, ca.fmax(ca.fabs(smallest), ca.fabs(largest)))
-    faults = image(design.G, smallest, largest)
+    faults = image(design.frame.G, smallest, largest)
     changed = {}
     for o, drive, fault, sign in (("m", lower, faults[0], -1.0), ("M", upper, faults[1], 1.0)):
         zeta, Omega, xi = (memory[f"{name}_{o}"] for name in ("zeta", "Omega", "xi"))
