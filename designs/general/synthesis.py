@@ -217,7 +217,7 @@ def solve_ellipsoid(
     def solve(gamma: float) -> tuple[float, Found] | None:
         problem = ellipsoid_problem(stated, gamma, weights, gain)
         try:
-            solution = solve_with_retries(problem, (), lambda s: 0.0 <= s.gap < GAP)
+            solution = _solved(problem)
             found = recovered(stated, solution, gamma, 0.0, gain)
             size = weights @ np.sqrt(np.diag(np.linalg.inv(found.P)))
         except (InfeasibleDesign, SolverTrouble, np.linalg.LinAlgError) as refusal:
@@ -233,6 +233,22 @@ def solve_ellipsoid(
     if best is None:
         raise _no_ellipsoid(measured, gamma, refusals)
     return best
+
+
+def _solved(problem: Problem) -> Solution:
+    """Solve a problem; what has a small gap and leaves half the margin serves, a proof follows."""
+    strict = [item.expression for item in problem.blocks.values() if item.asks_margin]
+
+    def serves(found: Solution) -> bool:
+        if not 0.0 <= found.gap < GAP:
+            return False
+        least = min(float(np.linalg.eigvalsh(found.value(part))[0]) for part in strict)
+        return least > -0.5 * MARGIN
+
+    found = solve_with_retries(problem, (), serves)
+    if not serves(found):
+        raise SolverTrouble(f"{problem.name}: {found.solver} calls solved what is not")
+    return found
 
 
 def _no_ellipsoid(
@@ -322,9 +338,7 @@ def solve_energy(
     last: Exception | None = None
     for cap in CAPS:
         try:
-            solution = solve_with_retries(
-                energy_problem(stated, weights, cap, gain), (), lambda s: 0.0 <= s.gap < GAP
-            )
+            solution = _solved(energy_problem(stated, weights, cap, gain))
         except (InfeasibleDesign, SolverTrouble) as refusal:
             last = refusal
             continue
