@@ -80,6 +80,16 @@ def _unknown(plant: Plant, kind: str) -> list[Signal]:
 
 
 def _read_region(plant: Plant, region: ArrayLike | None) -> FloatArray:
+    loose = tuple(s.name for s in plant.x if not s.bounded)
+    if region is None and loose:
+        raise StructureError(
+            f"state {', '.join(loose)} has no range, and the bank begins anew from ranges and "
+            "counts its rounding by them, also in states that enter linearly; declare it with "
+            "range=, or give region=",
+            symbol=loose[0],
+            symbols=loose,
+            condition="states with ranges",
+        )
     box = plant.box("x") if region is None else np.array(region, dtype=float)
     if box.shape != (len(plant.x), 2) or not np.isfinite(box).all():
         raise ObsynthError(

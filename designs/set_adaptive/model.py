@@ -24,7 +24,11 @@ CLASS = PlantClass(
         "d": " has no bound that this method could use; declare it as a disturbance with bound=, "
         "or as a fault",
     },
-    finite={"x": _NO_RANGE, "f": _NO_RANGE},
+    finite={
+        "x": " has no range, and the bounds of A x are those of ranges, even where it enters "
+        "linearly; declare it with range= (in the plant's own coordinates from 0 on)",
+        "f": _NO_RANGE,
+    },
     needs={"f": "this method bounds faults"},
 )
 
