@@ -5,10 +5,11 @@ For a discrete plant ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form:
 - a fault that is followed becomes a state with ``f+ = f + step``, the step within its rate;
 - other faults, parameters known to an interval, scheduling variables that are not measured, and
   unknown inputs with a range are disturbances like w;
-- unknown inputs without a range are taken away. ``F(x, d) - F(x, 0)`` has to lie in the span of a
-  constant D0, which is found from numbers and proved: rows that hold the identity in D0 tell the
-  others. With ``L0 = D0 (C D0)^-1`` on outputs of constant slopes and ``T0 = I - L0 C``, the rows
-  ``T0 F`` know nothing of d, whatever its size, and ``x = T0 x + L0 C x``.
+- unknown inputs without a range, and faults to be divided out, are taken away. ``F(x, d) - F(x,
+  0)`` has to lie in the span of a constant D0, which is found from numbers and proved: rows that
+  hold the identity in D0 tell the others. With ``L0 = D0 (C D0)^-1`` on outputs of constant slopes
+  and ``T0 = I - L0 C``, the rows ``T0 F`` know nothing of d, whatever its size, and ``x = T0 x + L0
+  C x``.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ class Extended:
     plant: states (x, followed faults), inputs (u, measured scheduling), disturbances v; its rows
         are ``T0 F`` and ``f + step``
     followed: names of the faults that are states
-    free: names of the unknown inputs that are taken away
+    free: names of the unknown inputs and faults that are taken away
     D0, L0, T0: exact matrices, shapes (N, k), (N, m), (N, N)
     picked: outputs that L0 reads
     """
@@ -86,24 +87,28 @@ def _items(matrix: sp.Matrix) -> list[tuple[tuple[int, int], sp.Expr]]:
     ]
 
 
-def extend(model: Plant, unfollowed: Sequence[str] = ()) -> Extended:
-    """Make the extended plant of a discrete one; `unfollowed` faults are disturbances.
+def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] = ()) -> Extended:
+    """Make the extended plant of a discrete one.
 
-    StructureError where unknown inputs cannot be taken away, or a disturbance has no bound.
+    `unfollowed` faults are disturbances, `divided` ones are taken away like unknown inputs.
+    StructureError where these cannot be taken away, or a disturbance has no bound.
     """
     constants = model.constant_values
     rows = [substitute(row, constants) for row in model.rhs]
     outputs = [substitute(row, constants) for row in model.output]
     followed = [
-        s for s in model.f if s.name not in unfollowed and (s.rate is not None or s.constant)
+        s
+        for s in model.f
+        if s.name not in (*unfollowed, *divided) and (s.rate is not None or s.constant)
     ]
     free = [s for s in model.d if not s.bounded]
+    free += [s for s in model.f if s.name in divided]
     loose = [
         *(s for s in model.w),
         *(s for s in model.p),
         *(s for s in model.rho if not s.measured),
         *(s for s in model.d if s.bounded),
-        *(s for s in model.f if s not in followed),
+        *(s for s in model.f if s not in followed and s.name not in divided),
     ]
     unbounded = [s for s in loose if not s.bounded]
     if unbounded:
@@ -122,6 +127,7 @@ def extend(model: Plant, unfollowed: Sequence[str] = ()) -> Extended:
         rows.append(moved)
     states = [*model.x, *followed]
     size = len(states)
+    _refuse_shown(outputs, free, model)
     D0, base = _span(rows, free, states, model)
     L0, picked = _left_inverse(D0, outputs, states, free, model)
     T0 = sp.eye(size) - L0 * _slopes(outputs, states, picked)
@@ -179,6 +185,23 @@ def _step(fault: Signal, taken: set[str]) -> Signal | None:
     return Signal(name, sp.Symbol(name, real=True), Role.DISTURBANCE, -rate, rate)
 
 
+def _refuse_shown(outputs: list[sp.Expr], free: list[Signal], model: Plant) -> None:
+    """Refuse signals of any size that stand in an output."""
+    for name, row in zip(model.output_names, outputs, strict=True):
+        seen = [s for s in free if row.has(s.symbol)]
+        if seen:
+            raise StructureError(
+                f"{seen[0].role} {', '.join(s.name for s in seen)} stands in the output {name}, "
+                "where nothing tells one of any size from noise: "
+                + (
+                    "BoundedErrorUIO follows it by its rate"
+                    if seen[0] in model.f
+                    else "declare it with range="
+                ),
+                symbols=tuple(s.name for s in seen),
+            )
+
+
 def _span(
     rows: list[sp.Expr], free: list[Signal], states: list[Signal], model: Plant
 ) -> tuple[sp.Matrix, list[sp.Expr]]:
@@ -187,6 +210,12 @@ def _span(
     zero = {s.symbol: sp.Integer(0) for s in free}
     if not free:
         return sp.zeros(size, 0), rows
+    idle = [s.name for s in free if not any(row.has(s.symbol) for row in rows)]
+    if idle:
+        raise StructureError(
+            f"{free[0].role} {', '.join(idle)} enters no equation of the states",
+            symbols=tuple(idle),
+        )
     names = ", ".join(s.name for s in free)
     base = [row.subs(zero) for row in rows]
     left = [
@@ -195,7 +224,7 @@ def _span(
     ]
     if any(kept.has(sp.nan, sp.zoo, sp.oo) for kept in base):
         raise StructureError(
-            f"unknown input {names}: the equations are not defined where it is zero; declare it "
+            f"{free[0].role} {names}: the equations are not defined where it is zero; declare it "
             "with range=, as a bounded disturbance",
             symbols=tuple(s.name for s in free),
         )
@@ -226,7 +255,7 @@ def _span(
         told = sum((D0[i, c] * left[touched[p]] for c, p in enumerate(pivots)), sp.Integer(0))
         if not is_zero(left[i] - told):
             raise StructureError(
-                f"unknown input {names}: what it does to {states[i].name} is no constant multiple "
+                f"{free[0].role} {names}: what it does to {states[i].name} is no constant multiple "
                 f"of what it does to {', '.join(states[touched[p]].name for p in pivots)}, so no "
                 "constant direction holds it; declare it with range=, as a bounded disturbance",
                 symbols=tuple(s.name for s in free),
@@ -294,13 +323,6 @@ def _left_inverse(
     if k == 0:
         return sp.zeros(size, m), ()
     names = tuple(s.name for s in free)
-    seen = [i for i, row in enumerate(outputs) if row.free_symbols & {s.symbol for s in free}]
-    if seen:
-        raise StructureError(
-            f"unknown input {', '.join(names)} stands in the output {model.output_names[seen[0]]}, "
-            "where nothing tells it from noise: declare it with range=",
-            symbols=names,
-        )
     moving = [s.symbol for s in (*states, *model.w, *model.p, *model.rho, *model.f)]
     constant = [i for i, row in enumerate(outputs) if _is_affine(row, moving)]
     C = _slopes(outputs, states, constant)
@@ -319,7 +341,7 @@ def _left_inverse(
     if rank < k:
         acts = [s.name for i, s in enumerate(states) if any(D0[i, c] != 0 for c in range(k))]
         raise StructureError(
-            f"rank(C D0) = {rank} but unknown input {', '.join(names)} acts in {k} directions, on "
+            f"rank(C D0) = {rank} but {free[0].role} {', '.join(names)} acts in {k} directions, on "
             f"{', '.join(acts)}: no output of constant slopes ({', '.join(model.output_names)}) "
             f"shows it one step later. Measure {acts[0]}, or declare {names[0]} with range=, as a "
             "bounded disturbance",

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -81,6 +82,24 @@ class Equations:
                 low, high = evaluate(self.program, cells[0], cells[1], [k])
             slopes[i, j] = low.min(), high.max()
         return slopes
+
+    @cached_property
+    def bends(self) -> dict[tuple[int, int], FloatArray]:
+        """How slopes by faults vary: bounds of their derivatives over the box, (variables,)."""
+        n = self.n
+        which = [(i, n + j) for j, i in self.invertible]
+        if not which:
+            return {}
+        v, known, rows, _, _ = _symbols(self.plant)
+        slopes = ca.vertcat(*(ca.jacobian(rows[i], v)[j] for i, j in which))
+        second = ca.densify(ca.jacobian(slopes, ca.vertcat(v, known)))
+        program = Program.from_casadi(ca.Function("bends", [v, known], [second]))
+        whole = np.vstack([self.box, self.known_box])
+        with np.errstate(all="ignore"):
+            low, high = evaluate(program, whole[:, :1], whole[:, 1:], [*range(second.numel())])
+        size = np.maximum(np.abs(low), np.abs(high)).reshape(second.shape[1], second.shape[0])
+        size = np.where(np.isnan(size), np.inf, size)
+        return {pair: size[: self.n_v, k] for k, pair in enumerate(which)}
 
     @property
     def invertible(self) -> list[tuple[int, int]]:

@@ -102,17 +102,32 @@ class HalfWidths:
         x = np.minimum(self._strips(x), core[:n])
         late = held[n:].copy()
         for j, i in equations.invertible if "inversion" in cuts else ():
-            low, high = equations.slopes[i, n + j].tolist()
-            if high - low <= 1e-9 * abs(high):
-                rest = np.where(np.arange(slopes.shape[1]) == n + j, 0.0, slopes[i])
-                moved = x[i] + _times(rest, np.concatenate([held[:n], late, fixed]))
-                late[j] = min(late[j], moved / min(abs(low), abs(high)) * _UP)
+            rest = np.where(np.arange(slopes.shape[1]) == n + j, 0.0, slopes[i])
+            halves = np.concatenate([held[:n], late, fixed])
+            told = self._divided(i, j, x[i] + _times(rest, halves), halves)
+            late[j] = min(late[j], told * _UP)
         late = np.minimum(late, core[n:]) if self.delay else late
         now = np.minimum(
             self.ranges[n:], late + self.contractor.rates if "rates" in cuts else np.inf
         )
         now = now if self.delay else np.minimum(now, core[n:])
         return np.append(x, now), np.append(x, late if self.delay else now)
+
+    def _divided(self, row: int, fault: int, half: float, halves: FloatArray) -> float:
+        """Bound the half width of what a row says of a fault, from those of all variables.
+
+        Of n / J with n within `half` of J f, and J in an interval of half width s: at most
+        ``half / |J| + (|f| |J| + half) s / |J|^2``, each with the worst J.
+        """
+        equations, plant = self.contractor.equations, self.contractor.plant
+        place = row, len(self.contractor.domain) + fault
+        ends = np.abs(equations.slopes[place])
+        low, high = float(ends.min()), float(ends.max())
+        spread = min(0.5 * (high - low), _times(equations.bends[place], halves))
+        if spread <= 1e-9 * high:
+            return half / low
+        largest = float(np.abs(plant.box("f")[fault]).max())
+        return half / low + (largest * high + half) * spread / low**2
 
     def _strips(self, x: FloatArray) -> FloatArray:
         """Cut states with what readings say of them."""

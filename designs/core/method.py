@@ -69,7 +69,7 @@ class Contract(Generic[D]):
     core: what the method knows from call to call, see `guard`
     shared: parts of the memory that estimates are made of, or a function of the design
     ode: right-hand side for the core's memory, of methods in continuous time
-    fault_delay, step_covered: see `Observer`
+    fault_delay, step_covered: see `Observer`; the former may be a function of the design
     settle: of a design, half widths of the sets that its core begins from, and a number of calls
         or None: how many calls its bounds take to settle, or that number, and its half widths from
         then on, all infinite where they cannot begin from such sets; None without any bounds
@@ -89,7 +89,7 @@ class Contract(Generic[D]):
     core: Callable[[D], Core]
     shared: tuple[str, ...] | Callable[[D], tuple[str, ...]] = ()
     ode: Callable[[D], ca.Function] | None = None
-    fault_delay: int = 0
+    fault_delay: int | Callable[[D], int] = 0
     step_covered: bool = False
     settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
     quiet: bool = False
@@ -131,7 +131,7 @@ class Contract(Generic[D]):
             half_widths=guard.widths(numbers.half_widths),
             certificate=certificate,
             guarantee=monitored(self.guarantee(design), guard, core.mean_fault),
-            fault_delay=self.fault_delay,
+            fault_delay=guard.delay,
             ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,
             searched=numbers.searched,
@@ -144,7 +144,7 @@ class Contract(Generic[D]):
             plant,
             self.memory(design),
             Watch.of(design.options),
-            self.fault_delay,
+            self.fault_delay(design) if callable(self.fault_delay) else self.fault_delay,
             plant.Ts if plant.Ts is not None else design.Ts,
             getattr(design, "precision", "double"),
             self.shared(design) if callable(self.shared) else self.shared,

@@ -138,6 +138,11 @@ def guarantee(design: GeneralDesign) -> Guarantee:
         claims = [f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds"]
     if extended.free:
         claims.append(f"whatever {', '.join(extended.free)} does")
+    if design.divided:
+        claims.append(
+            f"{', '.join(design.divided)} of the call before is what moved the states, divided by "
+            "its gain: it lies inside the returned interval too"
+        )
     if design.unfollowed:
         claims.append(
             f"{', '.join(design.unfollowed)} cannot be told from the states by the outputs and "

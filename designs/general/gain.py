@@ -267,6 +267,9 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
 
     N = len(data.x)
     AT = data.T @ data.A0
+    if not data.free.size:
+        yield np.zeros((N, 0))
+        return
     for inflation in INFLATIONS:
         for error in ERRORS:
 
@@ -312,6 +315,8 @@ def find_gain(design: GeneralDesign, weights: FloatArray, seed: int = 0) -> Floa
     """
     data = scaled(design)
     m = design.L0.shape[1]
+    if not data.free.size:
+        return np.zeros_like(design.L0)
     weights = weights * data.x
     total = weights.sum()
     weights = weights / total if total > 0 else np.ones(len(weights)) / len(weights)

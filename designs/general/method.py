@@ -43,6 +43,8 @@ WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and
 class GeneralUIO(Method):
     """Guaranteed intervals for plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form.
 
+    faults: "followed" as states, by their rates; "divided": of any size and rate, taken away from
+        the errors and found one call later from what moved the states
     bounds: what holds the errors: peak bounds, an ellipsoid, or an energy gain ("l2"), which holds
         no set
     gamma: contraction per step of the ellipsoid, searched where not given
@@ -65,9 +67,11 @@ class GeneralUIO(Method):
         settle=settling,
         core=build_core,
         shared=("prediction",),
+        fault_delay=lambda design: int(bool(design.divided)),
     )
 
     bounds: Literal["peak", "ellipsoid", "l2"] = "peak"
+    faults: Literal["followed", "divided"] = "followed"
     gamma: Annotated[float | None, CONTRACTION] = None
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
 
@@ -78,6 +82,11 @@ class GeneralUIO(Method):
 
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""
+        if self.faults == "divided":
+            model = read(given, divided=given.names("f"))
+            refuse_hidden(model.design)
+            _refuse_alike(model)
+            return model
         model = read(given)
         lost = refuse_hidden(model.design)
         while lost:
@@ -150,6 +159,18 @@ class GeneralUIO(Method):
             )
         given = dict(zip(names, self.weights, strict=True))
         return np.array([given[name] for name in states.names("x")])
+
+
+def _refuse_alike(model: GeneralModel) -> None:
+    """Refuse faults and unknown inputs that act in fewer directions than there are of them."""
+    free, rank = model.extended.free, model.extended.D0.shape[1]
+    if rank < len(free):
+        raise StructureError(
+            f"{', '.join(free)} act in {rank} direction{'s' if rank > 1 else ''} on the states: "
+            "of any size they cannot be told apart",
+            symbols=free,
+            condition="faults in different directions",
+        )
 
 
 def bound_peak(design: GeneralDesign) -> GeneralDesign:

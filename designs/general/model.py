@@ -42,9 +42,9 @@ def boxes(extended: Extended) -> tuple[FloatArray, FloatArray]:
     return np.where(symmetric, 0.0, centre), np.where(symmetric, box[:, 1], radius)
 
 
-def read(model: Plant, unfollowed: Sequence[str] = ()) -> GeneralModel:
+def read(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] = ()) -> GeneralModel:
     """Extend the plant and bound the Jacobians."""
-    extended = extend(model, unfollowed)
+    extended = extend(model, unfollowed, divided)
     bounds = jacobian_bounds(extended.plant, wrt="joint", rtol=RTOL, effort="fast")
     N, m = extended.L0.shape
     centre, radius = boxes(extended)
@@ -53,6 +53,7 @@ def read(model: Plant, unfollowed: Sequence[str] = ()) -> GeneralModel:
     design = GeneralDesign(
         plant=model,
         unfollowed=tuple(unfollowed),
+        divided=tuple(divided),
         v_centre=centre,
         v_radius=radius,
         L0=np.array(extended.L0.evalf(25).tolist(), dtype=float).reshape(N, m),
@@ -68,12 +69,13 @@ def read(model: Plant, unfollowed: Sequence[str] = ()) -> GeneralModel:
 
 def read_again(design: GeneralDesign) -> GeneralModel:
     """Derive everything anew from the stored equations."""
-    return read(design.plant, design.unfollowed)
+    return read(design.plant, design.unfollowed, design.divided)
 
 
 def without(model: GeneralModel, names: Sequence[str]) -> GeneralModel:
     """Return the model with further faults that count as disturbances."""
-    return read(model.design.plant, (*model.design.unfollowed, *names))
+    design = model.design
+    return read(design.plant, (*design.unfollowed, *names), design.divided)
 
 
 def with_gain(design: GeneralDesign, Z: FloatArray) -> GeneralDesign:

@@ -16,9 +16,9 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 
 
 @lru_cache(maxsize=16)
-def _extended(plant: Plant, unfollowed: tuple[str, ...]) -> Extended:
+def _extended(plant: Plant, unfollowed: tuple[str, ...], divided: tuple[str, ...]) -> Extended:
     """Return the extended plant, one for all designs of a plant."""
-    return extend(plant, unfollowed)
+    return extend(plant, unfollowed, divided)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ class GeneralDesign(Record):
     """Everything that is deployed and proved, in doubles.
 
     plant: the discrete plant
-    unfollowed: faults that count as disturbances, see `extend`
+    unfollowed, divided: faults that count as disturbances, or are taken away, see `extend`
     v_centre, v_radius: box of the disturbances of the extended plant
     L0: what takes unknown inputs away
     Z: the gain; zero where L0 reads
@@ -136,6 +136,7 @@ class GeneralDesign(Record):
 
     plant: Plant
     unfollowed: tuple[str, ...]
+    divided: tuple[str, ...]
     v_centre: Annotated[FloatArray, "n_v"]
     v_radius: Annotated[FloatArray, "n_v"]
     L0: Annotated[FloatArray, "N m"]
@@ -147,10 +148,11 @@ class GeneralDesign(Record):
 
     def check(self) -> None:
         """Refuse faults that the plant does not have."""
-        unknown = [name for name in self.unfollowed if name not in self.plant.names("f")]
-        if unknown or len(set(self.unfollowed)) < len(self.unfollowed):
+        named = (*self.unfollowed, *self.divided)
+        unknown = [name for name in named if name not in self.plant.names("f")]
+        if unknown or len(set(named)) < len(named):
             raise CertificateError(
-                f"the stored design names faults {list(self.unfollowed)}; the plant has "
+                f"the stored design names faults {list(named)}; the plant has "
                 f"{list(self.plant.names('f'))}"
             )
 
@@ -163,7 +165,7 @@ class GeneralDesign(Record):
     @cached_property
     def extended(self) -> Extended:
         """The plant with its faults as states, derived from the stored equations."""
-        return _extended(self.plant, self.unfollowed)
+        return _extended(self.plant, self.unfollowed, self.divided)
 
     @property
     def size(self) -> int:

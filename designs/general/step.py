@@ -311,7 +311,7 @@ def build_core(design: GeneralDesign) -> Core:
             c[:n],
             spread(c, 0.0),
             Ends(low[:n], high[:n]),
-            Ends(spread(low, -FAR), spread(high, FAR)) if names else None,
+            Ends(spread(low, -FAR), spread(high, FAR)) if followed else None,
             moved,
             sound=sound,
         )

@@ -1,7 +1,7 @@
 """`IntervalObserver`: options of the method, and the way from a model to an observer."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -9,10 +9,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive import JacobianBounds
+from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
-from obsynth.designs.core.given import MATRIX, read_gains, read_rows
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
+from obsynth.designs.core.given import MATRIX, read_gains, read_rows, refuse_idle
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.step import Step
+from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.interval.claims import claims, covers, guarantee, numbers
 from obsynth.designs.interval.decoupling import check_detectable, find_transformation
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
@@ -64,9 +69,11 @@ class IntervalObserver(Method):
         One vertex of the polytope for y, w and r together, or (13)-(15), (26) and (32), corrected.
     contraction : bool
         Cut the set of every instant with what the measurement says of it.
-    form : {"corrected", "printed"}
-        ``"printed"`` takes the theorem at its word and is refused with what fails: the widths, or
-        else (32).
+    form : {"general", "corrected", "printed"}, optional
+        ``"corrected"`` is for the class above; plants outside of it go to ``"general"``: peak
+        bounds of the states whatever the faults do, and these found by dividing what moved the
+        states by their gains. ``"printed"`` takes the theorem at its word and is refused with what
+        fails: the widths, or else (32).
     nominal : array_like of shape (n, n), optional
         The nominal A of ``centred=False``.
     precision : {"double", "single"}
@@ -140,7 +147,7 @@ class IntervalObserver(Method):
     centred: bool = True
     bound: Bound = "vertex"
     contraction: bool = True
-    form: Literal["corrected", "printed"] = "corrected"
+    form: Literal["general", "corrected", "printed"] | None = None
     nominal: Matrix = None
     precision: Precision = "double"
     R: Matrix = None
@@ -185,6 +192,35 @@ class IntervalObserver(Method):
             raise ObsynthError('R and Q belong to gains="sylvester"', option="R")
         if self.R is None and self.Q is not None:
             raise ObsynthError("Q is given without R: they belong together", option="Q")
+
+    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer; see `Method.design`."""
+        if self.form == "general":
+            return self._general().design(model)
+        try:
+            return super().design(model, bounds)
+        except StructureError as error:
+            idle = any(
+                getattr(self, option.name) != option.default
+                for option in fields(self)
+                if option.name not in ("form", "horizon", "recovery", "cuts")
+            )
+            if self.form is not None or idle or not isinstance(model, Plant):
+                raise
+            try:
+                return self._general().design(model)
+            except (StructureError, SolverTrouble, InfeasibleDesign) as other:
+                more = f"{error}\n  nor does the general class take it: {other}"
+                raise StructureError(more, **error.facts) from error
+
+    def _general(self) -> GeneralUIO:
+        """Return the method of the general class, faults of any size divided out."""
+        own = ("form", "horizon", "recovery", "cuts")
+        names = [option.name for option in fields(self) if option.name not in own]
+        refuse_idle(self, "the observer of the general class", *names)
+        return GeneralUIO(
+            faults="divided", horizon=self.horizon, recovery=self.recovery, cuts=self.cuts
+        )
 
     def read(self, given: Plant | QuasiLPV) -> IntervalModel:
         """Read the matrices and check the ranks; a form has to be the one of `prefer`."""

@@ -361,14 +361,15 @@ def test_mean_half_widths_are_those_of_another_implementation(name, cuts):
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_promised_half_widths_are_those_of_the_formulas(delay):
-    """By hand: strips, the image, inversions with constant slopes alone, rates, in this order.
+    """By hand: strips, the image, inversions, rates, in this order.
 
     a, b, e: their strips; c: h = h / 2 + h / 10 + h_a / 10, reached in many passes;
-    f: (h_a + h_a / 2 + h_b / 4) 3; g: h_b + h_b / 5; h has a gain that varies.
+    f: (h_a + h_a / 2 + h_b / 4) 3; g: h_b + h_b / 5;
+    h: (h_e + 2 h_c) / 1, and (2 3 + that) h_c / 1^2 more for a gain in [1, 3] that turns with c.
     Mutants: another fault's column; the wider of two; passes that end while one width still falls.
     """
     plant = by_hand()
-    x, late, now = [0.1, 0.2, 0.025, 0.1], [0.6, 0.24, 2.0], [0.61, 1.24, 2.0]
+    x, late, now = [0.1, 0.2, 0.025, 0.1], [0.6, 0.24, 0.30375], [0.61, 1.24, 1.30375]
     inf = np.inf
 
     def widths(cuts, core=None):

@@ -202,3 +202,48 @@ def test_given_gains_are_taken_as_the_field_writes_them():
     assert again.bound.b == pytest.approx(design.bound.b, rel=1e-6)
     with pytest.raises(ObsynthError, match="load away"):
         GeneralUIO().fix(model, {"L": design.L * 1.1})
+
+
+def test_faults_of_any_size_are_divided_out():
+    """Mutants: the fault's set not delayed; its gain at the estimate alone."""
+    observer = ob.IntervalObserver().design(motor())
+    plant = observer.model
+    assert observer.method == "general_uio" and observer.fault_delay == 1
+    assert np.isinf(observer.performance["core_half_widths"][2])
+    assert observer.half_widths[2] < 4
+    rng = np.random.default_rng(7)
+    x, f, before = np.zeros(2), np.zeros(1), np.zeros(1)
+    memory = observer.memory0(x, x_range=[(-1, 1), (-1, 1)])
+    widest = 0.0
+    for k in range(200):
+        u, d = np.array([3 * np.sin(k / 11)]), np.array([0.3 * rng.standard_normal()])
+        w = plant.box("w")[np.arange(3), rng.integers(0, 2, 3)]
+        following, y = plant.function()(x, u, d, f, w, [0.11], [])
+        out = observer.step(memory, u, np.array(y).ravel())
+        memory = out[0]
+        low, high = np.array(out[5]).ravel(), np.array(out[6]).ravel()
+        if k:
+            assert int(out[7]) == 0 and low <= before <= high
+            widest = max(widest, float(0.5 * (high - low)[0]))
+        assert np.all((np.array(out[3]).ravel() <= x) & (x <= np.array(out[4]).ravel()))
+        before, x = f, np.clip(np.array(following).ravel(), -39, 39)
+        f = np.clip(f + 0.08 * np.sign(np.sin(k / 25)), -4, 4)
+    assert widest <= observer.half_widths[2] * (1 + 1e-9)
+
+
+def test_faults_that_cannot_be_divided_out_are_refused_by_name():
+    plant = ob.Plant("alike")
+    x, z = plant.states("x z", range=(-5, 5))
+    plant.faults("g f", range=(-1, 1))
+    g, f = (s.symbol for s in plant.f)
+    plant.dynamics([x * (1 + z / 99) / 2 + f + g, z / 2 + x / 3], Ts=1)
+    plant.outputs([x, z])
+    with pytest.raises(ob.StructureError, match="g, f act in 1 direction"):
+        GeneralUIO(faults="divided").design(plant)
+    shown = ob.Plant("shown")
+    (x,) = shown.states("x", range=(-5, 5))
+    shown.dynamics([x / 2 + sp.sin(x) / 9], Ts=1)
+    shown.outputs([x])
+    shown.sensor_faults("s", of="y1", range=(-1, 1), rate=0.1)
+    with pytest.raises(ob.StructureError, match="sensor fault s stands in the output y1"):
+        GeneralUIO(faults="divided").design(shown)
