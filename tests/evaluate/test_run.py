@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from obsynth.evaluate import SimulationError, simulate
+from obsynth.evaluate import SimulationError, coverage_table, simulate
+from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.run import percent
 
 
@@ -103,6 +104,39 @@ def test_the_domain_names_who_left_and_when(toy_run):
     assert domain.left[1].startswith(
         "the estimate of a is outside its range [-50, 50] at 1 instants"
     )
+
+
+def test_either_of_truth_and_estimate_spoils_the_domain(toy_run):
+    """At one instant of one signal, at either end. Mutants: one of both asked, or any instant."""
+    for name in ("x", "xhat"):
+        for value in (-51.0, 51.0):
+            moved = getattr(toy_run, name).copy()
+            moved[7, 0] = value
+            domain = dataclasses.replace(toy_run, **{name: moved}).domain
+            assert not domain.ok
+            assert len(domain.left) == 1
+            assert domain.left[0].endswith("first k = 7: " + f"{value:g}; at most 1 beyond")
+
+
+def test_tables_of_coverage_say_whether_the_assumptions_were_kept(toy_run):
+    """Of each run, and of all seeds together. Mutants: any of them; what left not asked."""
+    x, upper = toy_run.x.copy(), toy_run.x_upper.copy()
+    x[7, 0], upper[7, 1] = 51.0, -9.0
+    left = dataclasses.replace(toy_run, x=x, seed=1)
+    outside = dataclasses.replace(toy_run, outside=("a reason",), x_upper=upper, seed=2)
+    runs = {"one": [toy_run, left, outside], "two": [toy_run]}
+    rows = coverage_table(runs).rows
+    assert [(row[1], row[2], row[-1]) for row in rows] == [
+        ("one", 3, True),
+        ("one", 1, False),
+        ("one", 2, False),
+        ("two", 3, True),
+    ]
+    found = coverage_summary(runs).rows
+    assert [(row[1], row[2], row[-1]) for row in found] == [("one", 3, False), ("two", 1, True)]
+    # the smallest over the seeds
+    assert found[0][4] == percent(1 - 1 / len(toy_run.t)) == "99.50 %"
+    assert found[1][4] == "100 %"
 
 
 def test_status_bits_are_counted_and_explained(toy_run):

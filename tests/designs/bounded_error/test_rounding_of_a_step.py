@@ -292,3 +292,13 @@ def build(design):
     contract = ob.BoundedErrorUIO.CONTRACT
     observer = contract.certify(design, "lmi").observer()
     return observer.step, observer.memory_layout
+
+
+def test_a_transformation_that_is_not_of_the_stored_matrices_counts(peak):
+    """By its distance from I + E C times the next state. Mutant: taken off instead."""
+    T = peak.T.copy()
+    T[0, 0] += 1e-6
+    state = np.abs(peak.plant.box("x")[0]).max()
+    before, after = of_step(peak), of_step(replace(peak, T=T))
+    assert (after >= 0.0).all()
+    assert before[0] < 1e-10 < 1e-7 * state < after[0] < 1.0
