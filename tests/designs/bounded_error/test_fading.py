@@ -343,3 +343,26 @@ def test_blocks_that_do_not_fit_are_refused(given_peak, blocks, tmp_path):
     path.write_text(json.dumps(stored))
     with pytest.raises(ob.CertificateError, match="blocks"):
         ob.load(path)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "sound"),
+    [
+        ([1, 1, 1, 1], True),
+        ([2, 1, 1], True),
+        ([2, 2], True),
+        ([1, 1, 1], False),
+        ([2, 2, 1], False),
+        ([3, 1], False),
+        ([4], False),
+        ([0, 2, 2], False),
+    ],
+)
+def test_blocks_of_one_or_two_make_up_the_basis(blocks, sound):
+    """Mutants: their sum not asked, or their size."""
+    modes = Modes(np.eye(4), np.eye(4), np.array(blocks))
+    if sound:
+        modes.check()
+    else:
+        with pytest.raises(ob.CertificateError, match="do not make up 4 columns"):
+            modes.check()

@@ -10,7 +10,7 @@ from tapes import NUMPY, tape
 
 import obsynth as ob
 from obsynth.designs.bounded_error.claims import claims, covers, guarantee
-from obsynth.designs.bounded_error.model import Limits
+from obsynth.designs.bounded_error.model import Limits, rounding_allowance
 from obsynth.designs.bounded_error.rounding import of_matrices, of_step
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.rounding import cut_box, rounding_bound
@@ -302,3 +302,19 @@ def test_a_transformation_that_is_not_of_the_stored_matrices_counts(peak):
     before, after = of_step(peak), of_step(replace(peak, T=T))
     assert (after >= 0.0).all()
     assert before[0] < 1e-10 < 1e-7 * state < after[0] < 1.0
+
+
+def test_what_is_assumed_where_nothing_is_proved_is_of_the_largest_state():
+    """2^-40 of it, or of 1, and the unknown input's share. Mutants: the smaller; half of it."""
+    plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
+    largest = np.abs(plant.box("x")).max()
+    assert largest > 1.0
+    assert rounding_allowance(plant).tolist() == [2.0**-40 * largest] * 6
+    assert (rounding_allowance(plant, 1e-3) >= 2.0**-40 * largest).all()
+    small = ob.Plant("small")
+    (x,) = small.states("x", range=(-0.1, 0.2))
+    (d,) = small.unknown_inputs("d", range=(-3, 2))
+    small.dynamics([x / 2 + d], Ts=1)
+    small.outputs([x])
+    assert rounding_allowance(small).tolist() == [2.0**-40]
+    assert rounding_allowance(small, 1e-3)[0] >= 2.0**-40 + 3e-3
