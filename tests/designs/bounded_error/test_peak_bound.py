@@ -4,12 +4,15 @@ import dataclasses
 import json
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import obsynth as ob
 from obsynth.derive.rigour import Enclosure
 from obsynth.designs.bounded_error.peak import bound as peak_bound_module
 from obsynth.designs.bounded_error.peak.attained import attained
@@ -19,6 +22,7 @@ from obsynth.designs.bounded_error.peak.bound import (
     prove_peak,
     small_gain_solution,
 )
+from obsynth.designs.bounded_error.peak.design import _unknown_input_bound
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system, projected_gains
 from obsynth.designs.bounded_error.peak.transient import Transient, transient
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
@@ -507,3 +511,14 @@ def test_projection_of_the_gains_changes_nothing_after_the_first_instant(tanks):
     K_used, F_used = projected_gains(full, wide, tanks.E, tanks.C)
     np.testing.assert_array_equal(K_used, K)
     np.testing.assert_array_equal(F_used, F)
+
+
+def test_an_unknown_input_counts_with_its_larger_end():
+    """What rounding leaves of it in the error. Mutant: the smaller end of an uneven range."""
+    plant = ob.Plant("uneven")
+    x, z = plant.states("x z", range=(-1, 1))
+    d, e, free = plant.unknown_inputs("d e free", range=[(-3, 1), (-1, 2), None])
+    plant.dynamics([x / 2 + d + free, z / 2 + e], Ts=1)
+    plant.outputs([x, z])
+    design: Any = SimpleNamespace(plant=plant)
+    assert _unknown_input_bound(design).tolist() == [3.0, 2.0, 0.0]
