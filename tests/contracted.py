@@ -158,6 +158,20 @@ def corners():
     return plant
 
 
+def turning():
+    """Faults whose gains pass zero inside of the box, one of them with a turn more."""
+    plant = ob.Plant("turning")
+    x, z = plant.states("x z", range=[(-2, 2), (-3, 3)])
+    f, g = plant.process_faults("f g", range=[(-1, 1), (-0.5, 0.4)], rate=[0.1, 0.2])
+    n = plant.disturbances("n1 n2", bound=0.02)
+    plant.dynamics(
+        [R(7, 10) * x + x * f / 2 + z / 20 + n[0], R(6, 10) * z + sp.sin(2 * z) * g / 3 + n[1]],
+        Ts=1,
+    )
+    plant.outputs([x + n[0], z + n[1]])
+    return plant
+
+
 def vessel():
     """In continuous time: strips, ranges and rates."""
     plant = ob.Plant("vessel")
@@ -195,6 +209,7 @@ PLANTS = {
         loose,
         gains,
         corners,
+        turning,
         vessel,
     )
 }

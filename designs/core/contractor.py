@@ -7,7 +7,7 @@ d, w) with y = C x + W2 w:
 - image: ``x_i`` lies in ``Phi_i(X', u', F', W)``, taken at the corners that the proved signs of
   the derivatives name; variables of open sign stay intervals, cut with the mean value form;
 - inversion: ``f'_j`` lies in ``(X_i - Phi_i(X', u', F' with f_j = 0, W)) / J_ij`` (mean value in
-  f_j alone) where zero is not in the range of J_ij;
+  f_j alone) where zero is not in the range of J_ij over the sets;
 - rates: ``f_j`` lies in ``F'_j +- r_j``, and everything in its declared range.
 
 Each keeps every point that the plant's equations and ranges allow. A row with an unbounded unknown
@@ -163,7 +163,8 @@ class Contractor:
     def invert(self, before: Before, X: Ends) -> Ends:
         """Return the faults of the call before, cut with where the states are now."""
         low, high = ca.SX(before.faults.lower), ca.SX(before.faults.upper)
-        for j, i in self.equations.invertible if "inversion" in self.cuts else ():
+        pairs = [*self.equations.invertible, *self.equations.turning]
+        for j, i in pairs if "inversion" in self.cuts else ():
             known = Before(before.states, Ends(low, high), before.known)
             now = Lifted(X.lower[i], X.upper[i])
             found = self.equations.invert(i, j, known, now, self.rounding)

@@ -15,6 +15,8 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 CELLS = 4096
 """Cells of the domain over which the signs of derivatives are proved."""
+SMALLEST = 2.0**-10
+"""Of the largest slope: what a fault is divided by where its slope passes zero in the box."""
 MOST_NODES = 4000
 """Operations of a row and its derivatives above which it is left alone."""
 
@@ -110,6 +112,19 @@ class Equations:
             for i in range(self.n)
             if self.usable[i]
             and not self.slopes[i, self.n + j, 0] <= 0 <= self.slopes[i, self.n + j, 1]
+        ]
+
+    @property
+    def turning(self) -> list[tuple[int, int]]:
+        """Pairs (fault, row) whose slope passes or touches zero in the box, and is bounded."""
+        return [
+            (j, i)
+            for j in range(self.n_f)
+            for i in range(self.n)
+            if self.usable[i]
+            and (i, self.n + j) in self.entries
+            and (j, i) not in self.invertible
+            and np.abs(self.slopes[i, self.n + j]).max() < 0.5 * FAR
         ]
 
     def variables(self, before: Before) -> list[Lifted]:
@@ -225,7 +240,31 @@ class Equations:
             local = lift(self.program, [node], whole, rounding)[0]
             slope = Lifted(ca.fmax(local.lower, low), ca.fmin(local.upper, high), low, high)
         moved = combine("subtract", now, rest, rounding=rounding)
+        if low <= 0.0 <= high:
+            return _either_side(moved, slope, rounding)
         return combine("divide", moved, slope, rounding=rounding)
+
+
+def _either_side(moved: Lifted, slope: Lifted, rounding: Rounding) -> Lifted:
+    """Divide where the slope over the sets is away from zero on one side; no bound elsewhere."""
+    lower, upper = ca.SX(-FAR), ca.SX(FAR)
+    sides = (
+        (moved, slope.lower, slope.upper, slope.high),
+        (
+            Lifted(-moved.upper, -moved.lower, -moved.high, -moved.low),
+            -slope.upper,
+            -slope.lower,
+            -slope.low,
+        ),
+    )
+    for part, least, most, limit in sides:
+        if limit > 0.0:
+            floor = SMALLEST * limit
+            size = Lifted(ca.fmax(least, floor), ca.fmax(most, floor), floor, limit)
+            told = combine("divide", part, size, rounding=rounding)
+            lower = ca.if_else(least >= floor, told.lower, lower)
+            upper = ca.if_else(least >= floor, told.upper, upper)
+    return Lifted(lower, upper)
 
 
 def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:

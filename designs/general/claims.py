@@ -145,8 +145,9 @@ def guarantee(design: GeneralDesign) -> Guarantee:
         )
     if design.unfollowed:
         claims.append(
-            f"{', '.join(design.unfollowed)} cannot be told from the states by the outputs and "
-            "counts as a disturbance within its range: of it the data alone say something"
+            f"{', '.join(design.unfollowed)} counts as a disturbance within its range, since the "
+            "outputs do not tell it from the states, or no gain was found that follows it: the "
+            "data alone say something of it"
         )
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",

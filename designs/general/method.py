@@ -1,8 +1,9 @@
 """The observer of the general class, as the methods that serve it design it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +11,10 @@ from numpy.typing import ArrayLike
 from obsynth.derive import JacobianBounds
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import TINY
-from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.claims import claims, covers, guarantee, numbers
 from obsynth.designs.general.fading import fade
 from obsynth.designs.general.frozen import attained_gain
@@ -35,6 +37,8 @@ from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+WAYS: tuple[Literal["divided", "bounded"], ...] = ("divided", "bounded")
+"""What is done with faults that cannot be followed, in this order."""
 CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
 WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 
@@ -44,7 +48,8 @@ class GeneralUIO(Method):
     """Guaranteed intervals for plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form.
 
     faults: "followed" as states, by their rates; "divided": of any size and rate, taken away from
-        the errors and found one call later from what moved the states
+        the errors and found one call later from what moved the states; "bounded": disturbances
+        within their ranges, told by the data alone
     bounds: what holds the errors: peak bounds, an ellipsoid, or an energy gain ("l2"), which holds
         no set
     gamma: contraction per step of the ellipsoid, searched where not given
@@ -71,7 +76,7 @@ class GeneralUIO(Method):
     )
 
     bounds: Literal["peak", "ellipsoid", "l2"] = "peak"
-    faults: Literal["followed", "divided"] = "followed"
+    faults: Literal["followed", "divided", "bounded"] = "followed"
     gamma: Annotated[float | None, CONTRACTION] = None
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
 
@@ -80,6 +85,22 @@ class GeneralUIO(Method):
         if self.bounds != "ellipsoid":
             refuse_idle(self, f'bounds="{self.bounds}", which has no ellipsoid', "gamma")
 
+    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer; see `Method.design`.
+
+        Where no gain is found that follows the faults, peak bounds divide them out, or hold them
+        for disturbances.
+        """
+        try:
+            return super().design(model)
+        except SolverTrouble as trouble:
+            if self.bounds != "peak" or self.faults != "followed" or not model.f:
+                raise
+            for way in WAYS:
+                with suppress(StructureError, SolverTrouble, InfeasibleDesign):
+                    return replace(self, faults=way).design(model)
+            raise trouble from None
+
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""
         if self.faults == "divided":
@@ -87,7 +108,7 @@ class GeneralUIO(Method):
             refuse_hidden(model.design)
             _refuse_alike(model)
             return model
-        model = read(given)
+        model = read(given, given.names("f") if self.faults == "bounded" else ())
         lost = refuse_hidden(model.design)
         while lost:
             model = without(model, lost)

@@ -276,6 +276,28 @@ def test_outputs_that_are_not_constant_rows_have_no_strip():
     assert [strip is None for strip in found] == [False, *[True] * 5, False]
 
 
+def test_a_fault_is_divided_out_where_its_gain_is_away_from_zero():
+    """Mutants: no look at which side; the division where the sets reach across zero."""
+    plant, contractor = made("turning"), of("turning")
+    assert contractor.equations.invertible == []
+    assert contractor.equations.turning == [(0, 0), (1, 1)]
+    whole = np.diff(plant.box("f"), axis=1)[:, 0]
+    near, wide = (trials(plant, seed=3, count=400, size=s, ends=0.5) for s in (0.05, 1.0))
+    for given, reaches in ((near, False), (wide, True)):
+        late = cut(contractor, given)[1]
+        told = (late[:, 1] - late[:, 0]) / whole[:, None]
+        for j, reach in ((0, 0.8), (1, 0.4)):
+            low, high = given.x[j, 0], given.x[j, 1]
+            size = np.stack([np.abs(low), np.abs(high)])
+            away = (low * high > 0) & (size.min(axis=0) > reach) & (size.max(axis=0) < 1.2)
+            across = given.fair & (low < 0) & (high > 0)
+            if reaches:
+                assert across.sum() > 10
+                assert np.all(late[j][:, across] == given.f[j][:, across])
+            else:
+                assert np.median(told[j, away & given.fair]) < 0.5
+
+
 def test_the_row_that_tells_a_fault_is_looked_up_in_the_column_of_that_fault():
     """Signs of states and faults differ. Mutant: the column of a state in place of it."""
     plant = ob.Plant("signs")

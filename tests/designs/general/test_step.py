@@ -122,7 +122,8 @@ def test_a_fault_that_no_output_tells_from_a_state_counts_as_a_disturbance():
     assert len(model.design.unfollowed) == 1
     observer = ob.BoundedErrorUIO(bounds="peak").design(blind)
     assert np.isfinite(observer.half_widths).all()
-    assert any("cannot be told" in text for text in observer.guarantee.claims)
+    (lost,) = model.design.unfollowed
+    assert any(text.startswith(f"{lost} counts as") for text in observer.guarantee.claims)
 
 
 def marched(observer, steps, seed, cuts_u=1.0):
@@ -247,3 +248,39 @@ def test_faults_that_cannot_be_divided_out_are_refused_by_name():
     shown.sensor_faults("s", of="y1", range=(-1, 1), rate=0.1)
     with pytest.raises(ob.StructureError, match="sensor fault s stands in the output y1"):
         GeneralUIO(faults="divided").design(shown)
+
+
+def vanishing():
+    """A fault whose gain passes zero inside of the box."""
+    plant = ob.Plant("vanishing")
+    (x,) = plant.states("x", range=(-1, 3))
+    (f,) = plant.faults("f", range=(-0.5, 0.5), rate=0.02)
+    w = plant.disturbances("w1 w2", bound=0.01)
+    plant.dynamics([x * sp.Rational(7, 10) + x * f / 2 + w[0] / 2 + sp.Rational(1, 10)], Ts=1)
+    plant.outputs([x + w[1]])
+    return plant
+
+
+def test_a_fault_whose_gain_vanishes_is_divided_out_by_itself():
+    """Mutant: the trouble of the search is told in place of another way."""
+    with pytest.raises(ob.SolverTrouble, match=r"variation comes from .*narrow"):
+        GeneralUIO().solve(GeneralUIO().read(vanishing()))
+    observer = ob.BoundedErrorUIO(bounds="peak").design(vanishing())
+    assert observer.fault_delay == 1
+    assert any("divided by its gain" in text for text in observer.guarantee.claims)
+    plant, rng = observer.model, np.random.default_rng(2)
+    x, f, before = np.array([1.0]), np.zeros(1), np.zeros(1)
+    memory = observer.memory0(x, x_range=[(0.5, 1.5)])
+    widths = []
+    for k in range(300):
+        w = plant.box("w")[np.arange(2), rng.integers(0, 2, 2)]
+        following, y = plant.function()(x, [], [], f, w, [], [])
+        out = observer.step(memory, [], np.array(y).ravel())
+        memory, low, high = out[0], float(out[5]), float(out[6])
+        assert float(out[3]) <= x[0] <= float(out[4])
+        if k:
+            assert low <= before[0] <= high
+            widths.append(0.5 * (high - low))
+        before, x = f, np.array(following).ravel()
+        f = np.clip(f + 0.02 * np.sign(np.sin(k / 30)), -0.5, 0.5)
+    assert np.median(widths) < 0.15
