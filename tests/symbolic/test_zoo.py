@@ -9,14 +9,17 @@ import sympy as sp
 
 from obsynth.symbolic import Plant, PlantError, plants
 from obsynth.symbolic.sxmodel import ParityError
-from zoo import ZOO
+from zoo import GALLERY, ZOO
 
 KINDS = ("x", "u", "d", "f", "w", "p", "rho")
 
 
-@pytest.fixture(params=ZOO)
+ALL = {**ZOO, **GALLERY}
+
+
+@pytest.fixture(params=ALL)
 def plant(request):
-    return ZOO[request.param]()
+    return ALL[request.param]()
 
 
 def points(plant, count, seed=0):
@@ -51,7 +54,7 @@ def derivatives(plant, x, u=()):
 
 
 def test_every_constructor_is_in_the_zoo():
-    covered = {name.split(" ")[0] for name in ZOO}
+    covered = {name.split(" ")[0] for name in ALL}
     assert covered == set(plants.__all__) - {"planar_arm_terms"}
     assert list(plants.__all__) == sorted(plants.__all__)
 
