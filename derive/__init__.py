@@ -35,6 +35,7 @@ from obsynth.derive.polytopes.polytope import polytope_from_vertices as polytope
 from obsynth.derive.polytopes.support import JacobianPolytope as JacobianPolytope
 from obsynth.derive.polytopes.support import jacobian_polytope as jacobian_polytope
 from obsynth.derive.remainder.certify import discretisation_remainder as discretisation_remainder
+from obsynth.derive.remainder.enclosure import enclose_remainder as enclose_remainder
 from obsynth.derive.remainder.flow import FlowError as FlowError
 from obsynth.derive.remainder.result import Remainder as Remainder
 from obsynth.derive.split import Split as Split

@@ -176,12 +176,20 @@ def _plant_section(observer: "Observer") -> _Section:
     if continuous is not None and model.Ts is not None:
         section.add(
             f"<p>Discretised with a sample time of {model.Ts:g} s "
-            f"({html.escape(str(model.discretisation))}). "
+            f"({html.escape(str(model.discretisation))}"
+            f"{_remainder_text(model)}). "
             f"{_subject(observer)}</p>"
         )
     section.add(signals_table(shown)._repr_html_())
     section.add(constants_html(shown))
     return section
+
+
+def _remainder_text(model: Plant) -> str:
+    if model.remainder is None:
+        return ""
+    ranges = ", ".join(f"{s.name} in [{s.lower:.3g}, {s.upper:.3g}]" for s in model.remainder)
+    return f"; what a step leaves out is a disturbance: {html.escape(ranges or 'nothing')}"
 
 
 def _design_section(observers: Mapping[str, "Observer"]) -> _Section:

@@ -60,7 +60,9 @@ def simulate(
     substeps : int, optional
         With ``"step"``: integrate the continuous plant by this many Runge-Kutta
         steps per sample, with inputs, faults and disturbances held. The run
-        then says that the discretisation is outside the guarantee. With
+        then says that the discretisation is outside the guarantee, unless the observer's model
+        carries its remainder: the disturbances of the run then show the remainder that the motion
+        had, within its range. With
         ``"joint"``: steps per sample, 1 by default.
 
     Returns
@@ -89,7 +91,7 @@ def simulate(
             f"engine={engine!r} is not known: use engine='step' or 'joint'.", engine=engine
         )
     truth = Truth(model, observer, substeps)
-    fields = scenario_fields(model, scenario, seed)
+    fields = scenario_fields(truth.model, scenario, seed)
     return _loop(truth, observer, scenario, fields, seed)
 
 
@@ -151,6 +153,7 @@ def _loop(
         plant_x[:] = plant.results[0]
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
+    fields["w"] = truth.remainders(fields, x)
     truths = {"x": x, "y": y, **fields}
     return Run.collect(
         model=model,

@@ -11,6 +11,7 @@ from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.discretise import PREFIX
 
 
 class Truth:
@@ -20,15 +21,21 @@ class Truth:
         self, model: Plant, observer: Observer | FaultDetector, substeps: int | None
     ) -> None:
         own = observer.model
+        if model is own.continuous and substeps is not None and own.remainder is not None:
+            # the plant behind the observer's model, whose remainder follows from its motion
+            model = own
         same_signals(model, own)
         self.model = model
+        self.rest: ca.Function | None = None
         self.Ts = sample_time(own)
         self.outside: tuple[str, ...] = ()
         self._ode = observer.ode
         p = parameters(model)
         if substeps is not None:
-            self._continuous(substeps)
+            self._continuous(substeps, own)
             step = _held(self.plant, self.Ts, substeps, p)
+            if model.remainder:
+                step = self._with_remainder(step, p)
         else:
             self._discrete(own)
             x, u, d, f, w, rho = _symbols(model)
@@ -41,11 +48,40 @@ class Truth:
         self.function = dense(step)
         self.description += parameter_text(model, p)
 
-    def _continuous(self, substeps: int) -> None:
+    def _with_remainder(self, step: ca.Function, p: FloatArray) -> ca.Function:
+        """Let a step of the continuous plant take all disturbances; remember what it adds to ours.
+
+        `rest` maps (x, u, d, f, w, rho) to the next state of the discrete plant without remainder.
+        """
+        x, u, d, f, w, rho = _symbols(self.model)
+        kept = w[: w.numel() - len(self.model.remainder or ())]
+        quiet = ca.vertcat(kept, ca.SX.zeros(w.numel() - kept.numel()))
+        ours = _call(self.model, x, u, d, f, quiet, p, rho)[0]
+        self.rest = ca.Function("rest", [x, u, d, f, w, rho], [ours])
+        moved, y = step(x, u, d, f, kept, rho)
+        return ca.Function("truth", [x, u, d, f, w, rho], [moved, y])
+
+    def remainders(self, fields: dict[str, FloatArray], x: FloatArray) -> FloatArray:
+        """Return the disturbances with the remainder that the motion had, (N + 1, n_w)."""
+        w = fields["w"]
+        if self.rest is None:
+            return w
+        signals = {**fields, "x": x}
+        rows = [signals[kind][:-1].T for kind in ("x", "u", "d", "f", "w", "rho")]
+        moved = x[1:] - np.array(self.rest(*rows)).T
+        carriers = self.model.remainder or ()
+        index = [self.model.names("x").index(s.name.removeprefix(PREFIX)) for s in carriers]
+        found = w.copy()
+        found[:-1, len(self.model.w) - len(carriers) :] = moved[:, index]
+        return found
+
+    def _continuous(self, substeps: int, own: Plant) -> None:
         substeps = substeps_of(substeps)
         self.plant = continuous_plant(self.model, f"substeps={substeps}")
         self.description = f"continuous plant, {substeps} Runge-Kutta steps per sample, inputs held"
-        if self._ode is None:
+        if self.model.remainder is not None and self.model.to_dict() == own.to_dict():
+            self.description += ", what a step leaves out is in the guarantee"
+        elif self._ode is None:
             self.outside = (
                 "the truth is the continuous plant; the error of its discretisation is no declared "
                 "disturbance, so the guarantee does not cover it",

@@ -40,6 +40,9 @@ def plant_html(plant: "Plant") -> str:
     method = f", {plant.discretisation}" if plant.discretisation else ""
     heads = ("signal", "role", "range", "nominal", "rate", "unit")
     rows = [_cells(signal) for signal in plant.signals]
+    rest = {signal.name for signal in plant.remainder or ()}
+    word = f"what a step of {plant.discretisation} leaves out"
+    rows = [(row[0], word, *row[2:]) if row[0] in rest else row for row in rows]
     sensors = zip(plant.output_names, plant.output_ranges, plant.output_units, strict=True)
     rows += [(name, "output", _span(*ends), "", "", unit) for name, ends, unit in sensors]
     cells = "".join(

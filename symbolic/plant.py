@@ -1,7 +1,6 @@
 """The plant: signals, dynamics and outputs as the control engineer writes them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Literal, Self
 
 import casadi as ca
@@ -11,15 +10,21 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic import declarations
 from obsynth.symbolic.declarations import Names, Symbols
+from obsynth.symbolic.discretise import PREFIX, Step, discretised, next_values, sampling_time
 from obsynth.symbolic.display import plant_html, plant_latex
 from obsynth.symbolic.equations import insert_faults, read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.from_casadi import plant_from_casadi
-from obsynth.symbolic.serialize import check_format, fill_from_dict, plant_to_dict, read_field
+from obsynth.symbolic.serialize import (
+    check_format,
+    fill_from_dict,
+    plant_to_dict,
+    read_field,
+    step_from_dict,
+)
 from obsynth.symbolic.signal_table import SignalTable, check_targets
 from obsynth.symbolic.signals import KINDS, LONGEST_NAME, Role, Signal, one_line
-from obsynth.symbolic.sxmodel import SxModel, build_sx, check_method, next_values, sampling_time
-from obsynth.symbolic.text import read_text
+from obsynth.symbolic.sxmodel import SxModel, build_sx
 
 Rows = tuple[sp.Expr, ...]
 
@@ -67,7 +72,8 @@ class Plant:
         self._output_units: tuple[str, ...] = ()
         self._output_ranges: tuple[tuple[float, float], ...] = ()
         self._Ts: sp.Expr | None = None
-        self._origin: tuple[Plant, str] | None = None
+        self._origin: tuple[Plant, Step] | None = None
+        self._remainder: tuple[Signal, ...] | None = None
         self._in_use = False
         self._cache: dict[str, Any] = {}
 
@@ -226,9 +232,14 @@ class Plant:
     def equations(self) -> tuple[Rows, Rows]:
         """Dynamics and outputs as they were given, before faults are inserted."""
         if self._dynamics is None and self._origin is not None:
-            origin, method = self._origin
+            origin, step = self._origin
             symbols = [signal.symbol for signal in self.x]
-            self._dynamics = next_values(method, symbols, origin.equations[0], self._Ts)
+            rows = next_values(step, symbols, origin.equations[0], self._Ts)
+            rest = {signal.name: signal.symbol for signal in self._remainder or ()}
+            self._dynamics = tuple(
+                row + rest.get(f"{PREFIX}{symbol}", 0)
+                for row, symbol in zip(rows, symbols, strict=True)
+            )
         return self._dynamics or (), tuple((self._outputs or {}).values())
 
     @property
@@ -263,8 +274,23 @@ class Plant:
 
     @property
     def discretisation(self) -> str | None:
-        """Name of the method this plant was discretised with."""
+        """Name of the method this plant was discretised with; of ``taylor`` also the order."""
+        return None if self._origin is None else str(self._origin[1])
+
+    @property
+    def step(self) -> Step | None:
+        """The formula of the step this plant was discretised with."""
         return None if self._origin is None else self._origin[1]
+
+    @property
+    def remainder(self) -> tuple[Signal, ...] | None:
+        """Disturbances that carry what the discretisation leaves out; None where nothing does.
+
+        Where it is not None, what holds for this plant holds for the continuous one at the
+        sampling instants: inputs, unknown inputs, disturbances and faults without a rate held over
+        each step, faults with a rate moving within it, states within their ranges.
+        """
+        return self._remainder
 
     def names(self, kind: str) -> tuple[str, ...]:
         """Return the names of a kind of signals: x, u, d, f, w, p or rho."""
@@ -319,28 +345,61 @@ class Plant:
         function: ca.Function = self._cache["function"]
         return function
 
-    def discretise(self, method: str, Ts: Any) -> "Plant":
-        """Return the discrete plant of a continuous one, signals held over a step.
+    def discretise(
+        self,
+        method: str,
+        Ts: Any,
+        order: int | None = None,
+        remainder: Any = None,
+    ) -> "Plant":
+        """Return the discrete plant of a continuous one.
 
         Parameters
         ----------
-        method : {"euler", "rk4"}
+        method : {"euler", "rk4", "taylor"}
+            ``"taylor"``: the Taylor polynomial of the solution.
         Ts : float or sympy.Rational
             Sampling time in s.
+        order : int, optional
+            Of ``"taylor"``, 1 to 6 (1 is Euler's method); by default the lowest after which the
+            remainder no longer matters.
+        remainder : bool, optional
+            Whether what the step leaves out becomes a disturbance ``remainder_x`` of every state
+            x, with a proved range (see ``discretisation_remainder``), so that what holds for the
+            discrete plant holds for the continuous one at the sampling instants. Faults with a
+            rate may move within a step, everything else is held over it. By default for
+            ``"taylor"`` only.
 
         Returns
         -------
         Plant
-            Dynamics, D, W1 and rates are multiplied by Ts; the outputs are the same.
+            D, W1 and rates are multiplied by Ts; the outputs are the same. ``.remainder`` lists
+            the disturbances that carry a remainder.
+
+        Raises
+        ------
+        PlantError
+            A plant that is discrete already; a kink, which has no Taylor polynomial of order 2.
+        UnboundedError, FlowError
+            A signal without a range, or solutions that cannot be enclosed over a step.
+
+        Examples
+        --------
+        >>> from obsynth import Plant
+        >>> plant = Plant("decay")
+        >>> (x,) = plant.states("x", range=(1, 2))
+        >>> plant.dynamics([-x]); plant.outputs([x])
+        ('y1',)
+        >>> step = plant.discretise("taylor", Ts=0.1, order=2)
+        >>> step.names("w"), step.remainder[0].lower > -0.1**3 / 3 * 1.1
+        (('remainder_x',), True)
         """
-        if self.check().Ts is not None:
-            raise PlantError(f"plant {self.name!r} is discrete already (Ts = {self.Ts:g} s)")
         result = Plant(self.name)
-        result._origin, result._Ts = (self, check_method(method)), sampling_time(Ts)
-        h = float(result._Ts)
-        result._table = SignalTable(
-            [replace(s, rate=None if s.rate is None else s.rate * h) for s in self.signals]
+        step, result._Ts, signals, result._remainder = discretised(
+            self, method, Ts, order, remainder
         )
+        result._origin = self, step
+        result._table = SignalTable([*signals, *(result._remainder or ())])
         result._outputs, result._output_units = self._outputs, self._output_units
         result._output_ranges = self._output_ranges
         self._in_use = result._in_use = True
@@ -358,9 +417,8 @@ class Plant:
         check_format(data)
         if "continuous" in data:
             discretise = read_field(data, "discretise", dict)
-            step = read_text(read_field(discretise, "Ts", str), {})
             original = cls.from_dict(read_field(data, "continuous", dict))
-            return original.discretise(read_field(discretise, "method", str), step)
+            return original.discretise(**step_from_dict(discretise))
         plant = cls(read_field(data, "name", str))
         fill_from_dict(plant, data)
         return plant

@@ -193,6 +193,12 @@ class Scenario:
             values = self._called("disturbances", [values(rng, k) for k in range(samples)])
         else:
             values = self._samples("disturbances")
+        rest = np.array([(s.lower, s.upper) for s in model.remainder or ()]).reshape(-1, 2)
+        given = np.asarray(values, dtype=float) if np.ndim(values) == 2 else None
+        if given is not None and len(rest) and given.shape[1] + len(rest) == len(model.w):
+            # what a discretisation leaves out is nobody's to give
+            middle = np.tile(rest.mean(axis=1), (len(given), 1))
+            values = np.hstack([given, middle])
         return self._fit("disturbances", values, model.names("w"))
 
     def _samples(self, field: str) -> Any:

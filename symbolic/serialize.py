@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import sympy as sp
 
+from obsynth.symbolic.discretise import PREFIX
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal, is_name
 from obsynth.symbolic.text import read_text, write_text
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
 
 
 FORMAT = "obsynth plant 1"
-"""Value of ``format``; the number grows when an older reader would misunderstand."""
+WITH_REMAINDER = "obsynth plant 2"
+"""Values of ``format``; the number grows when an older reader would misunderstand."""
 
 _REQUIRED = object()
 
@@ -26,12 +28,18 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
     Expressions are text, infinite bounds null, and a discretised plant is its continuous
     original with method and sampling time, so that nothing is rounded on the way.
     """
-    original = plant.check().continuous
+    original, formula = plant.check().continuous, plant.step
     step = None if plant.exact_Ts is None else write_text(plant.exact_Ts)
-    if original is not None:
+    if original is not None and formula is not None:
+        how: dict[str, Any] = {"method": formula.method, "Ts": step}
+        if formula.method == "taylor":
+            how["order"] = formula.order
+        if plant.remainder is not None:
+            kept = {s.name.removeprefix(PREFIX): [s.lower, s.upper] for s in plant.remainder}
+            how["remainder"] = kept
         return {
-            "format": FORMAT,
-            "discretise": {"method": plant.discretisation, "Ts": step},
+            "format": FORMAT if plant.remainder is None else WITH_REMAINDER,
+            "discretise": how,
             "continuous": plant_to_dict(original),
         }
     dynamics, outputs = ([_row_text(row, plant) for row in rows] for rows in plant.equations)
@@ -57,8 +65,38 @@ def plant_to_dict(plant: "Plant") -> dict[str, Any]:
 def check_format(data: Mapping[str, Any]) -> None:
     """Refuse data of another format."""
     stored = read_field(data, "format", str)
-    if stored != FORMAT:
-        raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {FORMAT!r}")
+    step = data.get("discretise")
+    kept = isinstance(step, Mapping) and "remainder" in step
+    known = WITH_REMAINDER if kept else FORMAT
+    if stored != known:
+        raise PlantError(f"stored plant: the format is {stored!r}, this reader knows {known!r}")
+
+
+def step_from_dict(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Read how a plant was discretised: what ``Plant.discretise`` takes."""
+    kept: Any = data.get("remainder")
+    if isinstance(kept, Mapping):
+        kept = {name: _read_pair(name, pair) for name, pair in kept.items()}
+    elif kept not in (None, False):
+        raise PlantError(
+            f"stored plant: the remainder is a table of ranges, not {repr(kept)[:100]}"
+        )
+    return {
+        "method": read_field(data, "method", str),
+        "Ts": read_text(read_field(data, "Ts", str), {}),
+        "order": read_field(data, "order", int, None),
+        "remainder": False if kept is None else kept,
+    }
+
+
+def _read_pair(name: str, pair: Any) -> tuple[float, float]:
+    finite = isinstance(pair, list) and len(pair) == 2 and all(type(v) is float for v in pair)
+    if not finite or not -math.inf < pair[0] <= pair[1] < math.inf:
+        raise PlantError(
+            f"stored plant: the remainder of {str(name)[:100]} is {repr(pair)[:100]}, not a range",
+            symbol=str(name)[:100],
+        )
+    return pair[0], pair[1]
 
 
 def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""A plant as CasADi SX expressions, its discretisation, and the check that it is what was typed.
+"""A plant as CasADi SX expressions, and the check that it is what was typed.
 
 Is the derived form of an equation the same function as what the user typed?
 
@@ -22,59 +22,12 @@ from sympy.core.relational import Relational
 from sympy.logic.boolalg import And, Not, Or
 
 from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.discretise import PREFIX, Step, composed
 from obsynth.symbolic.errors import ObsynthError, PlantError
-from obsynth.symbolic.signals import KINDS, exact_number
+from obsynth.symbolic.signals import KINDS
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
-
-
-METHODS = ("euler", "rk4")
-"""The methods by name."""
-
-
-def sampling_time(Ts: Any) -> sp.Expr:
-    """Read a sampling time in seconds."""
-    number = exact_number(Ts, "Ts")
-    if not number.is_positive:
-        raise PlantError(f"the sampling time Ts={Ts} is not positive", Ts=Ts)
-    if isinstance(number, sp.Float):
-        exact = sp.Rational(float(number))
-        return exact if exact.q <= 2**20 else number
-    return number
-
-
-def check_method(method: str) -> str:
-    """Return the name of a method, or refuse it with the names there are."""
-    if method not in METHODS:
-        raise PlantError(
-            f"discretisation {method!r} is unknown; methods are {', '.join(METHODS)}",
-            method=method,
-        )
-    return method
-
-
-def next_values(
-    method: str, x: Sequence[sp.Symbol], rates: Sequence[sp.Expr], step: sp.Expr
-) -> tuple[sp.Expr, ...]:
-    """Return the next value of every state, everything else held over the step."""
-    state, derivative = sp.Matrix(x), sp.Matrix(rates)
-    if method == "euler":
-        return tuple(state + step * derivative)
-
-    def at(point: sp.Matrix) -> sp.Matrix:
-        return derivative.xreplace(dict(zip(x, point, strict=True)))
-
-    return tuple(runge_kutta(at, state, step))
-
-
-def runge_kutta(rates: Callable[[Any], Any], x: Any, step: Any) -> Any:
-    """Return one step of the classical formula of order four."""
-    k1 = rates(x)
-    k2 = rates(x + step / 2 * k1)
-    k3 = rates(x + step / 2 * k2)
-    k4 = rates(x + step * k3)
-    return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 POINTS = 64
@@ -314,14 +267,14 @@ class SxModel:
 def build_sx(plant: Plant, constants: Literal["value", "symbol"]) -> SxModel:
     """Convert a complete plant to SX and compare the two forms at random points.
 
-    A Runge-Kutta step is composed in SX from the derivatives of the continuous plant,
+    A step of higher order is composed in SX from the derivatives of the continuous plant,
     which keeps the graph small; these are what is compared then.
     """
     if constants not in ("value", "symbol"):
         raise PlantError(f"constants= is 'value' or 'symbol', not {constants!r}")
-    original = plant.continuous
-    if original is not None and plant.Ts is not None and plant.discretisation == "rk4":
-        return _composed(original.sx(constants), plant.Ts)
+    original, step = plant.continuous, plant.step
+    if original is not None and step is not None and step.method != "euler":
+        return _composed(original.sx(constants), plant, step)
     columns = {kind: [ca.SX.sym(name) for name in plant.names(kind)] for kind in KINDS}
     values = plant.constant_values
     columns["c"] = []
@@ -350,12 +303,12 @@ def build_sx(plant: Plant, constants: Literal["value", "symbol"]) -> SxModel:
     return SxModel(name=name, rhs=_column(found[:n]), y=_column(found[n:]), **stacked)
 
 
-def _composed(model: SxModel, step: float) -> SxModel:
-    """Return the model whose right-hand side is one Runge-Kutta step of another's."""
-    others = [getattr(model, kind) for kind in (*KINDS, "c") if kind != "x"]
-    rates = ca.Function("rates", [model.x, *others], [model.rhs])
-    rhs = runge_kutta(lambda x: rates(x, *others), model.x, step)
-    return replace(model, rhs=rhs)
+def _composed(model: SxModel, plant: Plant, step: Step) -> SxModel:
+    """Return the model of a step of another's right-hand side, with its remainder."""
+    rhs = composed(step, model.x, model.rhs, plant.Ts)
+    carriers = {signal.name: ca.SX.sym(signal.name) for signal in plant.remainder or ()}
+    rest = [carriers.get(PREFIX + name, 0) for name in plant.names("x")]
+    return replace(model, rhs=rhs + ca.vertcat(*rest), w=ca.vertcat(model.w, *carriers.values()))
 
 
 def _identifier(name: str) -> str:

@@ -38,8 +38,8 @@ from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.plant import Plant
-from obsynth.symbolic.sxmodel import runge_kutta
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 _STEPS = (sp.floor, sp.ceiling, sp.Mod)

@@ -9,6 +9,7 @@ import sympy as sp
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.discretise import Step
 from obsynth.symbolic.plant import Plant
 
 
@@ -20,8 +21,8 @@ class Remainder:
     ----------
     plant : Plant
         The continuous plant.
-    method : str
-        ``"euler"`` or ``"rk4"``.
+    formula : Step
+        The formula of the step.
     exact_Ts : sympy.Expr
         Sampling time in s, as it was given.
     lower, upper : ndarray, shape (n,)
@@ -33,8 +34,8 @@ class Remainder:
     flow_lower, flow_upper : ndarray, shape (n,)
         A box that no solution from the plant's box leaves within a step.
     order : int
-        Power of Ts of the bound: 2 for Euler, 5 for Runge-Kutta, less where the dynamics have
-        kinks inside the box.
+        Power of Ts of the bound: 2 for Euler, 5 for Runge-Kutta, one more than its own for a
+        Taylor polynomial, less where the dynamics have kinks inside the box.
     assumed : dict of str to (float, float)
         Ranges that were given for this purpose and are not the plant's own.
     status : Status
@@ -42,7 +43,7 @@ class Remainder:
     """
 
     plant: Plant
-    method: str
+    formula: Step
     exact_Ts: sp.Expr
     lower: FloatArray
     upper: FloatArray
@@ -54,6 +55,11 @@ class Remainder:
     order: int
     assumed: dict[str, tuple[float, float]]
     status: Status
+
+    @property
+    def method(self) -> str:
+        """``"euler"``, ``"rk4"``, or ``"taylor"`` and the order."""
+        return str(self.formula)
 
     @property
     def Ts(self) -> float:
@@ -94,7 +100,12 @@ class Remainder:
         DerivationError
             A name that is taken.
         """
-        step = self.plant.discretise(self.method, self.exact_Ts)
+        step = self.plant.discretise(
+            self.formula.method,
+            self.exact_Ts,
+            self.formula.order if self.formula.method == "taylor" else None,
+            remainder=False,
+        )
         result = Plant(step.name)
         taken = {s.name for s in step.signals} | set(step.output_names)
         signals = [

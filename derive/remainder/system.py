@@ -12,8 +12,8 @@ from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rules import JUMPS
 from obsynth.derive.rigour import enclose_number
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.discretise import Step, composed
 from obsynth.symbolic.plant import Plant
-from obsynth.symbolic.sxmodel import runge_kutta
 
 _HELD = ("u", "d", "f", "w", "p", "rho")
 
@@ -28,6 +28,7 @@ class System:
     lower, upper: the box
     constants: constants of the plant
     constant_box: their enclosures
+    rates: how fast held signals may move after all, per second; 0 where they do not
     """
 
     x: ca.SX
@@ -40,6 +41,7 @@ class System:
     upper: FloatArray
     constants: ca.SX
     constant_box: list[tuple[float, float]]
+    rates: FloatArray
 
     @property
     def variables(self) -> ca.SX:
@@ -98,8 +100,10 @@ class System:
         return bool(found.rough.any())
 
 
-def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None) -> System:
-    """Read a continuous plant."""
+def system(
+    plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None, moving: bool = False
+) -> System:
+    """Read a continuous plant, faults with a rate moving within a step or held."""
     if plant.check().Ts is not None:
         raise DerivationError(
             f"plant {plant.name!r} is discrete (Ts = {plant.Ts:g} s); the remainder belongs to the "
@@ -115,7 +119,7 @@ def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None
         raise DerivationError(
             f"ranges= names {', '.join(unknown)}, which the plant does not have", symbols=unknown
         )
-    lower, upper, held, columns = [], [], [], []
+    lower, upper, held, columns, rates = [], [], [], [], []
     for kind in ("x", *_HELD):
         for signal, element in zip(
             getattr(plant, kind), ca.vertsplit(getattr(sx, kind)), strict=True
@@ -141,6 +145,8 @@ def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None
             if kind != "x":
                 held.append(signal.name)
                 columns.append(element)
+                fixed = signal.rate is None or signal.constant or not moving
+                rates.append(0.0 if fixed else float(signal.rate))
     return System(
         sx.x,
         ca.vertcat(*columns) if columns else ca.SX(0, 1),
@@ -152,6 +158,7 @@ def system(plant: Plant, ranges: Mapping[str, tuple[float, float]] | None = None
         np.array(upper),
         sx.c,
         [enclose_number(value) for value in plant.constant_values.values()],
+        np.array(rates, dtype=float),
     )
 
 
@@ -163,16 +170,9 @@ def time_derivatives(dynamics: System, order: int) -> list[ca.SX]:
     return found
 
 
-def step_derivatives(dynamics: System, method: str, order: int) -> list[ca.SX]:
-    """Form the derivatives of a method's step by its length s, as functions of x and s."""
-    if method == "euler":
-        return [dynamics.rhs] + [ca.SX.zeros(dynamics.x.numel())] * (order - 1)
-    rates = ca.Function("rates", [dynamics.x, dynamics.v, dynamics.constants], [dynamics.rhs])
-
-    def at(x: ca.SX) -> ca.SX:
-        return rates(x, dynamics.v, dynamics.constants)
-
-    value = runge_kutta(at, dynamics.x, dynamics.s)
+def step_derivatives(dynamics: System, step: Step, order: int) -> list[ca.SX]:
+    """Form the derivatives of a step by its length s, as functions of x and s."""
+    value = composed(step, dynamics.x, dynamics.rhs, dynamics.s)
     found = []
     for _ in range(order):
         value = ca.cse(ca.densify(ca.jacobian(value, dynamics.s)))

@@ -93,7 +93,8 @@ def _stages(tree: Tree, A: list[list[Fraction]]) -> list[Fraction]:
 
 def _coefficient(tree: Tree, method: str) -> Fraction:
     """Return k! times what the solution has more of F(tree) than a step, k nodes."""
-    A, b = TABLEAUS[method]
+    # a Taylor polynomial has nothing of the orders that it leaves out
+    A, b = TABLEAUS.get(method, ([], []))
     weight = sum((c * w for c, w in zip(b, _stages(tree, A), strict=True)), Fraction(0))
     difference = Fraction(1, _density(tree)) - weight
     return factorial(_nodes(tree)) * difference / _symmetry(tree)

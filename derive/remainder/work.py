@@ -14,6 +14,7 @@ from obsynth.derive.remainder.trees import difference_term
 from obsynth.derive.rigour import Interval, enclose_number, up
 from obsynth.derive.rigour.interval import add, multiply, subtract
 from obsynth.symbolic.arrays import BoolArray, FloatArray
+from obsynth.symbolic.discretise import Step
 
 _QUARTERS = 4
 _PARTS = 16
@@ -37,24 +38,24 @@ class Work:
     """One plant, method and step, with the box that solutions stay in until every quarter.
 
     dynamics: the plant
-    method: the method
+    formula: the formula of the step
     Ts: sampling time
     flows: flow boxes until the end of every quarter of the step
     effort: how many pieces hulls are made of
     """
 
     dynamics: System
-    method: str
+    formula: Step
     Ts: sp.Expr
     flows: list[tuple[FloatArray, FloatArray]]
     effort: str
 
     @classmethod
-    def prepare(cls, dynamics: System, method: str, Ts: sp.Expr, effort: str) -> "Work":
+    def prepare(cls, dynamics: System, formula: Step, Ts: sp.Expr, effort: str) -> "Work":
         """Enclose the flow of a plant over a step and its parts."""
         shares = [sp.Rational(k, _QUARTERS) for k in range(1, _QUARTERS + 1)]
         flows = [flow_box(dynamics, enclose_number(share * Ts)[1]) for share in shares]
-        return cls(dynamics, method, Ts, flows, effort)
+        return cls(dynamics, formula, Ts, flows, effort)
 
     @property
     def step(self) -> float:
@@ -81,7 +82,7 @@ class Work:
 
     def of_step(self, order: int) -> ca.SX:
         """Return the derivative of the step by its length, of an order."""
-        return step_derivatives(self.dynamics, self.method, order)[-1]
+        return step_derivatives(self.dynamics, self.formula, order)[-1]
 
     def continuous(self, order: int) -> bool:
         """Tell whether the derivatives of an order, of solution and step, have no jump."""
@@ -94,7 +95,7 @@ class Work:
         """Return the terms of order q and q + 1 of the remainder, as functions of the start."""
         total = ca.SX(len(self.dynamics.names), 1)
         for k in (order, order + 1):
-            term = difference_term(self.dynamics.x, self.dynamics.rhs, self.method, k)
+            term = difference_term(self.dynamics.x, self.dynamics.rhs, self.formula.method, k)
             total = total + float(self.Ts**k / sp.factorial(k)) * term
         return ca.cse(total)
 
@@ -107,7 +108,8 @@ class Work:
         pieces = PIECES[self.effort]
         along = self.dynamics.program(self.along(order))
         along_cuts = plan_cuts(along, self.flow, pieces)
-        steps = None if self.method == "euler" else self.dynamics.program(self.of_step(order))
+        gone = self.formula.is_polynomial and order > self.formula.order
+        steps = None if gone else self.dynamics.program(self.of_step(order))
         step_cuts = [] if steps is None else plan_cuts(steps, self.whole_box, pieces)
         n = len(self.dynamics.names)
         found = np.zeros(n), np.zeros(n)
@@ -131,6 +133,29 @@ class Work:
                     sub_box={},
                 )
         return found
+
+    def moved(self, order: int) -> FloatArray:
+        """Bound what moving signals add to the remainder of Taylor's formula of an order, (n,).
+
+        Along x' = f(x, v), v' = rho the derivative of g_k, the k-th one at held v, is g_(k+1) plus
+        the slope of g_k by v times rho: parts in k < order add the integral of
+        (Ts - s)^k / k! (dg_k/dv rho)(s), for any rho(s) within the rates.
+        """
+        n, total = len(self.dynamics.names), np.zeros(len(self.dynamics.names))
+        moving = np.flatnonzero(self.dynamics.rates)
+        if not len(moving):
+            return total
+        pieces = PIECES[self.effort]
+        for k in range(1, order):
+            slopes = ca.jacobian(self.along(k), self.dynamics.v[moving.tolist()])
+            program = self.dynamics.program(ca.vec(ca.densify(slopes)))
+            low, high = hull_over_pieces(program, self.flow, pieces)
+            size = np.maximum(np.abs(low), np.abs(high)).reshape(len(moving), n)
+            for column, rate in zip(size, self.dynamics.rates[moving], strict=True):
+                term = up(up(column * rate) * step_factor(self.Ts, k + 1)[1])
+                # what does not enter adds nothing, not even a rounding
+                total = np.where(column == 0.0, total, up(total + term))
+        return total
 
     def attained(self, points: FloatArray, order: int) -> Interval:
         """Enclose the remainder at points, by the leading terms and a tail over their solutions."""

@@ -24,6 +24,7 @@ from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import plain
+from obsynth.designs.core.remainder import of_continuous, prove_remainder
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
@@ -106,6 +107,7 @@ class Contract(Generic[D]):
             try:
                 fresh = self.read_again(design) if model is None else model
                 claims += self.covers(design, fresh)
+                claims += prove_remainder(design.plant)
             except ObsynthError as error:
                 said = "what was read of the plant can be derived from the stored equations"
                 claims.append(Claim("derivation", said, False, -np.inf, str(error)))
@@ -130,7 +132,9 @@ class Contract(Generic[D]):
             performance=performance,
             half_widths=guard.widths(numbers.half_widths),
             certificate=certificate,
-            guarantee=monitored(self.guarantee(design), guard, core.mean_fault),
+            guarantee=monitored(
+                of_continuous(self.guarantee(design), plant), guard, core.mean_fault
+            ),
             fault_delay=guard.delay,
             ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,

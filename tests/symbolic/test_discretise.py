@@ -5,8 +5,8 @@ import pytest
 import sympy as sp
 
 from obsynth.symbolic import Plant, PlantError
+from obsynth.symbolic.discretise import runge_kutta, sampling_time
 from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
-from obsynth.symbolic.sxmodel import runge_kutta, sampling_time
 
 
 def plant_with_everything():

@@ -89,7 +89,7 @@ def quasi_lpv(
     True
     """
     model.check()
-    if model.discretisation not in (None, "euler"):
+    if model.discretisation == "rk4":
         raise StructureError(
             f"a step of {model.discretisation} is no sum of terms that could be divided; use "
             "discretise('euler', Ts), the continuous plant, or jacobian_bounds",

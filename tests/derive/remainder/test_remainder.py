@@ -15,6 +15,7 @@ from obsynth.derive.remainder.result import Remainder
 from obsynth.derive.remainder.system import step_derivatives, system, time_derivatives
 from obsynth.derive.remainder.trees import difference_term, trees
 from obsynth.symbolic import Plant, plants
+from obsynth.symbolic.discretise import step_formula
 
 TANK = {"d": (-0.1, 0.1), "f1": (-1.0, 1.0), "f2": (-1.0, 1.0)}
 CASES = {
@@ -305,12 +306,24 @@ def test_trees_equal_the_difference_of_two_derivatives(name, method, orders):
     constants = [0.5 * (a + b) for a, b in dynamics.constant_box]
     for order in orders:
         direct = time_derivatives(dynamics, order)[-1] - ca.substitute(
-            step_derivatives(dynamics, method, order)[-1], dynamics.s, 0
+            step_derivatives(dynamics, step_formula(method), order)[-1], dynamics.s, 0
         )
         term = difference_term(dynamics.x, dynamics.rhs, method, order)
         function = ca.Function("both", [dynamics.variables, dynamics.constants], [term, direct])
         a, b = (np.array(v).ravel() for v in function([*point, 0.0], constants))
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(b).max())
+
+
+def test_a_taylor_polynomial_leaves_out_whole_derivatives():
+    build, _, given = CASES["van der Pol"]
+    dynamics = system(build(), assumed(build(), given))
+    for order in (3, 4):
+        term = difference_term(dynamics.x, dynamics.rhs, "taylor", order)
+        whole = time_derivatives(dynamics, order)[-1]
+        function = ca.Function("both", [dynamics.variables, dynamics.constants], [term, whole])
+        middle = [0.5 * sum(ends) for ends in dynamics.constant_box]
+        values = function([*dynamics.upper, 0.0], middle)
+        np.testing.assert_allclose(*(np.array(v) for v in values), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
