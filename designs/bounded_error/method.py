@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive import JacobianBounds, Split
+from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
+from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
 from obsynth.designs.bounded_error.claims import (
     claims,
     covers,
@@ -43,10 +44,14 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.lmi import Problem
-from obsynth.symbolic import Plant
+from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+# What the general class has no use for.
+IDLE = ("multipliers", "error", "post", "objective")
+# Beyond, one block with multipliers is solved in place of one per vertex.
+FEW_VERTICES = 16
 # Keeps sums of rounded weights at or below 1.
 BELOW_ONE = 1.0 - 2.0**-48
 CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
@@ -81,11 +86,14 @@ class BoundedErrorUIO(Method):
         max trace(P) (the paper's (49), which does not make the bounds small).
     weights : sequence of float, optional
         Of the components (states, then faults), for ``trace_inverse`` and peak
-        bounds; 1 by default.
+        bounds; by default 1, in the general class 1 / half range (there of half widths,
+        for ellipsoids of their squares).
     form : {"general", "corrected", "printed", "repaired"}, optional
         "general": plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, in current form
-        (the paper's observer predicts first); by default for peak bounds of a plant. The paper's
-        class has: the direct LMI at the vertices of the exact Jacobian set ("corrected"); (51) as
+        (the paper's observer predicts first), with one multiplier for every column of every
+        nonlinearity in place of vertices; by default for peak bounds of a plant, and for ellipsoids
+        where the paper's class does not have it or has more than 16 vertices. The paper's class
+        has: the direct LMI at the vertices of the exact Jacobian set ("corrected"); (51) as
         printed; (51) with diagonal multipliers, which is valid row by row.
 
     Raises
@@ -150,8 +158,14 @@ class BoundedErrorUIO(Method):
 
     def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
         """Design, prove and return the observer; see `Method.design`."""
-        general = self._general(model)
-        return super().design(model, bounds) if general is None else general.design(model)
+        if self.form == "general":
+            return self._as_general().design(model if isinstance(model, Plant) else model.model)
+        if self.form is not None or not isinstance(model, Plant):
+            return super().design(model, bounds)
+        if self.bounds == "peak":
+            return self._as_general().design(model)
+        found = self._of_the_paper(model, bounds)
+        return self._beyond(model) if found is None else super().design(*found)
 
     def analyse(
         self,
@@ -164,17 +178,40 @@ class BoundedErrorUIO(Method):
             return self._as_general().analyse(model, gains)
         return super().analyse(model, gains, bounds)
 
-    def _general(self, model: Plant | Split) -> GeneralUIO | None:
-        """Return the method of the general class where it designs for the model."""
-        if self.form == "general" or (self.form is None and self.bounds == "peak"):
-            return self._as_general() if isinstance(model, Plant) else None
-        return None
+    def _of_the_paper(
+        self, model: Plant, bounds: JacobianBounds | None
+    ) -> tuple[Split, JacobianBounds] | None:
+        """Split a plant of the paper's class with few vertices; None for others.
+
+        Options that speak of the paper's class alone keep it, and its refusals, in place.
+        """
+        named = [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
+        try:
+            self.CLASS.check(model)
+            parts = split(model)
+        except (StructureError, DerivationError):
+            if named:
+                raise
+            return None
+        found = jacobian_bounds(parts) if bounds is None else bounds
+        few = bool(named) or found.family.vertex_count <= FEW_VERTICES
+        return (parts, found) if few else None
+
+    def _beyond(self, model: Plant) -> Observer:
+        """Design for the general class; a state that needs a range is named by the paper's."""
+        try:
+            return self._as_general().design(model)
+        except UnboundedError:
+            replace(self.CLASS, forbids={}, faults=tuple(Role)).check(model)
+            raise
 
     def _as_general(self) -> GeneralUIO:
-        idle = ("gamma", "multipliers", "error", "post", "objective")
-        refuse_idle(self, "the observer of the general class", *idle)
+        refuse_idle(self, "the observer of the general class", *IDLE)
+        if self.bounds == "peak":
+            refuse_idle(self, "peak bounds", "gamma")
         return GeneralUIO(
-            bounds="peak",
+            bounds=self.bounds,
+            gamma=self.gamma,
             weights=self.weights,
             horizon=self.horizon,
             recovery=self.recovery,

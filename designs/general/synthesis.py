@@ -5,7 +5,8 @@ identity. Scaled by ranges alone, a solver has called values optimal that were a
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -211,44 +212,66 @@ def solve_ellipsoid(
     gain: FloatArray | None = None,
 ) -> Found:
     """Find an ellipsoid; over gamma, where not given, that of the least sum of weighted widths."""
-    stated = state(design, measured)
+    stated = [state(design, measured)]
     refusals: list[Exception] = []
 
     def solve(gamma: float) -> tuple[float, Found] | None:
-        problem = ellipsoid_problem(stated, gamma, weights, gain)
         try:
-            solution = _solved(problem)
-            found = recovered(stated, solution, gamma, 0.0, gain)
+            where, solution = _near_units(
+                design, stated[-1], lambda s: ellipsoid_problem(s, gamma, weights, gain)
+            )
+            found = recovered(where, solution, gamma, 0.0, gain)
             size = weights @ np.sqrt(np.diag(np.linalg.inv(found.P)))
         except (InfeasibleDesign, SolverTrouble, np.linalg.LinAlgError) as refusal:
             refusals.append(refusal)
             return None
+        stated.append(_rescaled(design, where, solution))
         return (float(size), found) if size > 0.0 else None
 
     if gamma is not None:
         one = solve(gamma)
         best = None if one is None else one[1]
     else:
-        best = search_gamma(solve, guess_gamma(stated, weights))
+        best = search_gamma(solve, guess_gamma(stated[0], weights))
     if best is None:
         raise _no_ellipsoid(measured, gamma, refusals)
     return best
 
 
-def _solved(problem: Problem) -> Solution:
-    """Solve a problem; what has a small gap and leaves half the margin serves, a proof follows."""
+def _near_units(
+    design: GeneralDesign, stated: Stated, make: Callable[[Stated], Problem]
+) -> tuple[Stated, Solution]:
+    """Solve a problem, again in units of what was found where that is not accurate."""
+    problem = make(stated)
+    rough = problem.solve(accept_inaccurate=True)
+    if _serves(problem, rough):
+        return stated, rough
+    nearer = _rescaled(design, stated, rough)
+    problem = make(nearer)
+    solution = solve_with_retries(problem, (), lambda s: _serves(problem, s))
+    if not _serves(problem, solution):
+        raise SolverTrouble(f"{problem.name}: {solution.solver} calls solved what is not")
+    return nearer, solution
+
+
+def _serves(problem: Problem, found: Solution) -> bool:
+    """Whether a solution has a small gap and leaves half the margin, as a proof follows."""
+    if not 0.0 <= found.gap < GAP:
+        return False
     strict = [item.expression for item in problem.blocks.values() if item.asks_margin]
+    least = min(float(np.linalg.eigvalsh(found.value(part))[0]) for part in strict)
+    return least > -0.5 * MARGIN
 
-    def serves(found: Solution) -> bool:
-        if not 0.0 <= found.gap < GAP:
-            return False
-        least = min(float(np.linalg.eigvalsh(found.value(part))[0]) for part in strict)
-        return least > -0.5 * MARGIN
 
-    found = solve_with_retries(problem, (), serves)
-    if not serves(found):
-        raise SolverTrouble(f"{problem.name}: {found.solver} calls solved what is not")
-    return found
+def _rescaled(design: GeneralDesign, stated: Stated, found: Solution) -> Stated:
+    """Take the half widths of a P as units of the errors where these are far from them."""
+    P = found["P"]
+    if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
+        return stated
+    size = np.clip(np.sqrt(np.diag(np.linalg.inv(P))), 1e-3, 1e3)
+    if np.all((size > 0.1) & (size < 10.0)):
+        return stated
+    return state(design, replace(stated.units, x=stated.units.x * size))
 
 
 def _no_ellipsoid(
@@ -334,15 +357,17 @@ def solve_energy(
 ) -> Found:
     """Find the least energy gain to the weighted errors."""
     stated = state(design, measured)
-    unit = float((weights * measured.x).max())
     last: Exception | None = None
     for cap in CAPS:
         try:
-            solution = _solved(energy_problem(stated, weights, cap, gain))
+            where, solution = _near_units(
+                design, stated, partial(energy_problem, weights=weights, cap=cap, gain=gain)
+            )
         except (InfeasibleDesign, SolverTrouble) as refusal:
             last = refusal
             continue
-        found = recovered(stated, solution, 0.0, 0.0, gain)
+        found = recovered(where, solution, 0.0, 0.0, gain)
+        unit = float((weights * where.units.x).max())
         level = unit * np.sqrt(max(solution.number("mu2"), LEAST_LEVEL))
         return Found(found.Z, found.P * unit**2, 0.0, found.noise, found.tau * unit**2, level)
     text = "no energy gain was found"

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split
+from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, read_matrix, refuse_idle
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.hinf.claims import (
     RESIDUAL,
     claims,
@@ -43,6 +46,8 @@ from obsynth.symbolic.errors import ObsynthError
 LEVEL = Number(above=0.0, because="a level is positive and finite")
 SLACK = Number(above=0.0, because="it is positive, since an infimum is not attained")
 DECAY = Number(0.0, 1.0, because="the factor of V per step lies between 0 and 1")
+# What the general class has no use for.
+IDLE = ("method", "multipliers", "drop_zero_rows", "mu", "slack", "decay", "majorant")
 DIAGONAL = Number(at_least=0.0, because="it has to be the diagonal of M'M, not negative")
 
 
@@ -77,8 +82,12 @@ class HinfUIO(Method):
     majorant : sequence of float, optional
         Diagonal of M'M in (5), proved to be one; `obsynth.majorant` by default. For
         ``multipliers="single"``.
-    form : {"corrected", "printed"}
-        (45) with (37) as printed, with ``method="standard"`` and one multiplier.
+    form : {"general", "corrected", "printed"}, optional
+        "general": plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, where by default
+        those go that the paper's class does not have (noisy outputs, varying gains, ...), if their
+        disturbances have bounds and their faults rates: both count in units of these, faults in
+        units of half their ranges, and fhat is of the same instant. "printed": (45) with (37) as
+        printed, with ``method="standard"`` and one multiplier.
 
     Raises
     ------
@@ -149,12 +158,48 @@ class HinfUIO(Method):
     slack: Annotated[float, SLACK] = 5e-4
     decay: Annotated[float | None, DECAY] = None
     majorant: Annotated[tuple[float, ...] | None, DIAGONAL] = None
-    form: Literal["corrected", "printed"] = "corrected"
+    form: Literal["general", "corrected", "printed"] | None = None
 
     def __post_init__(self) -> None:
         if self.majorant is not None:
             object.__setattr__(self, "majorant", _diagonal(self.majorant))
         super().__post_init__()
+
+    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
+        """Design, prove and return the observer; see `Method.design`."""
+        if self.form == "general":
+            return self._as_general().design(model if isinstance(model, Plant) else model.model)
+        try:
+            found = self._checked(model, bounds)
+        except (StructureError, DerivationError) as refusal:
+            if not self._open or not isinstance(model, Plant):
+                raise
+            try:
+                return self._as_general().design(model)
+            except (StructureError, DerivationError, UnboundedError) as beyond:
+                raise refusal from beyond
+        return self._certified(self.solve(found), found)
+
+    def analyse(
+        self,
+        model: Plant | Split,
+        gains: Mapping[str, ArrayLike],
+        bounds: JacobianBounds | None = None,
+    ) -> Observer:
+        """Return what given gains guarantee: ``K`` and more, or ``L``; see `Method.analyse`."""
+        if self.form == "general" or (self._open and "L" in gains):
+            return self._as_general().analyse(model, gains)
+        return super().analyse(model, gains, bounds)
+
+    @property
+    def _open(self) -> bool:
+        """Whether no option speaks of the paper's class alone."""
+        named = [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
+        return self.form is None and not named
+
+    def _as_general(self) -> GeneralUIO:
+        refuse_idle(self, "the observer of the general class", *IDLE)
+        return GeneralUIO(bounds="l2", horizon=self.horizon, recovery=self.recovery, cuts=self.cuts)
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""
