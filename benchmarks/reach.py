@@ -90,7 +90,7 @@ def attempt(plant, method, limit):
 def first_sentence(text):
     """Return the beginning of a refusal, in one line."""
     line = " ".join(text.split())
-    return re.split(r"(?<=[a-z)\]0-9])[.;:] ", line, maxsplit=1)[0][:110]
+    return re.split(r"(?<=[a-z)\]0-9])[.;] ", line, maxsplit=1)[0][:110]
 
 
 def line(plant, method, limit):

@@ -15,6 +15,7 @@ from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi import Problem
 from obsynth.designs.qpv.claims import claims, covers
+from obsynth.designs.qpv.defaults import default_sets, takes_rate
 from obsynth.designs.qpv.guarantee import guarantee, numbers
 from obsynth.designs.qpv.model import (
     CLASS,
@@ -67,8 +68,12 @@ class QPVObserver(Method):
     norm : {"h2", "hinf"}
         What is minimised: mu, a bound of trace(Cz P^-1 Cz') with V' < w'w, or gamma, a bound of
         the squared L2 gain from w to z = Cz e.
-    region : Ellipsoid
-        X of (18), in which states and faults are assumed to stay; states first, then faults.
+    region : Ellipsoid, optional
+        X of (18), in which states and faults are assumed to stay; states first, then faults. By
+        default the smallest one of the declared ranges' proportions that holds all of them; `E_x`
+        (half of the half ranges), `initial_error` (a tenth of the half ranges of the states, no
+        fault: tell `Observer.memory0` an `x_range`) and, where disturbances have bounds and with
+        ``norm="h2"``, `alpha_q` (`alpha`) then have defaults too.
     polytope : {"box", "cross"} or array_like of shape (p, n)
         P_x - c = P_e of (16), (17): half widths or semi-axes kappa sqrt(Q_ii), or kappa times
         given vertices.
@@ -175,7 +180,7 @@ class QPVObserver(Method):
 
     def check(self) -> None:
         """Read what is an array; refuse options that do not fit each other."""
-        if not isinstance(self.region, Ellipsoid):
+        if self.region is not None and not isinstance(self.region, Ellipsoid):
             raise ObsynthError(
                 f"region is {self.region!r}; the quadratic error dynamics contract only where "
                 "state and faults stay in a known set: give region=Ellipsoid(Q, c)",
@@ -191,24 +196,31 @@ class QPVObserver(Method):
                 "vertices, offsets from the centre c",
                 option="polytope",
             )
-        if (self.E_x is None) != (self.initial_error is None):
+        if self.region is not None and (self.E_x is None) != (self.initial_error is None):
             missing = "initial_error" if self.initial_error is None else "E_x"
             raise ObsynthError(
                 f"{missing} is missing: to take P_e apart from P_x give both initial_error (where "
                 "e(0) lies) and E_x (how far the error may go on its way)",
                 option=missing,
             )
-        if self.form == "printed" and (self.alpha_q is not None or self.E_x is not None):
+        apart = self.region is None or self.E_x is not None
+        if self.form == "printed" and (self.alpha_q is not None or apart):
             raise ObsynthError(
                 'form="printed" stands for (19)-(23) and (39)-(41), which have neither alpha_q '
-                "nor E_x",
+                "nor E_x, nor defaults: give region= alone",
                 option="form",
             )
 
     def read(self, given: Plant | QPV) -> QPVModel:
         """Derive the quadratic form; read the sets, the performance output and the noise."""
         form = read_form(given, self.form_of_N)
-        region = read_region(self.region, form)
+        sets = {name: getattr(self, name) for name in ("region", "E_x", "initial_error")}
+        rate = self.alpha_q
+        if self.region is None:
+            sets = {k: v if sets[k] is None else sets[k] for k, v in default_sets(form).items()}
+            if rate is None and self.norm == "h2" and self.alpha > 0.0 and takes_rate(form.model):
+                rate = self.alpha
+        region = read_region(sets["region"], form)
         if self.norm == "hinf" and not form.model.w:
             raise ObsynthError(
                 'norm="hinf" is a gain from disturbances, and the plant has none; declare '
@@ -216,8 +228,9 @@ class QPVObserver(Method):
                 option="norm",
             )
         unit = unit_shape(self.polytope, region)
-        kappa, eta = self.kappa, self._fixed_eta
-        if kappa is None and self.E_x is None:
+        apart = read_apart(sets["E_x"], sets["initial_error"], form)
+        kappa, eta = self.kappa, self._fixed_eta(apart is not None)
+        if kappa is None and apart is None:
             kappa = 1.0 / reach(unit, region)
         elif kappa is None:
             kappa = cover(unit, region) * (1.0 if eta is None else eta)
@@ -226,9 +239,9 @@ class QPVObserver(Method):
             region,
             unit,
             kappa,
-            read_apart(self.E_x, self.initial_error, form),
+            apart,
             read_performance_output(self.performance_output, form),
-            read_noise(self.alpha_q, form.model),
+            read_noise(rate, form.model),
         )
         return check_polytope(model, eta)
 
@@ -251,15 +264,17 @@ class QPVObserver(Method):
         ObsynthError
             If eta is not given: the inequalities are linear only for a fixed one.
         """
-        if self._fixed_eta is None:
+        model = self._checked(given)
+        if self._fixed_eta(model.apart is not None) is None:
             raise ObsynthError("the inequalities are linear only for a fixed eta: give eta=")
-        return state_problem(self.setting(self._checked(given)))
+        return state_problem(self.setting(model))
 
     def setting(self, model: QPVModel) -> Setting:
         """Return what the inequalities depend on, at the given eta or else at the largest one."""
+        eta = self._fixed_eta(model.apart is not None)
         return Setting(
             model,
-            model.largest_eta if self._fixed_eta is None else self._fixed_eta,
+            model.largest_eta if eta is None else eta,
             self.norm,
             self.alpha,
             self.polya,
@@ -271,14 +286,13 @@ class QPVObserver(Method):
         """Return the options as JSON-able data, the region apart."""
         return {name: value for name, value in super().options().items() if name != "region"}
 
-    @property
-    def _fixed_eta(self) -> float | None:
-        """The given eta; 1 for sets apart from each other, None to search it."""
-        return 1.0 if self.eta is None and self.E_x is not None else self.eta
+    def _fixed_eta(self, apart: bool) -> float | None:
+        """Return the given eta; 1 for sets apart from each other, None to search it."""
+        return 1.0 if self.eta is None and apart else self.eta
 
     def _solve(self, model: QPVModel, gains: FloatArray | None = None) -> QPVDesign:
         setting = self.setting(model)
-        if self._fixed_eta is None:
+        if self._fixed_eta(model.apart is not None) is None:
             setting = search_eta(setting, gains)
         check_faults(setting.data, setting.sets, model.form.names)
         if setting.printed:

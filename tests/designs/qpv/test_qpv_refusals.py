@@ -85,7 +85,7 @@ def test_a_fault_that_is_not_excited_is_named():
         ({"norm": "h1"}, "norm is 'h1'"),
         ({"form_of_N": "lower"}, "form_of_N is 'lower'"),
         ({"form": "repaired"}, "form is 'repaired'"),
-        ({"region": None}, "give region="),
+        ({"region": [5.0, 0.0]}, "give region="),
         ({"polytope": "ball"}, "polytope is 'ball'"),
         ({"eta": 1.5}, "eta is 1.5"),
         ({"eta": -0.1}, "eta is -0.1"),
@@ -99,6 +99,7 @@ def test_a_fault_that_is_not_excited_is_named():
         ({"E_x": [1.0]}, "initial_error is missing"),
         ({"initial_error": [1.0, 0.0]}, "E_x is missing"),
         ({"form": "printed", "alpha_q": 1.0}, "neither alpha_q"),
+        ({"form": "printed", "region": None}, "give region= alone"),
         ({"performance_output": "e"}, "no array of numbers"),
     ],
 )
