@@ -197,9 +197,17 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
 
 
 def operating_point(model: Plant, at: Any = None) -> Equilibrium:
-    """Read a point of operation, or find the nominal one."""
+    """Read a point of operation, or find the nominal one.
+
+    Where no equilibrium is found, the nominal values or the middles of the ranges serve: a split
+    is right at any point.
+    """
     if at is None:
-        return equilibrium(model)
+        inputs = _inputs(model, None)
+        try:
+            return equilibrium(model)
+        except DerivationError:
+            at = operating_values(model, "x"), inputs
     if isinstance(at, Equilibrium):
         point = at
     else:

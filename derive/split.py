@@ -181,7 +181,9 @@ def split(
     model : Plant
         Continuous or discrete.
     at : Equilibrium or (x, u), optional
-        Point of operation; by default the equilibrium of the nominal inputs.
+        Point of operation; by default the equilibrium of the nominal inputs or, where none is
+        found inside the ranges, the nominal values of states and inputs (the middles of their
+        ranges).
     linear : {"frozen", "terms", "jacobian"}
         ``"frozen"``: the quasi-linear matrices A(x, u), B(x, u) of `factorise` at the point;
         ``"terms"``: the terms that are linear with a constant coefficient;
@@ -198,7 +200,7 @@ def split(
         An unknown input, a fault or a disturbance enters nonlinearly, or an output is not linear
         in states and disturbances; symbol and row are named.
     DerivationError
-        No equilibrium, or a matrix that is not finite at the point.
+        An input without a value, or a matrix that is not finite at the point.
 
     Examples
     --------

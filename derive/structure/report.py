@@ -16,6 +16,7 @@ from obsynth.derive.structure.conditions import (
     weakest_member,
 )
 from obsynth.derive.structure.excitation import excitation
+from obsynth.derive.structure.following import Following, follow
 from obsynth.derive.structure.isolability import fault_isolability
 from obsynth.derive.structure.zeros import (
     invariant_zeros,
@@ -148,14 +149,15 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
     Parameters
     ----------
     model_or_split : Plant or Split
-        A plant is split with ``linear="frozen"`` at its nominal equilibrium.
+        A plant is split with ``linear="frozen"`` at its nominal equilibrium or nominal point.
 
     Returns
     -------
     StructureReport
-        Signals, equilibrium, split, which single faults show and can be told apart, what has to
-        move for that, decoupling of unknown inputs, Jacobian family, detectability at its vertices
-        and inside, invariant zeros and separability of the faults.
+        Signals, what the general class makes of a discrete plant (which faults are followed, and
+        why others are not), split, point of operation, which single faults show and can be told
+        apart, what has to move for that, decoupling of unknown inputs, Jacobian family,
+        detectability at its vertices and inside, invariant zeros and separability of the faults.
 
     Examples
     --------
@@ -174,7 +176,13 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
         if notes.step("plant", lambda: (model.check(), "complete and consistent")) is None:
             return StructureReport(model.name, tuple(notes.checks), None, None)
         notes.inform("signals", _signals(model))
+        general = None
+        if model.Ts is not None:
+            general = notes.step("general class", lambda: _follow(model))
         part = notes.step("split", lambda: _split(model))
+        if part is None and general is not None:
+            text = notes.checks.pop().text
+            notes.inform("split", f"not of the class of the papers: {text}")
     if model.f:
         notes.note("single faults", lambda: _isolate(model))
         notes.note("excitation", lambda: (None, str(excitation(model))))
@@ -243,6 +251,11 @@ def _detect(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:
         slowest = found.hidden_modes[-1]
         text += f"; a hidden mode decays with {slowest.real:.6g}"
     return True, text
+
+
+def _follow(model: Plant) -> tuple[Following, str]:
+    found = follow(model)
+    return found, str(found)
 
 
 def _isolate(model: Plant) -> tuple[bool | None, str]:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.errors import StructureError
 from obsynth.designs.core.errors import SolverTrouble
 from obsynth.designs.general.peak import spectral_radius
 from obsynth.designs.general.record import GeneralDesign
@@ -294,20 +293,6 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
                 continue
 
 
-def hidden_modes(data: Scaled) -> list[tuple[complex, FloatArray]]:
-    """Return modes of the middle that do not decay and that no output sees, with their vectors."""
-    A, C = data.T @ data.A0, data.C0 @ data.T
-    found = []
-    for value in np.linalg.eigvals(A):
-        if abs(value) < 1.0 - 1e-7:
-            continue
-        rows = np.vstack([A - value * np.eye(len(A)), C])
-        _, sizes, vectors = np.linalg.svd(rows)
-        if sizes[-1] < 1e-8:
-            found.append((complex(value), np.abs(vectors[-1])))
-    return found
-
-
 def find_gain(design: GeneralDesign, weights: FloatArray, seed: int = 0) -> FloatArray:
     """Return Z (N, m) for narrow peak bounds; weights (N,) of the errors in their own units.
 
@@ -394,25 +379,3 @@ def _strongest(data: Scaled, design: GeneralDesign) -> list[str]:
     return [s.name for s in (*plant.x, *plant.u, *plant.w) if s.name in inside] or [
         s.name for s in plant.x
     ]
-
-
-def refuse_hidden(design: GeneralDesign) -> list[str]:
-    """Return a followed fault of a mode that no output sees, if any; refuse modes of states alone.
-
-    Of several faults that are told from each other by nothing, the one with the smallest range.
-    """
-    data, plant = scaled(design), design.extended.plant
-    names, n = plant.names("x"), len(design.plant.x)
-    for value, vector in hidden_modes(data):
-        moved = [i for i in np.argsort(-vector) if vector[i] > 1e-6 * vector.max()]
-        faults = [int(i) for i in moved if i >= n]
-        if faults:
-            return [names[min(faults, key=lambda i: float(data.x[i]))]]
-        raise StructureError(
-            f"a mode {abs(value):.6g} of {', '.join(names[i] for i in moved)} does not decay "
-            f"and no output shows it ({', '.join(design.plant.output_names)}); measure one of "
-            "them",
-            symbols=tuple(names[i] for i in moved),
-            condition="detectability",
-        )
-    return []

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive import JacobianBounds
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import TINY
+from obsynth.derive.structure.following import follow
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
@@ -18,8 +19,8 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.claims import claims, covers, guarantee, numbers
 from obsynth.designs.general.fading import fade
 from obsynth.designs.general.frozen import attained_gain
-from obsynth.designs.general.gain import find_gain, refuse_hidden
-from obsynth.designs.general.model import CLASS, GeneralModel, read, read_again, without
+from obsynth.designs.general.gain import find_gain
+from obsynth.designs.general.model import CLASS, GeneralModel, of, read_again
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import settle
@@ -103,17 +104,12 @@ class GeneralUIO(Method):
 
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""
-        if self.faults == "divided":
-            model = read(given, divided=given.names("f"))
-            refuse_hidden(model.design)
-            _refuse_alike(model)
-            return model
-        model = read(given, given.names("f") if self.faults == "bounded" else ())
-        lost = refuse_hidden(model.design)
-        while lost:
-            model = without(model, lost)
-            lost = refuse_hidden(model.design)
-        return model
+        names = given.names("f")
+        divided = names if self.faults == "divided" else ()
+        found = follow(given, divided, names if self.faults == "bounded" else ())
+        rest = (*divided, *found.extended.followed)
+        unfollowed = [name for name in names if name not in rest]
+        return of(given, found.extended, found.bounds, unfollowed, divided)
 
     def solve(self, model: GeneralModel) -> GeneralDesign:
         """Find a gain and its bounds."""
@@ -180,18 +176,6 @@ class GeneralUIO(Method):
             )
         given = dict(zip(names, self.weights, strict=True))
         return np.array([given[name] for name in states.names("x")])
-
-
-def _refuse_alike(model: GeneralModel) -> None:
-    """Refuse faults and unknown inputs that act in fewer directions than there are of them."""
-    free, rank = model.extended.free, model.extended.D0.shape[1]
-    if rank < len(free):
-        raise StructureError(
-            f"{', '.join(free)} act in {rank} direction{'s' if rank > 1 else ''} on the states: "
-            "of any size they cannot be told apart",
-            symbols=free,
-            condition="faults in different directions",
-        )
 
 
 def bound_peak(design: GeneralDesign) -> GeneralDesign:

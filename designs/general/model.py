@@ -8,6 +8,7 @@ import numpy as np
 from obsynth.derive.forms.extended import Extended, extend
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.rigour import middle_and_radius
+from obsynth.derive.structure.following import RTOL
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.general.record import Fading, GeneralDesign, PeakBound, Rounding
 from obsynth.symbolic import Plant, Role
@@ -18,8 +19,6 @@ CLASS = PlantClass(
     time="discrete",
     faults=(Role.ACTUATOR_FAULT, Role.PROCESS_FAULT, Role.SENSOR_FAULT),
 )
-RTOL = 1e-3
-"""Of the bounds of the Jacobians, which the check derives again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +45,17 @@ def read(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] = 
     """Extend the plant and bound the Jacobians."""
     extended = extend(model, unfollowed, divided)
     bounds = jacobian_bounds(extended.plant, wrt="joint", rtol=RTOL, effort="fast")
+    return of(model, extended, bounds, unfollowed, divided)
+
+
+def of(
+    model: Plant,
+    extended: Extended,
+    bounds: JacobianBounds,
+    unfollowed: Sequence[str],
+    divided: Sequence[str],
+) -> GeneralModel:
+    """Return a design without gain for what was derived of a plant."""
     N, m = extended.L0.shape
     centre, radius = boxes(extended)
     none = np.zeros(N)
@@ -70,14 +80,3 @@ def read(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] = 
 def read_again(design: GeneralDesign) -> GeneralModel:
     """Derive everything anew from the stored equations."""
     return read(design.plant, design.unfollowed, design.divided)
-
-
-def without(model: GeneralModel, names: Sequence[str]) -> GeneralModel:
-    """Return the model with further faults that count as disturbances."""
-    design = model.design
-    return read(design.plant, (*design.unfollowed, *names), design.divided)
-
-
-def with_gain(design: GeneralDesign, Z: FloatArray) -> GeneralDesign:
-    """Return a design with a gain."""
-    return design.changed(Z=Z)

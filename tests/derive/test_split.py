@@ -115,6 +115,14 @@ def test_no_equilibrium_is_said():
         equilibrium(plant)
 
 
+def test_a_plant_that_never_rests_is_split_at_its_nominal_point():
+    """Mutant: no equilibrium, no split."""
+    plant = make(lambda s: [s["x"][0] ** 2 + 1 + 0 * s["u"], -s["x"][1]])
+    parts = split(plant)
+    assert parts.at.x.tolist() == plant.box("x").mean(axis=1).tolist()
+    assert parts.proof.holds and parts.at.residual == 1.0
+
+
 @pytest.mark.parametrize("u", [[1, 2], [float("nan")], []])
 def test_misshapen_inputs_are_refused(u):
     with pytest.raises(DerivationError, match="one finite number for each of u"):
