@@ -63,7 +63,17 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
         inputs=u_middle + u_half * np.sin(3.0 * speed * k + u_phase),
         faults=f_middle + f_half * np.sin(speed * k + f_phase),
         x_range=None,
+        f_range=_first_faults(plant, f_middle, f_half),
     )
+
+
+def _first_faults(plant: Plant, middle: FloatArray, half: FloatArray) -> FloatArray | None:
+    """Return the ranges of the faults, what the waves take where there is none; None of none."""
+    if not plant.f:
+        return None
+    near = np.column_stack([middle - half, middle + half])
+    box = plant.box("f")
+    return np.where(np.isfinite(box), box, near)
 
 
 def _about(plant: Plant, kind: str, share: float) -> tuple[FloatArray, FloatArray]:
