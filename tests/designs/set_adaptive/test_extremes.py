@@ -12,9 +12,11 @@ def mixer():
     """Two measured levels and a hidden one; entries rise and fall, one with both ends of a."""
     plant = ob.Plant("mixer")
     a, b, c = plant.states("a b c", range=[(0.5, 2.0), (1.0, 3.0), (0.0, 1.0)])
-    (u,) = plant.inputs("u", range=(0.2, 1.5), nominal=1)
+    u, q = plant.inputs("u q", range=[(0.2, 1.5), (-1, 3)], nominal=1)
     (f,) = plant.process_faults("f", range=(-0.1, 0.1))
-    plant.dynamics([-a * a + b * c + f, -u * b - b / (1 + a) + a, c * (a**2 - 2 * a) - (3 + u) * c])
+    plant.dynamics(
+        [-a * a + b * c + 2 * q + f, -u * b - b / (1 + a) + a, c * (a**2 - 2 * a) - (3 + u) * c]
+    )
     v = plant.disturbances("v1:3", bound=[0.02, 0.03])
     plant.outputs([a + v[0], 2 * b + v[1]])
     return plant
@@ -61,7 +63,7 @@ def test_extremes_are_those_of_all_ends(reach):
 
 @pytest.mark.parametrize("Ts", [0.0, 0.01, 0.1])
 def test_the_extremes_of_a_step_reach_as_far_as_noise_and_motion(Ts):
-    """Speeds by sampling the equations. Mutants: the noise or the motion left out or taken off."""
+    """Speeds by sampling the equations. Mutants: noise, motion or inputs left out or taken off."""
     plant, rng = mixer(), np.random.default_rng(1)
     boxes = [plant.box(kind) for kind in ("x", "u", "f")]
     x, u, f = (rng.uniform(*box.T, (2000, len(box))).T for box in boxes)

@@ -139,7 +139,12 @@ def test_an_incomplete_record_is_refused(cooperative, certify, key):
 
 
 def test_other_damage_is_refused(cooperative, bank, certify):
-    for change in ({"L": [[1.0]]}, {"fault_outputs": [0, 7]}, {"law": "none"}):
+    for change in (
+        {"L": [[1.0]]},
+        {"fault_outputs": [0, 7]},
+        {"fault_outputs": [0, -1]},
+        {"law": "none"},
+    ):
         with pytest.raises(ob.CertificateError):
             certify({**cooperative.record, **change})
     with pytest.raises(ob.CertificateError, match="scale has shape"):
@@ -160,7 +165,13 @@ def test_guarantees_name_what_they_rest_on(cooperative, bank, printed):
 # -- C -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["adaptive", "bank", "printed"])
+LONG = pytest.mark.long
+"""The contract of all methods compares fewer vectors of the same two every time."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param("adaptive", marks=LONG), pytest.param("bank", marks=LONG), "printed"]
+)
 def test_generated_c_equals_the_step(cooperative, bank, printed, tmp_path, kind):
     observer = {"adaptive": cooperative, "bank": bank, "printed": printed}[kind]
     project = ob.generate_c(observer, tmp_path / "c", vectors=1000)
