@@ -25,7 +25,8 @@ def jacobian(rows: sp.Matrix, symbols: Sequence[sp.Symbol]) -> sp.Matrix:
     flat: dict[sp.Basic, sp.Basic] = {}
     back: dict[sp.Basic, sp.Basic] = {}
     for node in once(*rows):
-        jump = sp.sign(node.args[0]) if isinstance(node, sp.Abs) else node
+        bent = isinstance(node, sp.Abs) and not node.args[0].is_extended_real
+        jump = sp.sign(node.args[0]) if bent else node
         if isinstance(jump, _FLAT):
             level = sp.Dummy(real=True)
             back[level] = jump

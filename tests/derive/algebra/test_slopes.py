@@ -41,10 +41,11 @@ def test_what_jumps_is_flat_and_nothing_is_left_undone(jump):
             assert float(found.xreplace(point)) == pytest.approx(wanted, abs=1e-7)
 
 
-def test_derivatives_of_smooth_rows_are_sympys():
-    rows = sp.Matrix([X**2 * sp.sin(Y), sp.Max(X, Y)])
+def test_derivatives_of_what_is_known_to_be_real_are_sympys():
+    """Mutant: a modulus always written by its sign (the slope of x |x| is 2 x sign(x) then)."""
+    rows = sp.Matrix([X**2 * sp.sin(Y), sp.Max(X, Y), X * sp.Abs(X) + Y])
     assert jacobian(rows, [X, Y]) == rows.jacobian([X, Y])
-    assert jacobian(rows, []).shape == (2, 0)
+    assert jacobian(rows, []).shape == (3, 0)
 
 
 @pytest.mark.timeout(60)
@@ -101,6 +102,10 @@ def test_cases_that_are_ruled_out_are_not_looked_at():
     """Mutant: all cases rebuilt (division by zero in one that does not count)."""
     row = sp.Piecewise((sp.sin(X) / X, sp.Ne(X, 0)), (sp.Symbol("one") + Y, True))
     assert replaced(row, {X: sp.Integer(0)}) == sp.Symbol("one") + Y
+    # the condition True was met before, the other one was not
+    both = sp.Piecewise((X, X > Y), (Y, True)) + sp.Piecewise((X**2, Y < -1), (2, True))
+    new = {X: Y + 1, Y: X}
+    assert replaced(both, new) == both.xreplace(new)
     chained = sp.Piecewise((1 / (X - 1), X > 1), (sp.log(Y), Y > 0), (2, True))
     assert replaced(chained, {X: sp.Integer(1), Y: sp.Integer(-1)}) == 2
 

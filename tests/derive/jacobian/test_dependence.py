@@ -291,6 +291,26 @@ def test_a_family_covers_one_with_narrower_ranges_and_no_other():
         assert not family.covers(replace(family, **mistake)), mistake
 
 
+def test_every_scalar_of_a_family_has_to_be_covered():
+    """Mutants: one lower end, one upper end or one entry of the radius is enough."""
+    family = AffineFamily(
+        np.zeros((1, 2)),
+        np.array([[[1.0, 0.0]], [[0.0, 1.0]]]),
+        np.array([[0.0, 1.0]] * 2),
+        np.zeros((1, 2)),
+        ("s", "t"),
+        True,
+    )
+    for row in (0, 1):
+        for end, value in ((0, -0.5), (1, 1.5)):
+            ranges = family.ranges.copy()
+            ranges[row, end] = value
+            assert not family.covers(replace(family, ranges=ranges))
+        radius = np.zeros((1, 2))
+        radius[0, row] = 1e-9
+        assert not family.covers(replace(family, radius=radius))
+
+
 def test_the_room_of_a_family_counts_both_ends():
     """Mutant: lower ends alone."""
     family = AffineFamily(
