@@ -123,3 +123,19 @@ def test_the_step_begins_a_core_from_no_wider_sets(bounded, delay):
     begun = guard.half_widths.begun
     assert np.all(np.array(found)[late:] <= begun * (1 + 1e-12))
     assert found[late][::2] == pytest.approx(begun[::2], rel=1e-6)
+
+
+def test_what_a_varying_gain_leaves_of_a_fault():
+    """J / 10 in [.1, .3]: .025 / .1 + (4.2 .3 + .025) s / .01, s = h_b / 10 or at most .1.
+
+    Mutants: half of the range of J; its ends exchanged; the largest fault left out.
+    """
+    p = ob.Plant("varying")
+    a, b = p.states("a b", range=[(-9, 9), (-1, 1)])
+    (f,) = p.faults("f", range=(-4.2, 4.2))
+    p.dynamics([a / 2 + (2 + b) * f / 10, b / 2], Ts=1)
+    p.outputs([a])
+    found = Guard(p, {}, Watch.of(OPTIONS), 0, 1.0).half_widths
+    for b_half, spread in ((0.5, 0.05), (2.0, 0.1), (0.0, 0.0)):
+        told = found._divided(0, 0, 0.025, np.array([0.01, b_half, 4.2]))
+        assert told == pytest.approx(0.25 + 1.285 * spread / 0.01, rel=1e-6)
