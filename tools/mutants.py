@@ -106,7 +106,7 @@ class Job:
     @property
     def room(self) -> str:
         """The folder that the table counts it for."""
-        return "/".join(self.file.split("/")[:2]) if self.file.count("/") > 1 else "codegen"
+        return "/".join(self.file.split("/")[:-1][:2])
 
 
 def read(files: Iterable[Path]) -> dict[str, Any]:

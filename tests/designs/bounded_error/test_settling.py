@@ -12,7 +12,7 @@ from obsynth.designs.core.guard import MOST_CALLS
 @pytest.fixture(scope="module", params=["ellipsoid", "peak"])
 def observer(request):
     model = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
-    return ob.BoundedErrorUIO(gamma=0.005, bounds=request.param).design(model)
+    return ob.BoundedErrorUIO(gamma=0.005, bounds=request.param, form="corrected").design(model)
 
 
 def steady_run(observer, steps):
