@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from tapes import errors
 
 from methods import METHODS
+from obsynth.designs.core.core import Seen
 from obsynth.designs.qpv import claims as proofs
+from obsynth.designs.qpv import step as module
 from obsynth.designs.qpv.guarantee import guarantee
 from obsynth.designs.qpv.step import Allowance, allowance, build_update
 
@@ -101,3 +104,23 @@ def test_a_reading_that_is_held_counts_as_a_disturbance(observer, design):
     outside, quiet = missed(0.01)
     assert (outside, quiet) == (0, 700)
     assert missed(0.05)[0] > 0
+
+
+@pytest.mark.parametrize("level", [0.0, 0.25, 1.0])
+def test_intervals_are_wider_by_the_allowance(design, monkeypatch, level):
+    """sqrt(V) + allowance times the half widths of E. Mutants: taken off; ends as they are rounded."""
+    monkeypatch.setattr(module, "allowance", lambda _: Allowance(1e-3, True))
+    state, n = design.region.c, len(design.plant.x)
+    parts = {"xhat": state[:n], "fhat": state[n:], "level": level}
+    seen = Seen(
+        {k: ca.SX(ca.DM(v)) for k, v in parts.items()}, *map(ca.SX, (7.0, 0.4, state[0])), [1]
+    )
+    known = module.build_core(design).run(seen)
+    ends = ca.vertcat(known.x.lower, known.f.lower, known.x.upper, known.f.upper)
+    low, high = np.array(ca.evalf(ends)).reshape(2, -1)
+    wanted = (np.sqrt(level) + 1e-3) * np.sqrt(design.inverse_diagonal)
+    # the root, the product and the end are rounded themselves
+    wanted += 8 * 2.0**-53 * (np.abs(state) + wanted)
+    for half in (high - state, state - low):
+        assert (half >= wanted).all()
+        assert half == pytest.approx(wanted, rel=1e-6, abs=1e-9)
