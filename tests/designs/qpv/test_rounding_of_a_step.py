@@ -108,7 +108,7 @@ def test_a_reading_that_is_held_counts_as_a_disturbance(observer, design):
 
 @pytest.mark.parametrize("level", [0.0, 0.25, 1.0])
 def test_intervals_are_wider_by_the_allowance(design, monkeypatch, level):
-    """sqrt(V) + allowance times the half widths of E. Mutants: taken off; ends as they are rounded."""
+    """sqrt(V) + allowance times the half widths of E. Mutants: taken off; ends as rounded."""
     monkeypatch.setattr(module, "allowance", lambda _: Allowance(1e-3, True))
     state, n = design.region.c, len(design.plant.x)
     parts = {"xhat": state[:n], "fhat": state[n:], "level": level}
