@@ -64,8 +64,8 @@ def error_loop(system: ErrorSystem) -> Loop:
         Enclosure(system.C0, rest[N:, :N]),
         Enclosure(system.V0, rest[N:, N:]),
     )
-    moves = np.any((system.W0 != 0.0) | (rest[:N, N:] != 0.0), axis=0)
-    shows = np.any((system.V0 != 0.0) | (rest[N:, N:] != 0.0), axis=0)
+    # where an entry is not exactly zero, its rounding at least is left open
+    moves, shows = (np.any(part != 0.0, axis=0) for part in (rest[:N, N:], rest[N:, N:]))
     moves[F.sources[F.sources >= N] - N] = True
     shows[h.sources[h.sources >= N] - N] = True
     before, after = (np.flatnonzero(which & (radius > 0.0)) for which in (moves, shows))

@@ -202,10 +202,10 @@ def drawn(design, rng, count=400):
     return e, *v
 
 
-@pytest.mark.parametrize("name", ["general_uio.ellipsoid", "general_uio.l2"])
+@pytest.mark.parametrize("name", ["motor", "l2", "shared"])
 def test_the_inequality_holds_for_jacobians_of_rows_and_outputs_apart(name):
     """Worst errors and disturbances of each pair of Jacobians, by its largest eigenvalue."""
-    design = observer_of(name).certificate.design
+    design = design_of(name)
     rng, N = np.random.default_rng(0), design.size
     n_v, radius = len(design.v_radius), design.v_radius
     most = -np.inf
@@ -281,8 +281,23 @@ def bent():
     return plant
 
 
+def shared():
+    """One noise in both outputs, of which one takes the unknown input away."""
+    plant = ob.Plant("shared")
+    x, z = plant.states("x z", range=[(-1, 1), (-1, 1)])
+    (d,) = plant.unknown_inputs("d")
+    w = plant.disturbances("w1 w2", bound=[0.1, 0.01])
+    plant.dynamics([x / 2 + z / 3 + d, x / 4 + R(9, 10) * z + sp.sin(x) / 10 + w[1]], Ts=1)
+    plant.outputs([x + w[0], z + x / 2 + w[0]])
+    return plant
+
+
 @functools.cache
 def design_of(name):
+    if name == "l2":
+        return observer_of("general_uio.l2").certificate.design
+    if name == "shared":
+        return ELLIPSOID.design(shared()).certificate.design
     if name == "motor":
         return observer_of("general_uio.ellipsoid").certificate.design
     if name == "scalar":
@@ -316,9 +331,11 @@ def ellipsoid():
 
 
 def fallen(design, **changes):
-    """Names of the claims that fall where the stored bound is changed."""
+    """Names of the claims that fall where the stored bound is changed; none has a margin."""
     changed = replace(design, bound=replace(design.bound, **changes))
-    return {claim.name for claim in prove_storage(changed) if not claim.holds}
+    failed = [claim for claim in prove_storage(changed) if not claim.holds]
+    assert all(claim.margin < 0.0 for claim in failed)
+    return {claim.name for claim in failed}
 
 
 def test_every_number_of_an_ellipsoid_is_proved(ellipsoid):
@@ -329,9 +346,10 @@ def test_every_number_of_an_ellipsoid_is_proved(ellipsoid):
     assert fallen(ellipsoid, gamma=bound.gamma * (1.0 + 1e-3)) == {"lmi"}
     assert "weights" in fallen(ellipsoid, gamma=bound.gamma * (1.0 - 1e-6))
     assert "weights" in fallen(ellipsoid, noise=bound.noise * (1.0 + 1e-6))
-    assert fallen(ellipsoid, inverse_diagonal=bound.inverse_diagonal * (1.0 - 1e-5)) == {
-        "half_widths"
-    }
+    for i in range(ellipsoid.size):
+        less = bound.inverse_diagonal.copy()
+        less[i] *= 1.0 - 1e-5
+        assert fallen(ellipsoid, inverse_diagonal=less) == {"half_widths"}
     for k in range(len(bound.tau)):
         tau = bound.tau.copy()
         tau[k] *= -1.0
@@ -340,6 +358,21 @@ def test_every_number_of_an_ellipsoid_is_proved(ellipsoid):
         name = "noise" if len(short) + 1 == len(bound.noise) else "tau"
         with pytest.raises(CertificateError):
             fallen(ellipsoid, **{name: short})
+
+
+def test_every_number_of_an_energy_gain_is_proved():
+    design = observer_of("general_uio.l2").certificate.design
+    bound = design.bound
+    assert not fallen(design)
+    assert fallen(design, mu=bound.mu * (1.0 - 1e-3)) == {"lmi"}
+    assert fallen(design, mu=-bound.mu) == {"multipliers"}
+    assert fallen(design, weights=bound.weights * (1.0 + 1e-3)) == {"lmi"}
+    for k in range(len(bound.tau)):
+        tau = bound.tau.copy()
+        tau[k] *= -1.0
+        assert "multipliers" in fallen(design, tau=tau)
+    with pytest.raises(CertificateError):
+        fallen(design, tau=bound.tau[:-1])
 
 
 def test_the_rest_of_the_family_is_part_of_the_proof(ellipsoid):
@@ -352,6 +385,12 @@ def test_the_rest_of_the_family_is_part_of_the_proof(ellipsoid):
         wide = replace(ellipsoid, family=replace(family, radius=radius))
         fell = {claim.name for claim in prove_storage(wide) if not claim.holds}
         assert fell == {"lmi"}, (i, j)
+    # a disturbance that no row knew
+    radius = ellipsoid.family.radius.copy()
+    radius[0, N] = 0.2
+    wide = replace(ellipsoid, family=replace(ellipsoid.family, radius=radius))
+    with pytest.raises(CertificateError, match="4 weights; the error system has 5"):
+        list(prove_storage(wide))
 
 
 @pytest.mark.parametrize("name", ["bent", "motor"])
