@@ -9,10 +9,11 @@ from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
-from obsynth.designs.bounded_error.record import Fading, PeakData, UioDesign
+from obsynth.designs.bounded_error.record import PeakData, UioDesign
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
+from obsynth.designs.general.record import Fading
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

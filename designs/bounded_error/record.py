@@ -13,8 +13,9 @@ from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
+from obsynth.designs.general.record import Fading
 from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.arrays import FloatArray
 
 MOST_VERTICES = 2**16
 
@@ -47,45 +48,6 @@ class EllipsoidBound(Record):
     def shape_of(self, component: int) -> int:
         """Return the number of the ellipsoid that bounds a component of xi."""
         return 0 if len(self.P) == 1 else component
-
-
-@dataclass(frozen=True, eq=False)
-class Modes(Record):
-    """Coordinates in which the first error fades.
-
-    basis: V, whose columns belong to blocks of one or two
-    inverse: Y, which takes errors to these coordinates
-    blocks: how many columns each block has
-    """
-
-    basis: Annotated[FloatArray, "n+n_f n+n_f"]
-    inverse: Annotated[FloatArray, "n+n_f n+n_f"]
-    blocks: Annotated[IntArray, "n_b"]
-
-    def check(self) -> None:
-        """Refuse blocks that are not those of the basis."""
-        if not np.all((self.blocks == 1) | (self.blocks == 2)) or self.blocks.sum() != len(
-            self.basis
-        ):
-            raise CertificateError(
-                f"the blocks {self.blocks.tolist()} of the stored design do not make up "
-                f"{len(self.basis)} columns"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class Fading(Record):
-    """How the first error fades: at most ``reach G^k start |xi_0|`` is added to the peak bounds.
-
-    decay: lambda, at least the spectral radius of G
-    modes: coordinates of the recursion; without them it is the exponential c lambda^k
-    """
-
-    G: Annotated[FloatArray, "n_b n_b"]
-    reach: Annotated[FloatArray, "n+n_f n_b"]
-    start: Annotated[FloatArray, "n_b n+n_f"]
-    decay: float
-    modes: Modes | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ where |.| of a block is its spectral norm. All are nonnegative, so the recursion
 ``S |e_p|`` stays above whatever the first error does, for every k >= 0 and every sequence of
 Jacobians. Scaling the blocks changes neither R G^k S nor the spectral radius of G.
 
-Y is the stored inverse of a stored basis V, and its own inverse is enclosed: with
-``|I - Y V| <= D``, ``Y^-1 = V (Y V)^-1`` lies within ``|V| D (I - D)^-1`` of V. Where no basis
+Where no basis
 makes G contract, an exponential serves: divided by lambda^k, what the first error adds is at most
 ``(I - G_lambda)^-1`` times its largest response without feedback, G_lambda the sums of responses
 of the system divided by lambda. Then G = lambda I, R = I, and S has these numbers by columns.
@@ -29,57 +28,41 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import matrix_balance, schur
 
-from obsynth.derive.rigour import (
-    TINY,
-    UNIT_ROUNDOFF,
-    Enclosure,
-    add_up,
-    lowered,
-    product_up,
-    raised,
-)
+from obsynth.derive.rigour import UNIT_ROUNDOFF, Enclosure, add_up, product_up, raised
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.general.modal import (
+    SLACK,
+    Recursion,
+    block_norms,
+    blocks_of,
+    choose,
+    enclosed_inverse,
+    prove_recursion,
+    proved_decay,
+    single,
+)
 from obsynth.designs.general.peak import response_of_q, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import Fading, Modes
 from obsynth.designs.general.responses import power_sum, response
 from obsynth.designs.general.system import ErrorSystem, magnitude
-from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.arrays import FloatArray
 
-# Room for other orders of summation when the numbers are computed again elsewhere: of the numbers,
-# and of the radii where nothing but rounding is left.
-SLACK, ROOM = 1.0 + 2.0**-36, 8.0
-# Between the spectral radius of G and 1: the decay that is stored and proved.
-SHARES = (1e-6, 1e-3, 0.1)
 # Of the way from the slowest decay to 1, for the exponential.
 DECAYS = (0.1, 0.3, 0.6, 0.9)
-# Row sums of I - Y V below it: Y is regular.
-REGULAR = 0.5
-# Of the peak bounds: a first error that adds less has settled.
-SETTLED = 0.1
 
 
 def fade(system: ErrorSystem, b: FloatArray, widest: FloatArray) -> Fading:
     """Choose the recursion that settles first from ``|e_p| <= widest``, shapes (N,)."""
-    room, found = SETTLED * b[system.size :], []
-    for modes in _bases(system.moving.mid):
-        needed = recursion(system, modes, ROOM)
-        if needed is None or not all(np.all(np.isfinite(matrix)) for matrix in needed):
-            continue
-        G, reach, start = (matrix * SLACK for matrix in needed)
-        decay = _decay(G)
-        if decay < 1.0:
-            fading = Fading(G, reach, start, decay, modes)
-            found.append((_settling(fading, start @ widest, room), fading))
-    if found:
-        return min(found, key=lambda pair: pair[0])[1]
+    found = choose(system.moving.mid, partial(recursion, system), b[system.size :], widest)
+    if found is not None:
+        return found
     G, reach, start = _best_exponential(system)
-    return Fading(G, reach, start * SLACK, _decay(G), None)
+    return Fading(G, reach, start * SLACK, proved_decay(G), None)
 
 
-def _best_exponential(system: ErrorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _best_exponential(system: ErrorSystem) -> Recursion:
     slow = spectral_radius(system.closed.mid)
     tried = []
     for share in DECAYS:
@@ -95,7 +78,7 @@ def _best_exponential(system: ErrorSystem) -> tuple[FloatArray, FloatArray, Floa
     return min(tried, key=lambda pair: pair[0])[1]
 
 
-def exponential(system: ErrorSystem, decay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def exponential(system: ErrorSystem, decay: float) -> Recursion:
     """Return G, R and S of the exponential with a given decay, S rounded up."""
     if not 0.0 < decay < 1.0:
         raise InfeasibleDesign(f"peak bounds: a decay of {decay:.6g} is none below 1")
@@ -132,169 +115,38 @@ def exponential(system: ErrorSystem, decay: float) -> tuple[FloatArray, FloatArr
     return decay * unit, unit, np.column_stack(columns)
 
 
-def _decay(G: FloatArray) -> float:
-    """Return a decay that is proved, little above the spectral radius; 1 where none is."""
-    radius = spectral_radius(G)
-    candidates = (radius + share * (1.0 - radius) for share in SHARES)
-    return next((decay for decay in candidates if contracts(G, decay)), 1.0)
-
-
-def _bases(A: FloatArray) -> Iterator[Modes]:
-    """Propose real bases in which A is block diagonal, or block triangular."""
-    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    values, vectors = np.linalg.eig(balanced)
-    columns, blocks = [], []
-    for k in np.flatnonzero(values.imag >= 0.0):
-        v = vectors[:, k]
-        pair = [v.real, v.imag] if values[k].imag else [v.real]
-        columns += pair
-        blocks.append(len(pair))
-    triangular, rotation = schur(balanced)
-    sizes: list[int] = []
-    i = 0
-    while i < len(A):
-        sizes.append(1 + int(i + 1 < len(A) and triangular[i + 1, i] != 0.0))
-        if sizes[-1] == 2:
-            # [a b; c a] with b c < 0 becomes a rotation times its size
-            rotation[:, i + 1] *= np.sqrt(-triangular[i + 1, i] / triangular[i, i + 1])
-        i += sizes[-1]
-    for basis, found in ((np.column_stack(columns), blocks), (rotation, sizes)):
-        basis = scale[:, None] * basis
-        with suppress(np.linalg.LinAlgError):
-            yield Modes(basis, np.linalg.inv(basis), np.array(found))
-
-
-def recursion(
-    system: ErrorSystem, modes: Modes, room: float = 1.0
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def recursion(system: ErrorSystem, modes: Modes, room: float = 1.0) -> Recursion | None:
     """Return G, R_c and S for a basis, rounded up; None where it is not regular.
 
     room: by what the radii of the enclosures are multiplied
     """
-    inverse = _inverse(modes)
+    inverse = enclosed_inverse(modes)
     if inverse is None:
         return None
-    norms = partial(_norms, room=room)
-    ends, N = np.cumsum(modes.blocks), system.size
-    blocks = np.column_stack([ends - modes.blocks, np.where(modes.blocks == 2, ends - 1, -1)])
+    norms, N, blocks = partial(block_norms, room=room), system.size, blocks_of(modes)
     h, F, Y = system.of_h, system.of_F, Enclosure.of(modes.inverse)
     Z, R_h, R_F = np.abs(system.Z), system.rest[N:, :N], system.rest[:N, :N]
-    single = _single(N)
-    reach_q = norms(system.T @ inverse, single, blocks)
+    each = single(N)
+    reach_q = norms(system.T @ inverse, each, blocks)
     seen_h = product_up(h.coupling(N), reach_q)
     left_h = product_up(R_h, reach_q)
     reach = add_up(
-        norms(system.M @ inverse, single, blocks),
+        norms(system.M @ inverse, each, blocks),
         product_up(product_up(Z, np.abs(h.columns)), seen_h),
         product_up(Z, left_h),
     )
     seen_F = product_up(F.coupling(N), reach)
-    size = norms(Y, blocks, single)
+    size = norms(Y, blocks, each)
     G = add_up(
         norms(Y @ system.moving @ inverse, blocks, blocks),
-        product_up(norms(Y @ system.B_y, blocks, _single(len(h.radii))), seen_h),
-        product_up(norms(Y @ F.columns, blocks, _single(len(F.radii))), seen_F),
+        product_up(norms(Y @ system.B_y, blocks, single(len(h.radii))), seen_h),
+        product_up(norms(Y @ F.columns, blocks, single(len(F.radii))), seen_F),
         product_up(size, product_up(R_F, reach)),
         product_up(size, product_up(product_up(np.abs(system.A0), Z), left_h)),
     )
     return G, reach, size
 
 
-def distance(modes: Modes) -> tuple[FloatArray, float]:
-    """Bound ``|I - Y V|``, and its largest row sum."""
-    rest = Enclosure.of(np.eye(len(modes.basis))) - Enclosure.of(modes.inverse) @ modes.basis
-    error = raised(np.abs(rest.mid) + rest.rad, 1)
-    return error, float(raised(error.sum(axis=1), len(error)).max(initial=0.0))
-
-
-def _inverse(modes: Modes) -> Enclosure | None:
-    """Enclose the inverse of the stored inverse; None where it is not proved to have one."""
-    error, norm = distance(modes)
-    if not norm < REGULAR:
-        return None
-    # D (I - D)^-1 is D plus what its row sums bound, norm^2 / (1 - norm), in every entry
-    spread = add_up(error, raised(np.full_like(error, 2.0 * norm * norm), 4))
-    return Enclosure(modes.basis, product_up(np.abs(modes.basis), spread))
-
-
-def _single(count: int) -> IntArray:
-    return np.column_stack([np.arange(count), np.full(count, -1)])
-
-
-def _norms(matrix: Enclosure, rows: IntArray, columns: IntArray, room: float) -> FloatArray:
-    """Bound the spectral norm of every block, given by pairs of indices, -1 for none."""
-    mid, rad = (np.pad(part, ((0, 1), (0, 1))) for part in (matrix.mid, matrix.rad))
-    parts = [np.ix_(rows[:, i], columns[:, j]) for i in (0, 1) for j in (0, 1)]
-    a, b, c, d = (mid[part] for part in parts)
-    # the larger singular value of [a b; c d]
-    middle = 0.5 * (np.hypot(a + d, b - c) + np.hypot(a - d, b + c))
-    return raised(middle + room * np.sum([rad[part] for part in parts], axis=0), 24)
-
-
-def contracts(G: FloatArray, decay: float) -> bool:
-    """Whether ``G v <= decay v`` holds for a positive v, proved: then G^k fades like decay^k."""
-    if not 0.0 < decay < 1.0:
-        return False
-    try:
-        v = np.asarray(np.linalg.solve(decay * np.eye(len(G)) - G, np.ones(len(G))), dtype=float)
-    except np.linalg.LinAlgError:
-        return False
-    usable = np.all(np.isfinite(v)) and np.all(v > 0)
-    return bool(usable and np.all(product_up(G, v) <= lowered(decay * v, 1)))
-
-
-def _settling(fading: Fading, mu: FloatArray, room: FloatArray) -> int:
-    """Return after how many samples what mu adds is within some room, by doubling."""
-    powers = [fading.G]
-    while np.any(fading.reach @ (powers[-1] @ mu) > room) and len(powers) < 40:
-        powers.append(powers[-1] @ powers[-1])
-    count = 1
-    for j, power in reversed(list(enumerate(powers))):
-        if np.any(fading.reach @ (power @ mu) > room):
-            mu, count = power @ mu, count + 2**j
-    return count
-
-
 def prove_fading(system: ErrorSystem, fading: Fading) -> Iterator[Claim]:
     """Prove the stored recursion from the stored gains and family."""
-    modes, decay = fading.modes, fading.decay
-    if modes is not None:
-        room = REGULAR - distance(modes)[1]
-        yield Claim(
-            "basis",
-            "inverse times basis encloses the identity, so that the first error has coordinates",
-            bool(room > 0.0),
-            room,
-            "products enclosed, largest row sum",
-        )
-    proof = "coordinates of the error system enclosed, all numbers rounded up"
-    needed: tuple[FloatArray, ...] | None
-    try:
-        if modes is None:
-            proof = "powers of the error system divided by those of the decay, rounded up"
-            needed = exponential(system, float(fading.G[0, 0]))
-        else:
-            needed = recursion(system, modes)
-    except InfeasibleDesign as error:
-        needed, proof = None, str(error)
-    stored = (fading.G, fading.reach, fading.start)
-    margins = [
-        np.min((have - least) / np.maximum(least, TINY))
-        for have, least in zip(stored, needed or (), strict=False)
-    ]
-    margin = float(min(margins, default=-np.inf))
-    yield Claim(
-        "transient",
-        "G, reach and start bound what the first error adds, at every k",
-        bool(margin >= 0.0),
-        margin,
-        proof,
-    )
-    holds = contracts(fading.G, decay)
-    yield Claim(
-        "decay",
-        f"what the first error adds to the bounds decays with {decay:.7g} per sample",
-        holds,
-        1.0 - decay if holds else -np.inf,
-        "G v <= decay v for a positive v, rounded up",
-    )
+    return prove_recursion(fading, partial(recursion, system), partial(exponential, system))

@@ -18,71 +18,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive.rigour import TINY, Enclosure, add_up, lowered, product_up, raised
+from obsynth.derive.rigour import Enclosure, add_up, lowered, product_up, raised
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.general.peak import (
+    PeakProof,
+    contraction,
+    small_gain_solution,
+    spectral_radius,
+)
 from obsynth.designs.general.responses import PowerSum, Response, power_sum, response
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-# Room that the certificate leaves for other orders of summation on other machines.
-SLACK = 2.0**-40
-
-
-def small_gain_solution(G: FloatArray, n: FloatArray) -> FloatArray:
-    """Return a b, barely above ``(I - G)^-1 n``, with ``n + G b <= b`` in rounded-up numbers."""
-    eye = np.eye(len(n))
-    b = np.maximum(np.linalg.solve(eye - G, n), n)
-    b = np.maximum(np.linalg.solve(eye - G, n + SLACK * b + 64.0 * TINY), n)
-    for _ in range(100):
-        image = add_up(n, product_up(G, b))
-        if np.all(image <= b) and np.all(np.isfinite(b)):
-            return b
-        b = np.maximum(b, image * (1.0 + 2.0**-45))
-    raise InfeasibleDesign(
-        "peak bounds: the small-gain condition holds without a margin that doubles can prove",
-        ["use other gains, or a smaller domain"],
-        rho=spectral_radius(G),
-        G=G,
-    )
-
-
-def spectral_radius(matrix: FloatArray) -> float:
-    """Return the largest absolute eigenvalue as computed."""
-    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
-
-
-def contraction(G: FloatArray, b: FloatArray) -> float:
-    """Return max (G v)_i / v_i for a positive v, over the outputs that feed back, rounded up.
-
-    Below one it proves that the spectral radius of G is below one.
-    """
-    coupled = np.flatnonzero(np.any(G, axis=0))
-    if coupled.size == 0:
-        return 0.0
-    inner, scale = G[np.ix_(coupled, coupled)], b[coupled]
-    # an output without noise of its own has (G b)_i = b_i, so b itself need not do
-    v = np.linalg.solve(np.eye(coupled.size) - inner, scale)
-    v = np.maximum(v, 2.0**-500 * np.max(np.abs(v)))
-    return float(np.max(raised(product_up(inner, v) / v, 1)))
-
-
-@dataclass(frozen=True, eq=False)
-class PeakProof:
-    """Why a vector b bounds the errors at every instant.
-
-    slack: lower bounds of ``b - n - G b``; none is negative
-    small_gain: upper bound of the spectral radius of G, below one: ``max (G v)_i / v_i`` for a
-        positive v
-    remainder: upper bound of the remainder of the sums of powers, below one half, which proves that
-        the error system at the midpoint is Schur
-    steps: number of powers that were summed
-    """
-
-    slack: FloatArray
-    small_gain: float
-    remainder: float
-    steps: int
 
 
 @dataclass(frozen=True, eq=False)

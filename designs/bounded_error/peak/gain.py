@@ -14,13 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.peak.bound import (
-    PeakBound,
-    channel_inputs,
-    peak_bound,
-    spectral_radius,
-)
+from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs, peak_bound
 from obsynth.designs.bounded_error.peak.system import PeakSystem, projected_gains
+from obsynth.designs.general.peak import spectral_radius
 from obsynth.designs.general.responses import absolute_sums
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

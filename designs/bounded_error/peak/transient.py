@@ -23,14 +23,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import UNIT_ROUNDOFF, Enclosure, add_up, lowered, product_up, raised
-from obsynth.designs.bounded_error.peak.bound import (
-    PeakBound,
-    channel_inputs,
-    small_gain_solution,
-    spectral_radius,
-)
+from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs
 from obsynth.designs.bounded_error.peak.system import PeakSystem, peak_system
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.general.peak import small_gain_solution, spectral_radius
 from obsynth.designs.general.responses import PowerSum, Response, power_sum, response
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

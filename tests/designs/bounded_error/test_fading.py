@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 import obsynth as ob
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.bounded_error.peak import fading as module
 from obsynth.designs.bounded_error.peak.bound import PeakBound, channel_inputs, peak_bound
 from obsynth.designs.bounded_error.peak.design import stored_bound
-from obsynth.designs.bounded_error.peak.fading import contracts, fade, prove_fading, recursion
+from obsynth.designs.bounded_error.peak.fading import fade, prove_fading, recursion
 from obsynth.designs.bounded_error.peak.system import peak_system
 from obsynth.designs.bounded_error.peak.transient import transient
-from obsynth.designs.bounded_error.record import Fading, Modes
 from obsynth.designs.bounded_error.step import first_bound, running_bound
 from obsynth.designs.core.boxes import Ends
+from obsynth.designs.general.modal import block_norms, contracts, enclosed_inverse, single
+from obsynth.designs.general.record import Fading, Modes
 
 # -- how long, how soon ------------------------------------------------------------------------
 
@@ -230,7 +230,7 @@ def test_norms_of_blocks_are_not_below_the_exact_ones(entries, radius, power):
     middle = np.array(entries).reshape(2, 2) * 2.0**power
     spread = np.full((2, 2), radius * 2.0**power)
     whole = np.array([[0, 1]])
-    bound = Fraction(float(module._norms(Enclosure(middle, spread), whole, whole, 1.0)[0, 0]))
+    bound = Fraction(float(block_norms(Enclosure(middle, spread), whole, whole, 1.0)[0, 0]))
     signs = np.where(middle < 0, -1.0, 1.0)
     M = [
         [Fraction(m) + Fraction(r) * int(s) for m, r, s in zip(*rows, strict=True)]
@@ -240,8 +240,8 @@ def test_norms_of_blocks_are_not_below_the_exact_ones(entries, radius, power):
     determinant = M[0][0] * M[1][1] - M[0][1] * M[1][0]
     assert 2 * bound**2 >= squares
     assert bound**4 - bound**2 * squares + determinant**2 >= 0
-    single = module._norms(Enclosure(middle, spread), module._single(2), module._single(2), 1.0)
-    assert np.all(single >= np.abs(middle) + spread)
+    alone = block_norms(Enclosure(middle, spread), single(2), single(2), 1.0)
+    assert np.all(alone >= np.abs(middle) + spread)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -251,7 +251,7 @@ def test_the_inverse_is_enclosed(seed):
     basis = rng.normal(size=(5, 5)) * 10.0 ** rng.integers(-6, 6, (5, 1))
     inverse = np.linalg.inv(basis) * (1 + 1e-9 * rng.normal(size=(5, 5)))
     modes = Modes(basis, inverse, np.ones(5, dtype=np.int64))
-    enclosed = module._inverse(modes)
+    enclosed = enclosed_inverse(modes)
     exact = ExactMatrix.of(inverse).inverse().to_fractions()
     distance = [
         [abs(x - Fraction(m)) for x, m in zip(*rows, strict=True)]
@@ -266,7 +266,7 @@ def test_the_inverse_is_enclosed(seed):
         any(d > Fraction(r) / 100 for d, r in zip(*rows, strict=True))
         for rows in zip(distance, enclosed.rad.tolist(), strict=True)
     )
-    assert module._inverse(replace(modes, inverse=0 * inverse)) is None
+    assert enclosed_inverse(replace(modes, inverse=0 * inverse)) is None
 
 
 def test_contraction_is_proved_by_a_vector():
