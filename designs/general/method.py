@@ -27,6 +27,7 @@ from obsynth.designs.general.rounding import settle
 from obsynth.designs.general.step import (
     Limits,
     build_core,
+    fault_delay,
     first_memory,
     memory_sizes,
     settling,
@@ -73,7 +74,7 @@ class GeneralUIO(Method):
         settle=settling,
         core=build_core,
         shared=("prediction",),
-        fault_delay=lambda design: int(bool(design.divided)),
+        fault_delay=fault_delay,
     )
 
     bounds: Literal["peak", "ellipsoid", "l2"] = "peak"

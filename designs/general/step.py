@@ -250,6 +250,11 @@ def settling(
     return k, per_signal(design, running.half_widths(s) * (1.0 + 2.0**-30))
 
 
+def fault_delay(design: GeneralDesign) -> int:
+    """Return how many calls late faults are known: one where they are divided out."""
+    return int(bool(design.divided))
+
+
 def memory_sizes(design: GeneralDesign) -> dict[str, int]:
     """Return the parts of the memory: the prediction of states and followed faults, and s."""
     bound, sizes = design.bound, {"prediction": design.size}
