@@ -105,3 +105,14 @@ def test_steady_widths_do_not_depend_on_the_sign_of_a_coupling():
         found.append(np.concatenate([part.ravel() for part in widths]))
     assert found[0] == pytest.approx(found[1], rel=1e-12)
     assert found[0][1] > 0.03
+
+
+def test_what_rounding_may_do_counts_with_the_largest_states(stored):
+    """In single precision it is seen. Mutants: the smallest ones, the rounding left out."""
+    single = replace(stored, precision="single")
+    widths = 2.0 * steady_half_widths(single)[0]
+    for k, i in enumerate(stored.outputs.tolist()):
+        noise = np.diff(stored.noise[k])[0] / stored.scale[k]
+        rounding = 4.0 * single.rounding * np.abs(stored.region[i]).max()
+        assert widths[i] == pytest.approx(noise + rounding, rel=1e-8)
+        assert rounding > 1e-6 * noise
