@@ -29,7 +29,7 @@ def cart() -> ob.Plant:
 
 @pytest.fixture(scope="module", params=["peak", "ellipsoid"])
 def carried(request):
-    return ob.BoundedErrorUIO(bounds=request.param, horizon=30).design(cart())
+    return ob.BoundedErrorUIO(bounds=request.param, horizon=30, form="corrected").design(cart())
 
 
 BOX = np.array([[-0.5, 0.5], [-1.0, 1.0]])
