@@ -144,6 +144,22 @@ def test_fast_growth_over_a_long_step_stays_within(method, order, rate):
     assert ((high - low)[:, 0] <= 3.5 * np.ptp(found, axis=1)).all()
 
 
+def test_a_step_that_is_too_long_for_higher_orders_is_enclosed_all_the_same():
+    """x' = -20 x over .1 s: each order is as large as the one before, so that the first ones stay.
+
+    Mutant: one end returned twice where the sequence stops.
+    """
+    plant = ob.Plant("stiff")
+    plant.states("x", range=(-1, 1))
+    plant.dynamics(["-20*x"])
+    plant.outputs(["x"])
+    step = plant.discretise("rk4", 0.1, remainder=True)
+    found, (low, high) = left_out(plant, step, 200), ends(step)
+    assert ((low <= found) & (found <= high)).all()
+    exact = np.exp(-2) - (1 - 2 + 2 - 8 / 6 + 16 / 24)
+    np.testing.assert_allclose(np.abs(found).max(), np.abs(exact), rtol=1e-9)
+
+
 def test_faults_that_are_constant_or_have_no_rate_are_held():
     """Mutants: a constant fault moves; a rate per step in place of one per second."""
 
