@@ -131,17 +131,28 @@ def test_sets_hold_what_noise_and_faults_at_their_ends_do(name):
     assert missed == 0 and total > 4000
 
 
+WAYS = {
+    "peak": {},
+    "peak alone": {"cuts": ()},
+    "ellipsoid alone": {"bounds": "ellipsoid", "cuts": ()},
+    "divided": {"faults": "divided"},
+}
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("cuts", [None, ()])
-def test_no_set_misses_in_a_hundred_thousand_instants(name, cuts):
-    observer = ob.BoundedErrorUIO(bounds="peak", cuts=cuts).design(made(name))
+@pytest.mark.parametrize("way", WAYS)
+def test_no_set_misses_in_many_instants(name, way):
+    """Over a million instants of states and faults in all, those that stay in the box."""
+    if way == "divided" and name not in SEVEN:
+        pytest.skip("a fault that stands in an output, or that no output shows a call later")
+    observer = GeneralUIO(**WAYS[way]).design(made(name))
     missed = total = seed = 0
-    while total < 100_000 and seed < 20:
+    while total < 60_000 and seed < 12:
         more = watched(observer, seed, count=60, steps=300)
         missed, total, seed = missed + more[0], total + more[1], seed + 1
     assert missed == 0
-    assert total > 5_000
+    assert total > 3_000
 
 
 def in_units(factor):
