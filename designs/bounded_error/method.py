@@ -162,7 +162,7 @@ class BoundedErrorUIO(Method):
             return self._as_general().design(model if isinstance(model, Plant) else model.model)
         if self.form is not None or not isinstance(model, Plant):
             return super().design(model, bounds)
-        if self.bounds == "peak":
+        if self.bounds == "peak" and self.gamma is None:
             return self._as_general().design(model)
         found = self._of_the_paper(model, bounds)
         return self._beyond(model) if found is None else super().design(*found)
