@@ -91,8 +91,8 @@ class BoundedErrorUIO(Method):
     form : {"general", "corrected", "printed", "repaired"}, optional
         "general": plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, in current form
         (the paper's observer predicts first), with one multiplier for every column of every
-        nonlinearity in place of vertices; by default for peak bounds of a plant, and for ellipsoids
-        where the paper's class does not have it or has more than 16 vertices. The paper's class
+        nonlinearity in place of vertices; by default unless gamma or an option of the paper's
+        class is given to a plant of that class with at most 16 vertices. The paper's class
         has: the direct LMI at the vertices of the exact Jacobian set ("corrected"); (51) as
         printed; (51) with diagonal multipliers, which is valid row by row.
 
@@ -165,7 +165,14 @@ class BoundedErrorUIO(Method):
         if self.bounds == "peak" and self.gamma is None:
             return self._as_general().design(model)
         found = self._of_the_paper(model, bounds)
-        return self._beyond(model) if found is None else super().design(*found)
+        if found is not None and (self.gamma is not None or self._named):
+            return super().design(*found)
+        try:
+            return self._beyond(model)
+        except (SolverTrouble, InfeasibleDesign):
+            if found is None:
+                raise
+            return super().design(*found)
 
     def analyse(
         self,
@@ -178,6 +185,11 @@ class BoundedErrorUIO(Method):
             return self._as_general().analyse(model, gains)
         return super().analyse(model, gains, bounds)
 
+    @property
+    def _named(self) -> list[str]:
+        """Options of the paper's class alone that differ from their defaults."""
+        return [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
+
     def _of_the_paper(
         self, model: Plant, bounds: JacobianBounds | None
     ) -> tuple[Split, JacobianBounds] | None:
@@ -185,7 +197,7 @@ class BoundedErrorUIO(Method):
 
         Options that speak of the paper's class alone keep it, and its refusals, in place.
         """
-        named = [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
+        named = self._named
         try:
             self.CLASS.check(model)
             parts = split(model)
