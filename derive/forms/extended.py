@@ -113,6 +113,7 @@ def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] 
     unbounded = [s for s in loose if not s.bounded]
     if unbounded:
         first = unbounded[0]
+        unbounded = [s for s in unbounded if s.role is first.role]
         more = ", or with rate= to have it followed" if first in model.f else ""
         raise StructureError(
             f"{first.role} {', '.join(s.name for s in unbounded)} has no bound, so no interval can "

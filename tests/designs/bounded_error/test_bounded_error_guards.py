@@ -221,7 +221,7 @@ def test_bounds_return_after_a_missing_measurement(alone):
     (w,) = plant.disturbances("w", bound=0.1)
     plant.dynamics([0.1 * v - 0.1 * h**0.5])
     plant.outputs([h + w])
-    observer = ob.BoundedErrorUIO().design(plant.discretise("euler", Ts=1.0))
+    observer = ob.BoundedErrorUIO(form="corrected").design(plant.discretise("euler", Ts=1.0))
     for one in (observer, alone(observer)):
         memory = one.memory0([40], x_range=[[30, 50]])
         lost = step(one, memory, u=[5], y=[np.nan])
