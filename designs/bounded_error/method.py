@@ -131,6 +131,7 @@ class BoundedErrorUIO(Method):
     """
 
     CLASS = CLASS
+    SPLITS = True
     CONTRACT = Contract(
         name="bounded_error_uio",
         record=UioDesign,
@@ -156,23 +157,23 @@ class BoundedErrorUIO(Method):
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
     form: Literal["general", "corrected", "printed", "repaired"] | None = None
 
-    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
-        """Design, prove and return the observer; see `Method.design`."""
+    def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer."""
         if self.form == "general":
             return self._as_general().design(model if isinstance(model, Plant) else model.model)
         if self.form is not None or not isinstance(model, Plant):
-            return super().design(model, bounds)
+            return super()._design(model, bounds)
         if self.bounds == "peak" and self.gamma is None:
             return self._as_general().design(model)
         found = self._of_the_paper(model, bounds)
         if found is not None and (self.gamma is not None or self._named):
-            return super().design(*found)
+            return super()._design(*found)
         try:
             return self._beyond(model)
         except (SolverTrouble, InfeasibleDesign):
             if found is None:
                 raise
-            return super().design(*found)
+            return super()._design(*found)
 
     def analyse(
         self,

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.derive import JacobianBounds
+from obsynth.derive import JacobianBounds, split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.contractor import CUTS
 from obsynth.designs.core.core import Core
@@ -185,7 +185,8 @@ CONTRACTS: dict[str, Contract[Any]] = {}
 class Method:
     """Options of a method, a frozen dataclass, and its way from a plant to an observer.
 
-    A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`.
+    A method has a `CLASS` of plants, a `CONTRACT`, and three verbs: `read`, `solve` and `fix`;
+    `SPLITS` says whether it builds on a split of the plant.
 
     horizon: N, number of calls after which a set that was begun anew takes over from an older one:
         nothing that happened more than 2 N calls ago matters to what is returned. By default as
@@ -198,6 +199,7 @@ class Method:
 
     CLASS: ClassVar[PlantClass]
     CONTRACT: ClassVar[Contract[Any]]
+    SPLITS: ClassVar[bool] = False
 
     horizon: Annotated[int | None, CALLS] = field(default=None, kw_only=True)
     recovery: Annotated[int, CALLS] = field(default=10, kw_only=True)
@@ -232,7 +234,7 @@ class Method:
         """Complete a design with given gains, or refuse them."""
         raise NotImplementedError
 
-    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
+    def design(self, model: Any, bounds: JacobianBounds | None = None, at: Any = None) -> Observer:
         """Design, prove and return the observer.
 
         Parameters
@@ -243,6 +245,8 @@ class Method:
             IntervalObserver, a `QPV` for QPVObserver.
         bounds : JacobianBounds, optional
             Of the split's g, where they are at hand, for BoundedErrorUIO and HinfUIO.
+        at : Equilibrium or (x, u), optional
+            Point at which a plant is split, see `obsynth.split`, for methods that build on one.
 
         Returns
         -------
@@ -261,6 +265,15 @@ class Method:
         CertificateError
             If a claim cannot be proved, or for printed forms that do not prove what they claim.
         """
+        if at is None:
+            return self._design(model, bounds)
+        if not self.SPLITS or not isinstance(model, Plant):
+            what = "this method" if not self.SPLITS else "what is split already"
+            raise ObsynthError(f"at has no effect with {what}: leave it out", option="at")
+        return self._design(split(self.CLASS.check(model), at=at), bounds)
+
+    def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer."""
         found = self._checked(model, bounds)
         return self._certified(self.solve(found), found)
 

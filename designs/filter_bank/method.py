@@ -82,6 +82,7 @@ class FilterBank(Method):
     """
 
     CLASS = CLASS
+    SPLITS = True
     CONTRACT = Contract(
         name="filter_bank",
         record=BankDesign,

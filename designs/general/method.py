@@ -87,14 +87,14 @@ class GeneralUIO(Method):
         if self.bounds != "ellipsoid":
             refuse_idle(self, f'bounds="{self.bounds}", which has no ellipsoid', "gamma")
 
-    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
-        """Design, prove and return the observer; see `Method.design`.
+    def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer.
 
         Where no gain is found that follows the faults, peak bounds divide them out, or hold them
         for disturbances.
         """
         try:
-            return super().design(model)
+            return super()._design(model, bounds)
         except SolverTrouble as trouble:
             if self.bounds != "peak" or self.faults != "followed" or not model.f:
                 raise

@@ -136,6 +136,7 @@ class HinfUIO(Method):
     """
 
     CLASS = CLASS
+    SPLITS = True
     CONTRACT = Contract(
         name="hinf_uio",
         record=HinfDesign,
@@ -165,8 +166,8 @@ class HinfUIO(Method):
             object.__setattr__(self, "majorant", _diagonal(self.majorant))
         super().__post_init__()
 
-    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
-        """Design, prove and return the observer; see `Method.design`."""
+    def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer."""
         if self.form == "general":
             return self._as_general().design(model if isinstance(model, Plant) else model.model)
         try:

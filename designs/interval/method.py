@@ -193,12 +193,12 @@ class IntervalObserver(Method):
         if self.R is None and self.Q is not None:
             raise ObsynthError("Q is given without R: they belong together", option="Q")
 
-    def design(self, model: Any, bounds: JacobianBounds | None = None) -> Observer:
-        """Design, prove and return the observer; see `Method.design`."""
+    def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer."""
         if self.form == "general":
             return self._general().design(model)
         try:
-            return super().design(model, bounds)
+            return super()._design(model, bounds)
         except StructureError as error:
             idle = any(
                 getattr(self, option.name) != option.default

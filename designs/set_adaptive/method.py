@@ -134,6 +134,7 @@ class SetAdaptiveObserver(Method):
     """
 
     CLASS = CLASS
+    SPLITS = True
     CONTRACT = Contract(
         name="set_adaptive_observer",
         record=SetDesign,
@@ -186,8 +187,8 @@ class SetAdaptiveObserver(Method):
             object.__setattr__(self, "law", "printed")
             object.__setattr__(self, "noise", False)
 
-    def design(self, model: Plant | Split, bounds: JacobianBounds | None = None) -> Observer:
-        """Design, prove and return the observer, see `Method.design`, or that of the bank."""
+    def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
+        """Design, prove and return the observer, or that of the bank."""
         if self.robust:
             bank = FilterBank(
                 self.filters,
@@ -199,7 +200,7 @@ class SetAdaptiveObserver(Method):
                 cuts=self.cuts,
             )
             return bank.design(model)
-        return super().design(model, bounds)
+        return super()._design(model, bounds)
 
     def read(self, given: Plant | Split) -> SetModel:
         """Bring the plant into the form (3) and bound its matrices elementwise."""

@@ -73,7 +73,13 @@ def test_the_proof_refuses_what_differs():
     assert not same_waves(v * sp.cos(a), m * sp.cos(a))
 
 
+def forgetful(monkeypatch):
+    """What was written before, or is written with a mistake, is not remembered."""
+    monkeypatch.setattr(factorise, "_rewritten", factorise._rewritten.__wrapped__)
+
+
 def wrong_rule(monkeypatch):
+    forgetful(monkeypatch)
     right = fu.TR8
     monkeypatch.setattr(
         fu, "TR8", lambda e, **options: right(e, **options).subs(sp.cos(b), sp.sin(b))
@@ -88,6 +94,7 @@ def test_a_wrong_rule_is_not_used(monkeypatch):
 
 def test_points_catch_what_a_missing_proof_lets_through(monkeypatch):
     plant = arm_from_lagrange(2)
+    forgetful(monkeypatch)
     monkeypatch.setattr(factorise, "same_waves", lambda one, other: True)
     right = fu.TR8
     monkeypatch.setattr(

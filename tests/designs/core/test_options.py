@@ -135,3 +135,21 @@ def test_types_of_options_are_checked(method, options):
     (name,) = options
     with pytest.raises(ObsynthError, match=f"^{name} is "):
         method(**options)
+
+
+def test_a_point_is_taken_where_a_plant_is_split_and_refused_elsewhere():
+    """Mutant: the nominal point in place of the given one."""
+    plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
+    at = np.array([150.0, 180, 40, 45]), np.array([11.0, 10])
+    method = ob.BoundedErrorUIO(gamma=0.004)
+    designs = [
+        method.design(plant, at=at).certificate.design,
+        method.design(ob.split(plant, at=at)).certificate.design,
+    ]
+    for design in designs:
+        assert design.x_at.tolist() == at[0].tolist() and design.u_at.tolist() == at[1].tolist()
+    assert np.array_equal(designs[0].A, designs[1].A)
+    with pytest.raises(ObsynthError, match="at has no effect with this method"):
+        ob.IntervalObserver().design(ob.plants.interval_example(), at=([0, 0, 0], [0]))
+    with pytest.raises(ObsynthError, match="split already"):
+        method.design(ob.split(plant), at=at)
