@@ -109,6 +109,7 @@ def test_highlights_come_from_the_results(study):
     assert shown["C steps equal to the last bit"] == "100"
 
 
+@pytest.mark.long
 def test_a_run_that_fails_or_is_interrupted_leaves_the_folder_as_it_was(quick, tmp_path):
     target = tmp_path / "out"
     with complete_folder(target, RUN) as place:

@@ -2,6 +2,8 @@
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 QUESTION = """{
     "equilibrium": list(parts.at.x),
     "m13": [bounds.min[0, 2], bounds.max[0, 2]],

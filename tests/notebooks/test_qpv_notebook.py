@@ -2,6 +2,8 @@
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 QUESTION = """
 {
     "printed": [printed.mu, printed.error_set],

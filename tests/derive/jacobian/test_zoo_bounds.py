@@ -206,7 +206,13 @@ def test_bounds_of_the_remainder_are_those_of_the_plant_moved(name):
 # -- bounds: sound -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.long if n in ("planar_arm 3R", "bicycle") else ())
+        for n in ZOO
+    ],
+)
 def test_samples_stay_within_the_bounds(name):
     effort = "fast" if name in HEAVY else "normal"
     for wrt in targets(name):

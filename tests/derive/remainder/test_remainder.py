@@ -102,11 +102,16 @@ def exceeded(found, errors, noise):
     return int(low + high)
 
 
+SLOW = ("tank", "CSTR")
+
+
 # -- soundness and tightness -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long if n in SLOW else ()) for n in CASES]
+)
 def test_never_exceeded_from_thousands_of_points(name, method):
     found = certified(name, method)
     errors, noise = local_errors(found, 3000)
@@ -137,6 +142,7 @@ def test_never_exceeded_from_a_hundred_thousand_points(name, method):
         assert exceeded(found, errors, noise) == 0
 
 
+@pytest.mark.long
 def test_higher_effort_is_no_looser():
     fast, normal = certified("Lorenz", "rk4"), certified("Lorenz", "rk4", effort="normal")
     assert (normal.upper - normal.lower <= (fast.upper - fast.lower) * 1.001).all()

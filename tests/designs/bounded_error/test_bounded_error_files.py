@@ -153,6 +153,7 @@ for claim in ob.load(sys.argv[1]).certificate.check():
 """
 
 
+@pytest.mark.long
 def test_the_file_is_checked_in_another_process_without_a_solver(base, given_peak, tmp_path):
     for name, observer in (("base", base), ("peak", given_peak)):
         path = tmp_path / f"{name}.json"

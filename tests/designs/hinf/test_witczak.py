@@ -305,6 +305,7 @@ def test_every_form_is_proved_again_from_its_file(designs, tmp_path):
             np.testing.assert_array_equal(np.array(a), np.array(b))
 
 
+@pytest.mark.long
 def test_the_file_is_proved_in_another_process(designs, tmp_path):
     path = tmp_path / "design.json"
     designs["general"].save(path)

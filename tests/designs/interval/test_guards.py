@@ -330,6 +330,7 @@ def test_a_stored_design_is_read_as_it_was(two_faults, tmp_path):
     assert again.certificate.check().valid
 
 
+@pytest.mark.long
 def test_a_stored_design_is_proved_in_another_process(designs, tmp_path):
     path = tmp_path / "d1.json"
     designs["d1"].save(path)

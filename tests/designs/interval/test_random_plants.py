@@ -102,6 +102,7 @@ def check(seed, run_many, options):
     return fine
 
 
+@pytest.mark.long
 @settings(max_examples=6, derandomize=True, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_whatever_is_designed_encloses(run_many, seed):

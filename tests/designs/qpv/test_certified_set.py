@@ -111,6 +111,7 @@ def violations(observer, alpha, count=10_000, duration=2.0, h=0.01, P=None):
     return ratio, largest
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["box_insc"])
 def test_V_decays_at_every_step_from_ten_thousand_starts(name, designed):
     observer = designed(name)

@@ -62,6 +62,7 @@ def follow(observer, plant, n, seed, steps=60):
     return wrong, np.array(f_high - f_low).ravel()
 
 
+@pytest.mark.long
 @settings(max_examples=5, deadline=None, derandomize=True)
 @given(st.integers(0, 10_000), st.sampled_from([0.02, 0.1]))
 def test_the_observer_on_random_compartments(seed, Ts):
@@ -71,6 +72,7 @@ def test_the_observer_on_random_compartments(seed, Ts):
     assert wrong == 0
 
 
+@pytest.mark.long
 @settings(max_examples=5, deadline=None, derandomize=True)
 @given(st.integers(0, 10_000), st.sampled_from([0.02, 0.1]))
 def test_the_bank_on_random_compartments(seed, Ts):
