@@ -268,7 +268,11 @@ def _rescaled(design: GeneralDesign, stated: Stated, found: Solution) -> Stated:
     P = found["P"]
     if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
         return stated
-    size = np.clip(np.sqrt(np.diag(np.linalg.inv(P))), 1e-3, 1e3)
+    inverse = np.diag(np.linalg.inv(P))
+    if not np.all(inverse > 0.0):
+        # barely definite: its inverse says nothing
+        return stated
+    size = np.clip(np.sqrt(inverse), 1e-3, 1e3)
     if np.all((size > 0.1) & (size < 10.0)):
         return stated
     return state(design, replace(stated.units, x=stated.units.x * size))

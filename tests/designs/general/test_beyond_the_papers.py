@@ -1,11 +1,14 @@
 """Plants that a paper does not have go to the observer of the general class by themselves."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sympy as sp
 
 import obsynth as ob
 from methods import motor, tank, two_tanks
+from obsynth.designs.general.synthesis import _rescaled
 
 R = sp.Rational
 
@@ -80,3 +83,13 @@ def test_what_neither_class_has_is_refused_as_before():
         ob.HinfUIO().design(plant)
     with pytest.raises(ob.StructureError, match="disturbance n has no bound"):
         ob.BoundedErrorUIO().design(plant)
+
+
+def test_a_matrix_that_is_barely_definite_gives_no_units(monkeypatch):
+    """Mutant: units that are no numbers, and a problem without unknowns (ExpressionError)."""
+    stated = SimpleNamespace(units=None)
+    for matrix in (-np.eye(3), np.full((3, 3), np.nan)):
+        assert _rescaled(None, stated, {"P": matrix}) is stated
+    # an inverse that rounding has turned over
+    monkeypatch.setattr(np.linalg, "inv", lambda matrix: -matrix)
+    assert _rescaled(None, stated, {"P": np.eye(3)}) is stated
