@@ -11,6 +11,7 @@ process of its own; imports do not count.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import resource
 import subprocess
@@ -42,17 +43,14 @@ def plant_of(n: int) -> Any:
 
 def run_row(way: str, n: int, gamma: float | None) -> dict[str, Any]:
     """One row, in this process."""
-    import clarabel  # noqa: F401
-    import cvxpy  # noqa: F401
-    import scipy.optimize  # noqa: F401
-
+    for heavy in ("clarabel", "cvxpy", "scipy.optimize"):
+        importlib.import_module(heavy)
     import obsynth as ob
 
-    methods = (ob.BoundedErrorUIO, ob.split, ob.plants)
     model = plant_of(n)
     start = time.perf_counter()
     if way == "naive cvxpy":
-        problem = methods[0](gamma=gamma, form="corrected").problem(model).to_cvxpy()
+        problem = ob.BoundedErrorUIO(gamma=gamma, form="corrected").problem(model).to_cvxpy()
         problem.solve(solver="CLARABEL")
         row: dict[str, Any] = {"note": f"{problem.status} at gamma {gamma:.3g}, not proved"}
     else:

@@ -137,6 +137,27 @@ def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] 
             base[i] if T0[i, :] == sp.eye(size)[i, :] else sp.expand(T0[i, :].dot(sp.Matrix(base)))
             for i in range(size)
         ]
+    noise = [*loose, *(step for step in steps if step is not None)]
+    made = _assembled(model, states, noise, rows, outputs)
+    return Extended(
+        made,
+        tuple(s.name for s in followed),
+        tuple(s.name for s in free),
+        D0,
+        L0,
+        T0,
+        picked,
+    )
+
+
+def _assembled(
+    model: Plant,
+    states: list[Signal],
+    noise: list[Signal],
+    rows: list[sp.Expr],
+    outputs: list[sp.Expr],
+) -> Plant:
+    """Return the plant of these states, disturbances, rows and outputs; inputs are the model's."""
     made = Plant(model.name)
     made.add_signals(
         [replace(s, role=Role.STATE, rate=None, of=None, constant=False) for s in states]
@@ -145,7 +166,6 @@ def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] 
     made.add_signals(
         [replace(s, role=Role.INPUT, constant=False, value=None) for s in model.rho if s.measured]
     )
-    noise = [*loose, *(step for step in steps if step is not None)]
     made.add_signals(
         [
             replace(
@@ -163,15 +183,7 @@ def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] 
     )
     made.dynamics(rows, Ts=model.exact_Ts)
     made.outputs(outputs, names=list(model.output_names))
-    return Extended(
-        made,
-        tuple(s.name for s in followed),
-        tuple(s.name for s in free),
-        D0,
-        L0,
-        T0,
-        picked,
-    )
+    return made
 
 
 def _step(fault: Signal, taken: set[str]) -> Signal | None:

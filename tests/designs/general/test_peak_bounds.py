@@ -252,6 +252,20 @@ def test_a_first_error_fades_no_slower_than_is_said(designed, form):
             s = G @ s
 
 
+def test_an_exponential_counts_the_step_by_which_an_input_is_late():
+    """Scalars: sums of (M A0 / decay)^k, an input one step later. Mutant: not divided by decay."""
+    Z, decay = 0.45, 0.6
+    design = replace(read(scalar()).design, Z=np.array([[Z]]))
+    design = bound_peak(replace(design, family=replace(fixed(design.family))))
+    radius = np.array([[0.1, 0.0], [0.0, 0.0]])
+    design = replace(design, family=replace(design.family, radius=radius))
+    (A, _), (C, _) = design.middle
+    keep = abs(1 - Z * C)
+    gain = 0.1 * keep / decay / (1 - abs(A) * keep / decay)
+    start = exponential(error_system(design), decay)[2]
+    assert start[0, 0] == pytest.approx(keep / (1 - gain), rel=1e-6)
+
+
 def test_fading_with_less_is_not_proved(designed):
     system, fading = error_system(designed), designed.bound.fading
     assert all(claim.holds for claim in prove_fading(system, fading))
