@@ -1,6 +1,7 @@
 """What the user says: plants, signals, equations, scenarios."""
 
 from obsynth.symbolic import plants as plants
+from obsynth.symbolic import records as records
 from obsynth.symbolic import scenarios as scenarios
 from obsynth.symbolic.convert import nearest_double as nearest_double
 from obsynth.symbolic.convert import to_sx as to_sx
@@ -10,6 +11,7 @@ from obsynth.symbolic.errors import PlantError as PlantError
 from obsynth.symbolic.functions import phi1 as phi1
 from obsynth.symbolic.functions import tanhc as tanhc
 from obsynth.symbolic.plant import Plant as Plant
+from obsynth.symbolic.record import Record as Record
 from obsynth.symbolic.scenario import Scenario as Scenario
 from obsynth.symbolic.signals import Role as Role
 from obsynth.symbolic.signals import Signal as Signal

@@ -46,8 +46,10 @@ from .evaluate import simulate as simulate
 from .symbolic import ObsynthError as ObsynthError
 from .symbolic import Plant as Plant
 from .symbolic import PlantError as PlantError
+from .symbolic import Record as Record
 from .symbolic import Scenario as Scenario
 from .symbolic import plants as plants
+from .symbolic import records as records
 from .symbolic import scenarios as scenarios
 
 __version__: str

@@ -8,6 +8,7 @@ from obsynth.symbolic.plants.haldane_bioreactor import haldane_bioreactor
 from obsynth.symbolic.plants.hinf_example import hinf_example
 from obsynth.symbolic.plants.induction_motor import induction_motor
 from obsynth.symbolic.plants.interval_example import interval_example
+from obsynth.symbolic.plants.leaking_tanks import leaking_tanks
 from obsynth.symbolic.plants.lorenz import lorenz
 from obsynth.symbolic.plants.planar_arm import planar_arm, planar_arm_bias, planar_arm_terms
 from obsynth.symbolic.plants.pmsm_dq import pmsm_dq
@@ -37,6 +38,7 @@ __all__ = [
     "interval_example",
     "kinematic_bicycle",
     "klatt_engell_reactor",
+    "leaking_tanks",
     "lorenz",
     "planar_arm",
     "planar_arm_bias",
