@@ -113,7 +113,7 @@ def lift(
     """Return what nodes of a program enclose for variables between lifted ends."""
     arithmetic = _Arithmetic(Rounding() if rounding is None else rounding)
     found: dict[int, Lifted] = {}
-    for index in _needed(program, nodes):
+    for index in needed(program, nodes):
         node = program.nodes[index]
         if index in program.constants:
             low, high = (float(end[0]) for end in program.constants[index])
@@ -125,20 +125,38 @@ def lift(
     return [found[index] for index in nodes]
 
 
-def combine(op: str, *args: Lifted, rounding: Rounding) -> Lifted:
-    """Return one operation of the rules, ``add``, ``subtract``, ``multiply`` or ``divide``."""
-    return _Arithmetic(rounding).apply(Node(op), list(args))
+def combine(op: str, *args: Lifted, rounding: Rounding, number: int = 0) -> Lifted:
+    """Return one operation of the rules; `number` is the exponent of ``power_int``."""
+    return _Arithmetic(rounding).apply(Node(op, (), number), list(args))
 
 
-def _needed(program: Program, nodes: Sequence[int]) -> list[int]:
-    needed: set[int] = set()
+def needed(program: Program, nodes: Sequence[int]) -> list[int]:
+    """List nodes and what they are made of, operands first."""
+    found: set[int] = set()
     stack = list(nodes)
     while stack:
         index = stack.pop()
-        if index not in needed:
-            needed.add(index)
+        if index not in found:
+            found.add(index)
             stack.extend(() if index in program.constants else program.nodes[index].args)
-    return sorted(needed)
+    return sorted(found)
+
+
+def varying(program: Program, nodes: Sequence[int], variables: Sequence[Lifted]) -> set[int]:
+    """Return those of some nodes, operands first, that depend on a variable that is no point."""
+    found: set[int] = set()
+    for index in nodes:
+        node = program.nodes[index]
+        if index in program.constants:
+            continue
+        if not is_point(variables[node.number]) if node.op == "input" else found & {*node.args}:
+            found.add(index)
+    return found
+
+
+def is_point(a: Lifted) -> bool:
+    """Whether both ends are one number."""
+    return bool(ca.is_equal(a.lower, a.upper, 2))
 
 
 def _within(low: float, high: float) -> tuple[float, float]:
@@ -163,7 +181,7 @@ class _Arithmetic:
         if form is None or (nowhere and node.op != "divide"):
             return Lifted.number(low, high)
         lifted = form(
-            self, [_clamped(a) for a in args] if node.op in PARTIAL else args, low, high, *extra
+            self, [clamped(a) for a in args] if node.op in PARTIAL else args, low, high, *extra
         )
         return Lifted.number(low, high) if lifted is None else lifted
 
@@ -358,7 +376,7 @@ class _Arithmetic:
         return Lifted(args[0].upper <= 0.0, args[0].lower <= 0.0, low, high)
 
 
-def _clamped(a: Lifted) -> Lifted:
+def clamped(a: Lifted) -> Lifted:
     """Keep the ends between the numbers, where an operation is not defined beyond them."""
     if ca.SX(a.lower).is_constant() and ca.SX(a.upper).is_constant():
         return a
@@ -366,7 +384,7 @@ def _clamped(a: Lifted) -> Lifted:
 
 
 def _ends(a: Lifted) -> tuple[ca.SX, ...]:
-    return (a.lower,) if ca.is_equal(a.lower, a.upper, 2) else (a.lower, a.upper)
+    return (a.lower,) if is_point(a) else (a.lower, a.upper)
 
 
 def _product(a: Lifted, b: Lifted) -> tuple[ca.SX, ca.SX]:

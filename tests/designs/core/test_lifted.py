@@ -4,6 +4,7 @@ import casadi as ca
 import mpmath as mp
 import numpy as np
 import pytest
+from operations import CASES, NEAR, PRECISION, TRUTHS, UP, drawn, points
 from tapes import NUMPY, tape
 
 from obsynth.derive.intervals.graph import Node
@@ -12,12 +13,6 @@ from obsynth.derive.intervals.rules import RULES
 from obsynth.designs.core import lifted
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding, lift
 
-PRECISION = 400
-WHOLE, NEAR, UP, DOWN, OPEN = (-FAR, FAR), (-3.0, 5.0), (0.5, 3.0), (-3.0, -0.5), (-2.0, 0.0)
-SIGNS = (WHOLE, NEAR, UP, DOWN, OPEN, (0.0, 4.0))
-PAIRS = [(a, b) for a in SIGNS for b in SIGNS]
-TRUTHS = ((0.0, 1.0),)
-CHOICES = [(*TRUTHS, a, b) for a, b in ((NEAR, NEAR), (UP, DOWN), (WHOLE, WHOLE))]
 ROUNDED = [
     *("add", "subtract", "multiply", "divide", "power_int", "power_const", "power", "sqrt"),
     *("hypotenuse", "arctangent2", "exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh"),
@@ -25,77 +20,9 @@ ROUNDED = [
 ]
 
 
-def one(*ranges):
-    return [(r,) for r in ranges]
-
-
-# operation: the ranges of its operands for which it is tried, its value
-OPERATIONS = {
-    "add": (PAIRS, lambda a, b: a + b),
-    "subtract": (PAIRS, lambda a, b: a - b),
-    "multiply": (PAIRS, lambda a, b: a * b),
-    "divide": (PAIRS, lambda a, b: a / b),
-    "negate": (one(*SIGNS), lambda a: -a),
-    "twice": (one(*SIGNS), lambda a: 2 * a),
-    "sqrt": (one((0.0, 4.0), (0.0, FAR), UP), mp.sqrt),
-    "nonnegative": (one((0.0, 4.0), UP), lambda a: a),
-    "absolute": (one(*SIGNS), abs),
-    "minimum": (PAIRS, min),
-    "maximum": (PAIRS, max),
-    "meet": (PAIRS, lambda a, b: a),
-    "with_zero": (one(*SIGNS), lambda a: a),
-    "power_const": ([(r, (p, p)) for r in (UP, (0.0, 4.0)) for p in (1.5, 2.25, 0.3)], mp.power),
-    "power": ([(UP, NEAR), (UP, UP), ((0.01, 30.0), DOWN)], mp.power),
-    "select": (CHOICES, lambda c, a, b: a if c else b),
-    "if_else_zero": ([c[:2] for c in CHOICES], lambda c, a: a if c else mp.mpf(0)),
-    "less": (PAIRS, lambda a, b: mp.mpf(a < b)),
-    "less_equal": (PAIRS, lambda a, b: mp.mpf(a <= b)),
-    "boundary_weight": (PAIRS, lambda a, b: mp.mpf(a < b) if a != b else mp.mpf("0.5")),
-    "logical_not": ([TRUTHS], lambda a: mp.mpf(not a)),
-    "conjunction": ([TRUTHS * 2], min),
-    "disjunction": ([TRUTHS * 2], max),
-    "hypotenuse": (PAIRS, mp.hypot),
-    "arctangent2": ([(NEAR, UP), (UP, WHOLE), (DOWN, NEAR), (WHOLE, (0.5, FAR))], mp.atan2),
-    "exp": (one(NEAR, UP, DOWN, (-700.0, 700.0), WHOLE), mp.exp),
-    "expm1": (one(NEAR, UP, (-50.0, 50.0)), mp.expm1),
-    "log": (one(UP, (1e-300, FAR), (0.0, 4.0)), mp.log),
-    "log1p": (one(UP, (-0.9, 4.0), (0.0, FAR)), mp.log1p),
-    "sinh": (one(NEAR, UP, (-200.0, 200.0)), mp.sinh),
-    "cosh": (one(NEAR, UP, DOWN, (-200.0, 200.0)), mp.cosh),
-    "tanh": (one(NEAR, UP, WHOLE), mp.tanh),
-    "asinh": (one(NEAR, UP, WHOLE), mp.asinh),
-    "acosh": (one((1.0, 3.0), (1.0, FAR)), mp.acosh),
-    "atanh": (one((-0.9, 0.9), (0.2, 0.7)), mp.atanh),
-    "asin": (one((-1.0, 1.0), (0.2, 0.7)), mp.asin),
-    "atan": (one(NEAR, UP, WHOLE), mp.atan),
-    "erf": (one(NEAR, UP, WHOLE), mp.erf),
-    "sine": (one(NEAR, (0.2, 0.7), (-1e3, 1e3), WHOLE), mp.sin),
-    "cosine": (one(NEAR, (0.2, 0.7), (-1e3, 1e3), WHOLE), mp.cos),
-    "tangent": (one((-1.5, 1.5), (0.2, 0.7), (1.6, 4.7)), mp.tan),
-}
-POWERS = {n: (one(*SIGNS[1:]), lambda a, n=n: a**n) for n in (2, 3, 4, 5)}
-CASES = {**OPERATIONS, **{f"power_int {n}": case for n, case in POWERS.items()}}
-
-
 def test_every_form_is_tried():
     assert {name.split()[0] for name in CASES} == set(lifted._FORMS)
     assert set(ROUNDED) <= set(lifted._FORMS)
-
-
-def drawn(rng, ranges, count):
-    """Ends inside of ranges: anywhere, of any size, one number, whole range, near crests."""
-    low, high = np.clip(ranges, -1e40, 1e40)
-    shape = (2, count)
-    found = rng.uniform(low, high, shape) if high - low < 1e6 else rng.normal(0.0, 50.0, shape)
-    sizes = 10.0 ** rng.uniform(-30, 2, shape) * rng.choice([-1.0, 1.0], shape)
-    found = np.where(rng.uniform(size=count) < 0.2, sizes, found)
-    crests = 0.5 * np.pi * rng.integers(-12, 13, shape)
-    found = np.where(rng.uniform(size=shape) < 0.1, crests, found)
-    found = np.where(rng.uniform(size=shape) < 0.05, np.array([[low], [high]]), found)
-    if ranges == (0.0, 1.0):
-        found = np.round(np.abs(found)) % 2
-    found = np.sort(np.clip(found, low, high), axis=0)
-    return np.where(rng.uniform(size=count) < 0.1, found[:1], found)
 
 
 def code(op, number, ranges, rounding):
@@ -110,16 +37,6 @@ def code(op, number, ranges, rounding):
 def run(function, boxes):
     given = [end[None, :] for box in boxes for end in box]
     return [np.array(v).ravel() for v in function(*given)]
-
-
-def points(rng, boxes):
-    """Corners of boxes and points inside of them, tuples of rows of numbers."""
-    for corner in range(2 ** len(boxes)):
-        yield [box[(corner >> i) & 1] for i, box in enumerate(boxes)]
-    for _ in range(2):
-        share = [rng.uniform(size=box.shape[1]) for box in boxes]
-        inner = [b[0] + s * (b[1] - b[0]) for b, s in zip(boxes, share, strict=True)]
-        yield [np.clip(v, *b) for v, b in zip(inner, boxes, strict=True)]
 
 
 def missed(case, count=10, rounding=None, seed=0):
