@@ -3,16 +3,10 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import obsynth as ob
-
-# Gains of the last row of the comparison in the peak-bound analysis, exact decimals.
-PEAK_GAINS = {
-    "K": np.array([[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]),
-    "F": np.array([[0.6766, 0.0023, 0], [-0.0042, 0.6263, 0]]),
-}
+from methods import PEAK_GAINS
 
 
 @pytest.fixture(scope="session")

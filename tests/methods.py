@@ -12,6 +12,12 @@ import obsynth as ob
 from luenberger.method import Luenberger
 from obsynth.designs.general.method import GeneralUIO
 
+# Gains of the last row of the comparison in the peak-bound analysis, exact decimals.
+PEAK_GAINS = {
+    "K": np.array([[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]),
+    "F": np.array([[0.6766, 0.0023, 0], [-0.0042, 0.6263, 0]]),
+}
+
 
 @dataclass(frozen=True)
 class Entry:

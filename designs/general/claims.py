@@ -104,10 +104,12 @@ def covers(design: GeneralDesign, fresh: GeneralModel) -> Iterator[Claim]:
 
 def numbers(design: GeneralDesign) -> Numbers:
     """Return gains, performance and steady half widths."""
-    bound = design.bound
+    bound, gains, n = design.bound, {"L": design.L}, len(design.plant.x)
+    if np.any(design.K):
+        gains |= {"K": design.K[:n], "F": design.K[n:]}
     if isinstance(bound, EnergyBound):
         levels = {"l2_gain": bound.mu, "mu": bound.mu, "attained_gain": bound.attained}
-        return Numbers({"L": design.L}, levels, searched=("attained_gain",))
+        return Numbers(gains, levels, searched=("attained_gain",))
     widths = steady(design)
     finite = widths[np.isfinite(widths)]
     performance = {"sum_half_widths": float(finite.sum())}
@@ -115,7 +117,7 @@ def numbers(design: GeneralDesign) -> Numbers:
         performance["decay"] = bound.fading.decay
     else:
         performance |= {"gamma": bound.gamma, "decay": 1.0 - bound.gamma}
-    return Numbers({"L": design.L}, performance, widths)
+    return Numbers(gains, performance, widths)
 
 
 def guarantee(design: GeneralDesign) -> Guarantee:

@@ -3,14 +3,16 @@
 For the Jacobians that occur the error system is linear, so the responses to the disturbances
 (within the peak bounds) and to the first error add up. The latter obeys
 
-    e_q = T e_p,   e_c = M e_p - Z b delta' ...,   e_p+ = A0 e_c + b delta ... .
+    e_q = T e_p,   e_c = M e_p - Z b delta' ...,   e_p+ = L T e_p + b delta ... - B b delta' ... ,
+
+with ``B = A0 Z + K`` and ``L = A0 - B C0``.
 
 Let Y be any regular matrix, eta = Y e_p, and mu_a = |eta_a|_2 over blocks of one or two coordinates
 (two for a complex pair). The triangle inequality in each block gives
 
     mu+ <= G mu,    |e_q| <= R_q mu,  |e_c| <= R_c mu,    mu_0 <= S |e_p| at the start,
     R_q = |T Y^-1|,   R_c = |M Y^-1| + |Z b| r R_q,   S = |Y|,
-    G = |Y A0 M Y^-1| + |Y A0 Z b| r R_q + |Y b| r R_c ,
+    G = |Y L T Y^-1| + |Y B b| r R_q + |Y b| r R_c ,
 
 where |.| of a block is its spectral norm. All are nonnegative, so the recursion started at
 ``S |e_p|`` stays above whatever the first error does, for every k >= 0 and every sequence of
@@ -43,7 +45,7 @@ from obsynth.designs.general.modal import (
     proved_decay,
     single,
 )
-from obsynth.designs.general.peak import response_of_q, small_gain_solution, spectral_radius
+from obsynth.designs.general.peak import small_gain_solution, spectral_radius
 from obsynth.designs.general.record import Fading, Modes
 from obsynth.designs.general.responses import power_sum, response
 from obsynth.designs.general.system import ErrorSystem, magnitude
@@ -89,27 +91,22 @@ def exponential(system: ErrorSystem, decay: float) -> Recursion:
     parts = [system.B_y, Enclosure.of(F.columns), eye]
     B = Enclosure(np.hstack([p.mid for p in parts]), np.hstack([p.rad for p in parts]))
     # an input of e_p arrives one step later, which 1 / decay stands for
-    c_sum = raised(response(powers, np.eye(N), system.M @ B).total / decay, 1)
-    q_first = magnitude(system.T @ B)
-    q_sum = raised(response_of_q(system, powers, B) / decay, 2)
-    q_sum = raised(add_up(q_sum, q_first) / decay, 2)
-    S = np.vstack([q_sum, c_sum])
+    S = raised(response(powers, system.seen, system.T @ B).total / decay, 1)
     at = np.cumsum([0, len(h.radii), len(F.radii), N])
     S_h, S_F, U = (S[:, a:b] for a, b in pairwise(at.tolist()))
     Z, R_h, R_F = np.abs(system.Z), system.rest[N:, :N], system.rest[:N, :N]
     drawn_h = add_up(
         product_up(S_h, h.coupling(N)),
-        product_up(U, product_up(product_up(np.abs(system.A0), Z), R_h)),
+        product_up(U, product_up(magnitude(system.back), R_h)),
     )
     own = add_up(product_up(product_up(Z, np.abs(h.columns)), h.coupling(N)), product_up(Z, R_h))
     drawn_h[N:] = add_up(drawn_h[N:], own)
     gain = np.hstack([drawn_h, add_up(product_up(S_F, F.coupling(N)), product_up(U, R_F))])
     if not spectral_radius(gain) < 1.0:
         raise InfeasibleDesign(f"peak bounds: no decay of {decay:.6g} can be guaranteed")
-    # responses without feedback: e_c is M e_p, then powers of M A0; e_q likewise
-    free_c = response(powers, np.eye(N), system.M)
-    free_q = add_up(magnitude(system.T), raised(response_of_q(system, powers, eye) / decay, 1))
-    free = np.vstack([free_q, add_up(free_c.terms.max(axis=0), free_c.spread)])
+    # responses without feedback
+    first = response(powers, system.seen, system.T)
+    free = add_up(first.terms.max(axis=0), first.spread)
     columns = [small_gain_solution(gain, free[:, j])[N:] for j in range(N)]
     unit = np.eye(N)
     return decay * unit, unit, np.column_stack(columns)
@@ -142,7 +139,7 @@ def recursion(system: ErrorSystem, modes: Modes, room: float = 1.0) -> Recursion
         product_up(norms(Y @ system.B_y, blocks, single(len(h.radii))), seen_h),
         product_up(norms(Y @ F.columns, blocks, single(len(F.radii))), seen_F),
         product_up(size, product_up(R_F, reach)),
-        product_up(size, product_up(product_up(np.abs(system.A0), Z), left_h)),
+        product_up(size, product_up(magnitude(system.back), left_h)),
     )
     return G, reach, size
 

@@ -120,12 +120,22 @@ class GeneralUIO(Method):
         return self._stored(given, weights, units(given, weights))
 
     def fix(self, model: GeneralModel, gains: Mapping[str, ArrayLike]) -> GeneralDesign:
-        """Bound the errors of a given ``L`` of shape (n + n_f, m)."""
-        blank = model.design
-        L = read_gains(gains, {"L": blank.L0.shape})["L"]
+        """Bound the errors of given gains.
+
+        ``L`` (n + n_f, m) corrects the state and the faults that are followed by the readings;
+        ``K`` (n, m) and ``F`` (n_f, m), where given, move their next prediction by what is left
+        of the innovation where unknown inputs are taken away.
+        """
+        blank, n = model.design, len(model.design.plant.x)
+        N, m = blank.L0.shape
+        shapes = {"L": (N, m), "K": (n, m), "F": (N - n, m)}
+        found = read_gains(gains, shapes, () if {"K", "F"} & set(gains) else ("K", "F"))
+        L, K = found["L"], blank.K
+        if "K" in found:
+            K = np.vstack([found["K"], found["F"]])
         Z = L.copy()
         Z[:, list(model.extended.picked)] = 0.0
-        design = blank.changed(Z=Z, options=self.options())
+        design = blank.changed(Z=Z, K=K, options=self.options())
         if not np.allclose(design.L, L, rtol=1e-9, atol=1e-12 * np.abs(L).max(initial=0.0)):
             raise ObsynthError(
                 f"L does not take {', '.join(model.extended.free)} away: (I - L C) D0 has to be "
@@ -134,6 +144,12 @@ class GeneralUIO(Method):
             )
         if self.bounds == "peak":
             return bound_peak(settle(design))
+        if np.any(K):
+            raise ObsynthError(
+                f'K and F move predictions, of which bounds="{self.bounds}" knows nothing: give '
+                'L alone, or bounds="peak"',
+                option="gains",
+            )
         weights = self._weights(model)
         return self._stored(design, weights, units(design, weights), Z)
 

@@ -68,6 +68,7 @@ def of(
         v_radius=radius,
         L0=np.array(extended.L0.evalf(25).tolist(), dtype=float).reshape(N, m),
         Z=np.zeros((N, m)),
+        K=np.zeros((N, m)),
         family=bounds.family,
         rounding=Rounding(none, none, none),
         bound=PeakBound(np.zeros(2 * N), Fading(nothing, nothing, nothing, 0.0, None)),

@@ -7,8 +7,8 @@ the instant k,
 
 n from disturbances, rounding and the channels that disturbances drive, G from those that errors
 drive. Errors e_q at k follow from instants before, e_c at k from these and e_q at k, so if
-``n + G b <= b`` then b bounds both at every k. Responses of e_c to an input B of e_p are those of
-``M A0`` to M B, and of e_q ``T B`` and then ``T A0`` times these, so one sequence of powers serves
+``n + G b <= b`` then b bounds both at every k. Responses of e_q to an input B of e_p are those of
+``T (A0 - back C0)`` to T B, and of e_c ``I - Z C0`` times these, so one sequence of powers serves
 both. The certificate is one inequality in numbers that are all rounded up.
 """
 
@@ -44,9 +44,7 @@ def error_sums(system: ErrorSystem, extra: Extra) -> Sums:
     parts = [system.B_v, system.B_y, Enclosure.of(F.columns), eye]
     B = Enclosure(np.hstack([p.mid for p in parts]), np.hstack([p.rad for p in parts]))
     powers = power_sum(system.closed)
-    after = response(powers, np.eye(N), system.M @ B).total
-    seen = response_of_q(system, powers, B)
-    S = np.vstack([seen, after])
+    S = response(powers, system.seen, system.T @ B).total
     at = np.cumsum([0, n_v, len(h.radii), len(F.radii), N])
     S_v, S_h, S_F, U = (S[:, a:b] for a, b in pairwise(at.tolist()))
     Z = np.abs(system.Z)
@@ -55,30 +53,19 @@ def error_sums(system: ErrorSystem, extra: Extra) -> Sums:
     S_h = add_up(S_h, own)
     R_F, R_h = system.rest[:N], system.rest[N:]
     v_F, v_h = (product_up(R[:, N:], system.v_radius) for R in (R_F, R_h))
-    AZ = product_up(np.abs(system.A0), Z)
+    back = magnitude(system.back)
     at_once = np.concatenate([extra.q, add_up(extra.c, product_up(Z, v_h))])
     n = add_up(
         product_up(S_v, system.v_radius),
         product_up(S_h, h.sizes(N, system.v_radius)),
         product_up(S_F, F.sizes(N, system.v_radius)),
-        product_up(U, add_up(extra.p, v_F, product_up(AZ, v_h))),
+        product_up(U, add_up(extra.p, v_F, product_up(back, v_h))),
         at_once,
     )
-    drawn_h = add_up(product_up(S_h, h.coupling(N)), product_up(U, product_up(AZ, R_h[:, :N])))
+    drawn_h = add_up(product_up(S_h, h.coupling(N)), product_up(U, product_up(back, R_h[:, :N])))
     drawn_h[N:] = add_up(drawn_h[N:], product_up(Z, R_h[:, :N]))
     drawn_F = add_up(product_up(S_F, F.coupling(N)), product_up(U, R_F[:, :N]))
     return Sums(n, np.hstack([drawn_h, drawn_F]), powers)
-
-
-def response_of_q(system: ErrorSystem, powers: PowerSum, B: Enclosure) -> FloatArray:
-    """Bound ``|T B| + sum_k |T A0 (M A0)^k M B|``, shape (N, inputs)."""
-    TA = system.T @ system.A0
-    inner = system.M @ B
-    found = response(powers, TA.mid, inner).total
-    if np.any(TA.rad):
-        size = product_up(powers.bound, magnitude(inner))
-        found = add_up(found, product_up(raised(TA.rad, 1), size))
-    return add_up(magnitude(system.T @ B), found)
 
 
 def spectral_radius(matrix: FloatArray) -> float:

@@ -129,6 +129,7 @@ class GeneralDesign(Record):
     v_centre, v_radius: box of the disturbances of the extended plant
     L0: what takes unknown inputs away
     Z: the gain; zero where L0 reads
+    K: the gain of the innovation in the next prediction, which peak bounds alone can have
     family: Jacobians of the extended plant's rows and outputs by its states and disturbances
     rounding: allowances of one step
     options: the options of the method, as given
@@ -141,13 +142,19 @@ class GeneralDesign(Record):
     v_radius: Annotated[FloatArray, "n_v"]
     L0: Annotated[FloatArray, "N m"]
     Z: Annotated[FloatArray, "N m"]
+    K: Annotated[FloatArray, "N m"]
     family: Annotated[AffineFamily, "N+m N+n_v"]
     rounding: Rounding
     bound: PeakBound | EllipsoidBound | EnergyBound
     options: Mapping[str, Any]
 
     def check(self) -> None:
-        """Refuse faults that the plant does not have."""
+        """Refuse faults that the plant does not have, and gains that the bound does not know."""
+        if np.any(self.K) and not isinstance(self.bound, PeakBound):
+            raise CertificateError(
+                f"the stored design has a gain K of predictions and a bound of kind "
+                f"{self.bound.KIND}; peak bounds alone have it"
+            )
         named = (*self.unfollowed, *self.divided)
         unknown = [name for name in named if name not in self.plant.names("f")]
         if unknown or len(set(named)) < len(named):

@@ -200,21 +200,22 @@ def _powers(matrix: FloatArray, most: int) -> FloatArray:
     return powers[:steps]
 
 
-def response(powers: PowerSum, outputs: FloatArray, B: Enclosure) -> Response:
+def response(powers: PowerSum, outputs: FloatArray | Enclosure, B: Enclosure) -> Response:
     """Bound the responses of some outputs to some inputs.
 
     ``|Q A^k B| <= |Q X_k B| + |Q| |A^k - X_k| |B|``; the rounding of the two
-    products and the radius of B are bounded in the same way.
+    products and the radii of B and Q are bounded in the same way.
     """
+    Q = outputs if isinstance(outputs, Enclosure) else Enclosure.of(outputs)
     size = B.mid.shape[0]
     steps = powers.steps
-    terms = np.abs((outputs @ powers.powers) @ B.mid)
+    terms = np.abs((Q.mid @ powers.powers) @ B.mid)
     weight = raised(gamma_bound(2 * size + 2) * np.abs(B.mid) + B.rad, 4)
-    inner = add_up(
-        product_up(powers.total, weight),
-        product_up(powers.error, raised(np.abs(B.mid) + B.rad, 1)),
-    )
-    spread = product_up(np.abs(outputs), inner)
+    most = raised(np.abs(B.mid) + B.rad, 1)
+    inner = add_up(product_up(powers.total, weight), product_up(powers.error, most))
+    spread = product_up(np.abs(Q.mid), inner)
+    if np.any(Q.rad):
+        spread = add_up(spread, product_up(Q.rad, product_up(powers.bound, most)))
     return Response(
         terms=terms, spread=spread, total=add_up(raised(terms.sum(axis=0), steps), spread)
     )

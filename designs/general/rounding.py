@@ -62,10 +62,14 @@ def needed(design: GeneralDesign) -> Rounding:
     boxes = {"x": limits.x, "u": limits.u, "y": np.column_stack([-most, most])}
     first, second, third = stages(design)
     leak = design.extended.leak(design.L0, most)
+    corrected = _over(design, second, boxes)
+    nu = corrected["nu"]
+    most = nu.size + nu.error
+    boxes["nu"] = np.column_stack([-most, most])
     return Rounding(
         q=(_over(design, first, boxes)["q"].error + leak) * UP,
-        c=_over(design, second, boxes)["c"].error * UP,
-        p=_over(design, third, boxes)["p"].error * UP,
+        c=corrected["c"].error * UP,
+        p=(_over(design, third, boxes)["p"].error + np.abs(design.K) @ nu.error) * UP,
     )
 
 

@@ -76,14 +76,15 @@ def _wider(box: FloatArray) -> FloatArray:
 
 
 def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return (xp, u, y) -> xq, (xq, u, y) -> xc and (xc, u) -> next xp.
+    """Return (xp, u, y) -> xq, (xq, u, y) -> (xc, nu) and (xc, u, nu) -> next xp.
 
     Rows and outputs are the extended plant's own at v0, inside the box of the states on which a
     slope depends, and go on outside with the middle of their slopes.
     """
     plant, N = design.extended.plant, design.size
     m = len(plant.output_names)
-    x, u, y = (ca.SX.sym(s, k) for s, k in (("x", N), ("u", len(plant.u)), ("y", m)))
+    sizes = {"x": N, "u": len(plant.u), "y": m, "nu": m}
+    x, u, y, nu = (ca.SX.sym(name, size) for name, size in sizes.items())
     empty = ca.DM(0, 1)
     box = np.where(curved(plant)[:, None], plant.box("x"), [-np.inf, np.inf])
     inner = clip(x, box)
@@ -94,7 +95,7 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
     loose = np.isfinite(box).any(axis=1)
     A0[:, np.flatnonzero(~loose).tolist()] = 0.0
     C0[:, np.flatnonzero(~loose).tolist()] = 0.0
-    rows = rows + ca.sparsify(A0) @ outside
+    rows = rows + ca.sparsify(A0) @ outside + ca.sparsify(ca.DM(design.K)) @ nu
     innovation = y - (outputs + ca.sparsify(C0) @ outside)
     # the outputs that L0 reads have constant slopes: no clipping there
     plain = plant.function()(x, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
@@ -102,11 +103,12 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
     if not design.extended.picked:
         first = x
     second = x + ca.sparsify(ca.DM(design.Z)) @ innovation
+    second, innovation = ca.densify(second), ca.densify(innovation)
     names = ["x", "u", "y"]
     return (
         ca.Function("first", [x, u, y], [ca.densify(first)], names, ["q"]),
-        ca.Function("second", [x, u, y], [ca.densify(second)], names, ["c"]),
-        ca.Function("third", [x, u], [ca.densify(rows)], names[:2], ["p"]),
+        ca.Function("second", [x, u, y], [second, innovation], names, ["c", "nu"]),
+        ca.Function("third", [x, u, nu], [ca.densify(rows)], ["x", "u", "nu"], ["p"]),
     )
 
 
@@ -298,11 +300,11 @@ def build_core(design: GeneralDesign) -> Core:
         expected = outputs(prediction, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
         y = seen.readings(expected)
         q = first(prediction, u, y)
-        c = second(q, u, y)
+        c, nu = second(q, u, y)
         sound = ca.logic_and(inside(prediction, prediction, limits.x), inside(q, q, limits.x))
         sound = ca.logic_and(sound, inside(c, c, limits.x))
         sound = ca.logic_and(sound, inside(u, u, limits.u))
-        moved = {"prediction": third(c, u)}
+        moved = {"prediction": third(c, u, nu)}
         if running is None:
             return Known(c[:n], spread(c, 0.0), None, None, moved, sound=sound)
         s = seen.memory["bound"]

@@ -4,18 +4,21 @@ The extended plant is ``x+ = F(x, u, v) + D0 phi, y = h(x, u, v)``, with rows F 
 of phi (see `extend`); the observer, in current form, with h and F continued affinely outside the
 box by the middle [A0 W0; C0 V0] of their Jacobians,
 
-    xq = xp + L0 (y - h(xp, u, v0)),   xc = xq + Z (y - h(xq, u, v0)),   xp+ = F(xc, u, v0).
+    xq = xp + L0 (y - h(xp, u, v0)),   nu = y - h(xq, u, v0),
+    xc = xq + Z nu,                    xp+ = F(xc, u, v0) + K nu.
 
 Let e_p = x - xp, less what L0 takes away, and e_q, e_c alike, v less v0, T = I - L0 C. Averages of
 Jacobians along the way from an estimate to the state lie in the convex family, so
 
-    e_q  = T e_p - L0 V v
-    e_c  = (I - Z C0) e_q - Z V0 v - sum_j Z b_j delta'_j [e_q; v]_(c_j)
-    e_p+ = A0 e_c + W0 v + sum_j b_j delta_j [e_c; v]_(c_j) ,     |delta_j|, |delta'_j| <= r_j ,
+    e_q  = T e_p - L0 V v ,    e_c  = e_q - Z nu ,
+    nu   = C0 e_q + V0 v + sum_j b_j delta'_j [e_q; v]_(c_j) ,
+    e_p+ = A0 e_c - K nu + W0 v + sum_j b_j delta_j [e_c; v]_(c_j) ,
 
-where delta of F and delta' of h are independent. One channel for every column of every direction:
-outside the box the state x in it satisfies ``x - sat(xhat) = Theta (x - xhat)`` with a diagonal
-0 <= Theta <= 1, which each column of the deviation shrinks with.
+with ``|delta_j|, |delta'_j| <= r_j``, where delta of F and delta' of h are independent, but delta'
+is the same for both gains: an innovation moves ``back = A0 Z + K`` in all, e_p+ is ``A0 e_q - back
+nu`` and so on. One channel for every column of every direction: outside the box the state x in it
+satisfies ``x - sat(xhat) = Theta (x - xhat)`` with a diagonal 0 <= Theta <= 1, which each column of
+the deviation shrinks with.
 """
 
 from dataclasses import dataclass
@@ -60,7 +63,8 @@ class ErrorSystem:
     """The matrices above, all enclosed. Shapes: N errors, n_v disturbances, m outputs.
 
     A0, W0, C0, V0: the middle, exact doubles
-    T, M: ``I - L0 C`` and ``(I - Z C0) T``, (N, N)
+    T, kept: ``I - L0 C`` and ``I - Z C0``, (N, N)
+    back: ``A0 Z + K``, (N, m)
     through, direct: ``L0 V`` and ``L0 V + Z (V0 - C0 L0 V)``, what v adds to e_q, e_c
     B_v, B_y: what v and the channels of h add to e_p
     of_h, of_F: channels; `of_h.columns` (m, .), `of_F.columns` (N, .)
@@ -75,7 +79,8 @@ class ErrorSystem:
     L0: FloatArray
     Z: FloatArray
     T: Enclosure
-    M: Enclosure
+    kept: Enclosure
+    back: Enclosure
     through: Enclosure
     direct: Enclosure
     B_v: Enclosure
@@ -91,14 +96,30 @@ class ErrorSystem:
         return len(self.A0)
 
     @cached_property
+    def M(self) -> Enclosure:
+        """``(I - Z C0) T``, which takes e_p to e_c, (N, N)."""
+        return self.kept @ self.T
+
+    @cached_property
+    def onward(self) -> Enclosure:
+        """``A0 - back C0``, which takes e_q to the next e_p, (N, N)."""
+        return Enclosure.of(self.A0) - self.back @ self.C0
+
+    @cached_property
     def closed(self) -> Enclosure:
-        """``M A0``, which moves e_c, (N, N)."""
-        return self.M @ self.A0
+        """What moves e_q, (N, N)."""
+        return self.T @ self.onward
 
     @cached_property
     def moving(self) -> Enclosure:
-        """``A0 M``, which moves e_p, (N, N)."""
-        return Enclosure.of(self.A0) @ self.M
+        """What moves e_p, (N, N)."""
+        return self.onward @ self.T
+
+    @cached_property
+    def seen(self) -> Enclosure:
+        """``[I; I - Z C0]``, which takes e_q to [e_q; e_c], (2 N, N)."""
+        eye, kept = np.eye(self.size), self.kept
+        return Enclosure(np.vstack([eye, kept.mid]), np.vstack([0.0 * eye, kept.rad]))
 
 
 def split_columns(
@@ -129,10 +150,10 @@ def error_system(design: GeneralDesign) -> ErrorSystem:
     widths = np.concatenate([np.ones(N), design.v_radius])
     eye, of = np.eye(N), Enclosure.of
     L0, Z = of(design.L0), of(design.Z)
-    kept = of(eye) - Z @ C0
     T = of(eye) - L0 @ Enclosure(C0, rest[N:, :N])
     through = L0 @ Enclosure(V0, rest[N:, N:])
-    direct = kept @ through + Z @ V0
+    shown = of(V0) - of(C0) @ through
+    back = of(A0) @ Z + design.K
     of_h = split_columns(family.directions, radii, slice(N, None), widths)
     of_F = split_columns(family.directions, radii, slice(0, N), widths)
     return ErrorSystem(
@@ -143,11 +164,12 @@ def error_system(design: GeneralDesign) -> ErrorSystem:
         L0=design.L0,
         Z=design.Z,
         T=T,
-        M=kept @ T,
+        kept=of(eye) - Z @ C0,
+        back=back,
         through=through,
-        direct=direct,
-        B_v=of(W0) - of(A0) @ direct,
-        B_y=-(of(A0) @ (Z @ of_h.columns)),
+        direct=through + Z @ shown,
+        B_v=of(W0) - of(A0) @ through - back @ shown,
+        B_y=-(back @ of_h.columns),
         of_h=of_h,
         of_F=of_F,
         rest=rest,
@@ -172,7 +194,9 @@ class Extra:
 
 def extra_inputs(system: ErrorSystem, design: GeneralDesign) -> Extra:
     """Bound what rounding and the leak of L0 add, (N,) each."""
-    rounding, kept = design.rounding, np.abs(np.eye(system.size) - system.Z @ system.C0)
-    kept = raised(kept + np.abs(system.Z) @ np.abs(system.C0) * 2.0**-48, 4)
-    c = add_up(product_up(kept, rounding.q), rounding.c)
-    return Extra(rounding.q, c, add_up(product_up(np.abs(system.A0), c), rounding.p))
+    rounding = design.rounding
+    c = add_up(product_up(magnitude(system.kept), rounding.q), rounding.c)
+    onward = product_up(magnitude(system.onward), rounding.q)
+    return Extra(
+        rounding.q, c, add_up(onward, product_up(np.abs(system.A0), rounding.c), rounding.p)
+    )

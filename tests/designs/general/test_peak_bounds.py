@@ -2,7 +2,8 @@
 
 Mutants, each of which fails here: the channels of h or of F without their coupling; delta and
 delta' taken as one; w counted once where it enters rows and outputs; e_q without L0 V; the rest of
-the family left out; the correction's own share of the channels of h left out.
+the family left out; the correction's own share of the channels of h left out; K without the
+channels of h, without V, without C0 or with the other sign; delta' of Z and of K taken as two.
 """
 
 from dataclasses import replace
@@ -22,6 +23,9 @@ from obsynth.designs.general.peak import error_sums, prove_peak, small_gain_solu
 from obsynth.designs.general.record import Rounding
 from obsynth.designs.general.system import error_system, extra_inputs
 
+# of one state: Z and K
+GAINS = [(0.2, 0.0), (0.45, 0.0), (0.8, 0.0), (0.0, 0.3), (0.0, 0.5), (0.3, 0.2)]
+
 
 def scalar(sign=1, touched=0):
     """One state; the same w in row and output; both slopes vary, by w too if touched."""
@@ -34,10 +38,11 @@ def scalar(sign=1, touched=0):
     return plant
 
 
-def exactly(Z, middle, reach, w=0.1):
+def exactly(Z, middle, reach, w=0.1, K=0.0):
     """The largest |e_q| and |e_c| of one state: corners of all signs, again and again.
 
-    middle, reach: of [A W; C V] and its deviations, each with a sign of its own
+    middle, reach: of [A W; C V] and its deviations, each with a sign of its own; both gains see
+    the same innovation
     """
     (A, W), (C, V) = middle
     (a, b), (c, d) = reach
@@ -45,9 +50,10 @@ def exactly(Z, middle, reach, w=0.1):
     s = signs[0]
     p = most = 0.0
     for _ in range(600):
-        e = (1 - Z * (C + c * signs[1])) * p - Z * (V + d * signs[2]) * s * w
+        nu = (C + c * signs[1]) * p + (V + d * signs[2]) * s * w
+        e = p - Z * nu
         most = max(most, np.abs(e).max())
-        p = np.abs((A + a * signs[3]) * e + (W + b * signs[4]) * s * w).max()
+        p = np.abs((A + a * signs[3]) * e - K * nu + (W + b * signs[4]) * s * w).max()
     return p, most
 
 
@@ -62,25 +68,25 @@ def fixed(family):
     return replace(family, ranges=np.repeat(middle, 2, axis=1))
 
 
-@pytest.mark.parametrize("Z", [0.2, 0.45, 0.8])
+@pytest.mark.parametrize(("Z", "K"), [*GAINS, (0.8, -0.4), (0.9, -0.54)])
 @pytest.mark.parametrize(("sign", "touched"), [(1, 0), (-1, 0), (1, 2), (-1, 2)])
-def test_bounds_of_one_state_are_above_the_worst_and_near_it(Z, sign, touched):
+def test_bounds_of_one_state_are_above_the_worst_and_near_it(Z, K, sign, touched):
     model = read(scalar(sign, touched))
-    design = bound_peak(replace(model.design, Z=np.array([[Z]])))
-    worst = exactly(Z, design.middle, reach_of(design.family))
+    design = bound_peak(replace(model.design, Z=np.array([[Z]]), K=np.array([[K]])))
+    worst = exactly(Z, design.middle, reach_of(design.family), K=K)
     assert np.all(design.bound.b >= worst)
     assert np.all(design.bound.b <= 1.25 * np.array(worst))
 
 
+@pytest.mark.parametrize(("Z", "K"), [(0.45, 0.0), (0.0, 0.3), (0.3, 0.2)])
 @pytest.mark.parametrize(("i", "j"), list(product(range(2), range(2))))
-def test_what_the_family_leaves_open_entry_by_entry_counts(i, j):
-    Z = 0.45
-    design = replace(read(scalar()).design, Z=np.array([[Z]]))
+def test_what_the_family_leaves_open_entry_by_entry_counts(i, j, Z, K):
+    design = replace(read(scalar()).design, Z=np.array([[Z]]), K=np.array([[K]]))
     radius = np.zeros((2, 2))
     radius[i, j] = 0.1
     family = replace(fixed(design.family), radius=radius)
     found = bound_peak(replace(design, family=family)).bound.b
-    worst = np.array(exactly(Z, design.middle, radius))
+    worst = np.array(exactly(Z, design.middle, radius, K=K))
     assert np.all(found >= worst)
     assert np.all(found <= 1.25 * worst)
 
@@ -120,27 +126,34 @@ def rotated(design, seed, kind):
     n_v = W.shape[1]
     eye = np.eye(N)
     T = eye - design.L0 @ design.middle[N:, :N]
-    Z = design.Z
-    K = 400
     reached = np.zeros(2 * N)
     for j in range(n_v):
         e_p = np.zeros(N)
         total = np.zeros(2 * N)
-        for k in range(K):
+        for k in range(400):
             v = np.zeros(n_v)
             v[j] = design.v_radius[j] if k == 0 else 0.0
             e_q = T @ e_p - design.L0 @ V @ v
-            e_c = e_q - Z @ (C @ e_q + V @ v)
+            nu = C @ e_q + V @ v
+            e_c = e_q - design.Z @ nu
             total += np.abs(np.concatenate([e_q, e_c]))
-            e_p = A @ e_c + W @ v
+            e_p = A @ e_c + W @ v - design.K @ nu
         reached += total
     return reached
 
 
 @pytest.fixture(scope="module")
-def designed():
+def searched():
     model = GeneralUIO().read(motor())
     return GeneralUIO().solve(model)
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.5, 1.0], ids=["Z", "Z and K", "K"])
+def designed(searched, request):
+    """So much of the gain given to the prediction, as is done at once or a step later."""
+    N = searched.size
+    K = request.param * searched.middle[:N, :N] @ searched.Z
+    return bound_peak(searched.changed(Z=(1.0 - request.param) * searched.Z, K=K))
 
 
 def test_no_constant_member_of_the_family_goes_beyond_the_bounds(designed):
@@ -152,20 +165,27 @@ def test_no_constant_member_of_the_family_goes_beyond_the_bounds(designed):
     )
 
 
+def test_of_one_member_the_bounds_are_attained(designed):
+    """Mutants: any part of what v moves left out, or with another sign."""
+    alone = bound_peak(designed.changed(family=fixed(designed.family)))
+    assert alone.bound.b == pytest.approx(rotated(alone, 0, 0), rel=1e-6)
+
+
+@pytest.mark.parametrize(("Z", "K"), [(0.45, 0.0), (0.0, 0.3), (0.3, 0.2), (0.8, -0.2)])
 @pytest.mark.parametrize("stage", ["q", "c", "p"])
-def test_rounding_of_every_stage_enters_the_bounds(stage):
+def test_rounding_of_every_stage_enters_the_bounds(stage, Z, K):
     """An error of delta in a stage, at every call with the worst sign, is one more input."""
-    Z, delta = 0.45, 1e-3
-    design = replace(read(scalar()).design, Z=np.array([[Z]]))
+    delta = 1e-3
+    design = replace(read(scalar()).design, Z=np.array([[Z]]), K=np.array([[K]]))
     design = replace(design, family=fixed(design.family))
     zero = np.zeros(1)
     parts = {"q": zero, "c": zero, "p": zero, stage: np.array([delta])}
     plain, more = bound_peak(design), bound_peak(replace(design, rounding=Rounding(**parts)))
     (A0, _), (C0, _) = design.middle
     keep = 1 - Z * C0
-    decay = 1 - abs(A0 * keep)
+    decay = 1 - abs(A0 * keep - K * C0)
     once = {"q": delta, "c": 0.0, "p": 0.0}[stage]
-    into = {"q": abs(A0 * keep), "c": abs(A0), "p": 1.0}[stage] * delta / decay
+    into = {"q": abs(A0 * keep - K * C0), "c": abs(A0), "p": 1.0}[stage] * delta / decay
     q = once + into
     c = abs(keep) * q + (delta if stage == "c" else 0.0)
     added = more.bound.b - plain.bound.b
@@ -208,24 +228,31 @@ def free_errors(design, start, steps, rng):
         e_q = T @ e_p
         e_c = e_q - design.Z @ (h @ e_q)
         found.append(np.abs(e_c))
-        e_p = F @ e_c
+        e_p = F @ e_c - design.K @ (h @ e_q)
     return np.array(found)
 
 
-@pytest.mark.parametrize("Z", [0.2, 0.45, 0.8])
-def test_a_first_error_of_one_state_fades_no_slower_than_the_worst_members(Z):
-    """Mutants: the channels of h or F left out of G or of reach; a step not divided by decay."""
-    design = bound_peak(replace(read(scalar()).design, Z=np.array([[Z]])))
+@pytest.mark.parametrize("apart", ["channels", "entries"])
+@pytest.mark.parametrize(("Z", "K"), GAINS)
+def test_a_first_error_of_one_state_fades_no_slower_than_the_worst_members(Z, K, apart):
+    """Mutants: the channels or the rest of h or F left out of G or of reach."""
+    design = replace(read(scalar()).design, Z=np.array([[Z]]), K=np.array([[K]]))
+    reach = reach_of(design.family)
+    if apart == "entries":
+        design = replace(design, family=replace(fixed(design.family), radius=reach))
+    design = bound_peak(design)
     system = error_system(design)
     (A, _), (C, _) = design.middle
-    (a, _), (c, _) = reach_of(design.family)
-    keep = max(abs(1 - Z * (C + s * c)) for s in (-1, 1))
+    (a, _), (c, _) = reach
+    slopes = [C + s * c for s in (-1, 1)]
+    keep = max(abs(1 - Z * slope) for slope in slopes)
+    step = max(abs((A + s * a) * (1 - Z * h) - K * h) for s in (-1, 1) for h in slopes)
     fading = design.bound.fading
     ways = [(fading.G, fading.reach, fading.start, 1.02), (*exponential(system, 0.8), 4.0)]
     for G, reach, start, loss in ways:
         s = start @ np.ones(1)
         for k in range(8):
-            worst = keep * ((abs(A) + a) * keep) ** k
+            worst = keep * step**k
             assert worst <= (reach @ s)[0]
             assert k > 0 or (reach @ s)[0] <= loss * worst
             s = G @ s
@@ -252,18 +279,34 @@ def test_a_first_error_fades_no_slower_than_is_said(designed, form):
             s = G @ s
 
 
-def test_an_exponential_counts_the_step_by_which_an_input_is_late():
+@pytest.mark.parametrize(("Z", "K"), [(0.45, 0.0), (0.0, 0.3), (0.3, 0.2)])
+def test_an_exponential_counts_the_step_by_which_an_input_is_late(Z, K):
     """Scalars: sums of (M A0 / decay)^k, an input one step later. Mutant: not divided by decay."""
-    Z, decay = 0.45, 0.6
-    design = replace(read(scalar()).design, Z=np.array([[Z]]))
+    decay = 0.6
+    design = replace(read(scalar()).design, Z=np.array([[Z]]), K=np.array([[K]]))
     design = bound_peak(replace(design, family=replace(fixed(design.family))))
     radius = np.array([[0.1, 0.0], [0.0, 0.0]])
     design = replace(design, family=replace(design.family, radius=radius))
     (A, _), (C, _) = design.middle
     keep = abs(1 - Z * C)
-    gain = 0.1 * keep / decay / (1 - abs(A) * keep / decay)
+    gain = 0.1 * keep / decay / (1 - abs(A * (1 - Z * C) - K * C) / decay)
     start = exponential(error_system(design), decay)[2]
     assert start[0, 0] == pytest.approx(keep / (1 - gain), rel=1e-6)
+
+
+@pytest.mark.parametrize(("Z", "K"), [(0.45, 0.0), (0.0, 0.3), (0.3, 0.2)])
+def test_an_exponential_counts_what_readings_leave_open(Z, K):
+    """Scalars again, the slope of the reading open. Mutants: it moves e_c or e_p alone."""
+    decay, rho = 0.6, 0.1
+    design = replace(read(scalar()).design, Z=np.array([[Z]]), K=np.array([[K]]))
+    radius = np.array([[0.0, 0.0], [rho, 0.0]])
+    design = bound_peak(replace(design, family=replace(fixed(design.family), radius=radius)))
+    (A, _), (C, _) = design.middle
+    back, keep = A * Z + K, 1 - Z * C
+    late = 1 / (decay - abs(A - back * C))
+    q = 1 / (1 - late * back * rho)
+    start = exponential(error_system(design), decay)[2]
+    assert start[0, 0] == pytest.approx(keep + rho * (keep * late * back + Z) * q, rel=1e-6)
 
 
 def test_fading_with_less_is_not_proved(designed):
