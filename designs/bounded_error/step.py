@@ -1,7 +1,5 @@
 """What runs: equations (10)-(12), half-width recursions (33)-(36) and how they begin."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,44 +12,10 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
+from obsynth.designs.core.running import ROUND_UP, SETTLED, UP, Running, settle
 from obsynth.designs.core.stepping import clip, inside, select
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-ROUND_UP = 1.0 + 2.0**-50
-# covers the rounding of estimate - half and estimate + half
-ULPS = 2.0**-50
-# Above the relative rounding error of the few dozen operations of each formula below.
-UP = 1.0 + 2.0**-44
-SETTLED = 0.01
-MOST_CALLS = 100_000
-
-
-@dataclass(frozen=True, eq=False)
-class RuntimeBound:
-    """How the guaranteed half widths evolve: ``s+ = decay s + offset``.
-
-    The half widths are ``sqrt(reach s) + add`` if `root` is set (ellipsoids, eqs. (35)-(36), one s
-    per component) and ``reach s + add`` otherwise (peak bounds, see `Fading`). Shapes: decay
-    (k, k), offset (k,), reach (n + n_f, k), add (n + n_f,).
-    """
-
-    decay: FloatArray
-    offset: FloatArray
-    reach: FloatArray
-    add: FloatArray
-    root: bool
-
-    def half_widths(self, s: FloatArray) -> FloatArray:
-        """Return the half widths that belong to a value of s."""
-        inner = self.reach @ s
-        return (np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add
-
-    @property
-    def steady(self) -> FloatArray:
-        """Half widths in the limit k to infinity."""
-        limit = np.linalg.solve(np.eye(len(self.decay)) - self.decay, self.offset)
-        return self.half_widths(np.asarray(limit, dtype=float))
 
 
 def noise_offset(design: UioDesign) -> FloatArray:
@@ -70,7 +34,7 @@ def _component_map(design: UioDesign, bound: EllipsoidBound) -> list[int | None]
     return states + [len(kept) + j for j in range(n_f)]
 
 
-def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
+def ellipsoid_runtime(design: UioDesign) -> Running:
     """Return the recursion of eq. (36) for every component, rounding errors of the step included.
 
     An error of at most `UioDesign.rounding` per step is at most rho in the norm
@@ -94,7 +58,7 @@ def ellipsoid_runtime(design: UioDesign) -> RuntimeBound:
         decay[i] = (1.0 - gamma) * (1.0 + rho) * UP
         offset[i] = (gamma * (1.0 + rho) + rho + rho**2) * UP
         scale[i] = bound.inverse_diagonal[component] * UP
-    return RuntimeBound(np.diag(decay), offset, np.diag(scale), add, True)
+    return Running(np.diag(decay), offset, np.diag(scale), add, True)
 
 
 def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
@@ -107,14 +71,14 @@ def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) ->
         )
 
 
-def peak_runtime(design: UioDesign) -> RuntimeBound:
+def peak_runtime(design: UioDesign) -> Running:
     """Return the recursion of what the first error adds to the peak bounds.
 
     Underflow of its products is far below the rounding that `add` counts a second time.
     """
     bound = peak_data(design)
     fading = bound.fading
-    return RuntimeBound(
+    return Running(
         decay=fading.G * UP,
         offset=np.zeros(len(fading.G)),
         reach=fading.reach * UP,
@@ -123,7 +87,7 @@ def peak_runtime(design: UioDesign) -> RuntimeBound:
     )
 
 
-def running_bound(design: UioDesign) -> RuntimeBound:
+def running_bound(design: UioDesign) -> Running:
     """Return how the half widths of a design evolve."""
     ellipsoid = isinstance(design.bound, EllipsoidBound)
     return ellipsoid_runtime(design) if ellipsoid else peak_runtime(design)
@@ -132,28 +96,21 @@ def running_bound(design: UioDesign) -> RuntimeBound:
 def settling(
     design: UioDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray]:
-    """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
+    """Return how many calls the bounds take to settle, and the largest from then on, see `settle`.
 
     They begin from boxes of half widths `box`, around estimates that are as near as the limits say;
-    with `calls` given, the half widths after so many; infinite where a box has no bound.
+    infinite where a box has no bound.
     """
     if not np.isfinite(box).all():
         return 0, np.full(box.shape, np.inf)
     bound, n = running_bound(design), len(design.A)
-    steady = bound.steady
-    near = steady * (1.0 + SETTLED)
+    near = bound.steady * (1.0 + SETTLED)
     ends = np.column_stack([-box, box])
     # the truth may be at one end of its box, and the estimate beyond the other
     z = near[:n] + noise_offset(design) + np.abs(design.T) @ box[:n]
     kept = {"z": ca.SX(ca.DM(z)), "fhat": ca.SX(ca.DM(near[n:] + box[n:]))}
     first = first_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), kept)
-    s = np.array(ca.evalf(first)).ravel()
-    k = 0
-    while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
-        if calls is None and np.all(bound.half_widths(s) <= near):
-            break
-        s, k = bound.decay @ s + bound.offset, k + 1
-    return k, bound.half_widths(s) * (1.0 + 2.0**-30)
+    return settle([bound], np.array(ca.evalf(first)).ravel() * UP, calls)
 
 
 def equations(design: UioDesign) -> ca.Function:
@@ -203,7 +160,7 @@ def equations(design: UioDesign) -> ca.Function:
 def memory_sizes(design: UioDesign) -> dict[str, int]:
     """Return the parts of the memory vector.
 
-    ``z`` (10), ``fhat`` (12), ``bound`` (the s of `RuntimeBound`) and ``prediction`` (of the state,
+    ``z`` (10), ``fhat`` (12), ``bound`` (the s of `Running`) and ``prediction`` (of the state,
     which stands for a reading that is missing).
     """
     n, n_f = len(design.A), len(design.rate)
@@ -264,7 +221,6 @@ def build_core(design: UioDesign) -> Core:
     n, C, W2 = len(design.A), ca.DM(design.C), design.W2
     offset, noise = ca.DM(W2 @ design.w_centre), ca.DM(np.abs(W2) @ design.w_radius)
     limits, curved = Limits.of(design.plant), curved_states(design.plant)
-    reach, decay = (ca.sparsify(ca.DM(matrix)) for matrix in (bound.reach, bound.decay))
 
     def pick(one: ca.SX, other: ca.SX) -> ca.SX:
         return ca.vertcat(*(one[i] if curved[i] else other[i] for i in range(n)))
@@ -273,9 +229,7 @@ def build_core(design: UioDesign) -> Core:
         z, fhat, s, prediction = (seen.memory[part] for part in memory_sizes(design))
         y = seen.readings(C @ prediction + offset) - offset
         xhat, innovation, next_state, z_next, fhat_next = move(z, fhat, seen.u, y)
-        inner = reach @ s
-        half = (ca.sqrt(inner) if bound.root else inner) * ROUND_UP + ca.DM(bound.add)
-        half = half + ULPS * ca.fabs(ca.vertcat(xhat, fhat))
+        half, moved = bound.around(s, ca.vertcat(xhat, fhat))
         x = Ends(xhat - half[:n], xhat + half[:n])
         f = Ends(fhat - half[n:], fhat + half[n:])
         allowed = ca.fabs(C) @ half[:n] + noise
@@ -294,7 +248,7 @@ def build_core(design: UioDesign) -> Core:
             {
                 "z": z_next,
                 "fhat": fhat_next,
-                "bound": decay @ s + ca.DM(bound.offset),
+                "bound": moved,
                 "prediction": next_state,
             },
             sound=sound,

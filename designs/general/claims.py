@@ -11,7 +11,7 @@ from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
 from obsynth.designs.general.peak import error_sums, prove_peak
-from obsynth.designs.general.record import EnergyBound, GeneralDesign, PeakBound
+from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import prove_rounding
 from obsynth.designs.general.step import Limits, curved, steady
 from obsynth.designs.general.storage import prove_storage
@@ -22,10 +22,9 @@ def claims(design: GeneralDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     yield _prove_boxes(design)
     yield prove_rounding(design)
-    if isinstance(design.bound, PeakBound):
-        yield from prove_peak_claims(design, design.bound)
-    else:
-        yield from prove_storage(design)
+    yield from prove_storage(design)
+    if design.peak is not None:
+        yield from prove_peak_claims(design, design.peak)
 
 
 def _prove_boxes(design: GeneralDesign) -> Claim:
@@ -136,7 +135,8 @@ def guarantee(design: GeneralDesign) -> Guarantee:
     if isinstance(bound, EnergyBound):
         claims = [*_energy_claims(design, bound)]
     else:
-        kind = "peak" if isinstance(bound, PeakBound) else "ellipsoidal"
+        words = {EllipsoidBound: "ellipsoidal", PeakBound: "peak"}
+        kind = " and ".join(words[type(part)] for part in design.bounds)
         claims = [f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds"]
     if extended.free:
         claims.append(f"whatever {', '.join(extended.free)} does")

@@ -22,7 +22,7 @@ from obsynth.designs.general.frozen import attained_gain
 from obsynth.designs.general.gain import find_gain
 from obsynth.designs.general.model import CLASS, GeneralModel, of, read_again
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
-from obsynth.designs.general.record import GeneralDesign, PeakBound
+from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import settle
 from obsynth.designs.general.step import (
     Limits,
@@ -163,7 +163,7 @@ class GeneralUIO(Method):
         """Find an ellipsoid or an energy gain, for a given Z or with it."""
         if self.bounds == "ellipsoid":
             found = solve_ellipsoid(given, weights, measured, self.gamma, Z)
-            return settle(with_ellipsoid(given, found))
+            return cut_with_peak(settle(with_ellipsoid(given, found)))
         found = solve_energy(given, weights, measured, Z)
         chosen = given.changed(Z=found.Z)
         return settle(with_energy(given, found, weights, attained_gain(chosen, weights)))
@@ -197,6 +197,20 @@ class GeneralUIO(Method):
 
 def bound_peak(design: GeneralDesign) -> GeneralDesign:
     """Attach proved peak bounds to a design with a gain."""
+    return design.changed(bound=peak_bounds(design))
+
+
+def cut_with_peak(design: GeneralDesign) -> GeneralDesign:
+    """Attach peak bounds of the same gain to an ellipsoid, where small gain holds."""
+    bound = design.bound
+    with suppress(InfeasibleDesign):
+        if isinstance(bound, EllipsoidBound):
+            return design.changed(bound=replace(bound, peak=peak_bounds(design)))
+    return design
+
+
+def peak_bounds(design: GeneralDesign) -> PeakBound:
+    """Return peak bounds of a gain, or refuse."""
     system = error_system(design)
     sums = error_sums(system, extra_inputs(system, design))
     rho = spectral_radius(sums.G)
@@ -211,4 +225,4 @@ def bound_peak(design: GeneralDesign) -> GeneralDesign:
         )
     b = small_gain_solution(sums.G, sums.n)
     widest = np.diff(Limits.of(design.extended.plant).x, axis=1)[:, 0]
-    return design.changed(bound=PeakBound(b, fade(system, b, widest)))
+    return PeakBound(b, fade(system, b, widest))

@@ -82,6 +82,7 @@ class EllipsoidBound(Record):
     noise: diagonal of N, of the components of v_k and v_{k+1} in units of their bounds
     tau: multipliers of the channels, those of F and then those of h
     inverse_diagonal: upper bounds of ``(P^-1)_ii``
+    peak: bounds of the same gain, where small gain holds; the smaller half width counts
     """
 
     KIND = "ellipsoid"
@@ -91,6 +92,7 @@ class EllipsoidBound(Record):
     noise: Annotated[FloatArray, "n_both"]
     tau: Annotated[FloatArray, "n_q"]
     inverse_diagonal: Annotated[FloatArray, "N"]
+    peak: PeakBound | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +175,19 @@ class GeneralDesign(Record):
     def extended(self) -> Extended:
         """The plant with its faults as states, derived from the stored equations."""
         return _extended(self.plant, self.unfollowed, self.divided)
+
+    @property
+    def bounds(self) -> tuple[PeakBound | EllipsoidBound, ...]:
+        """What holds the errors at every instant, all at once; nothing of an energy gain."""
+        if isinstance(self.bound, EnergyBound):
+            return ()
+        peak = self.bound.peak if isinstance(self.bound, EllipsoidBound) else None
+        return (self.bound,) if peak is None else (self.bound, peak)
+
+    @property
+    def peak(self) -> PeakBound | None:
+        """The peak bounds, if there are any."""
+        return next((bound for bound in self.bounds if isinstance(bound, PeakBound)), None)
 
     @property
     def size(self) -> int:

@@ -11,21 +11,22 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.running import (
+    ROUND_UP,
+    SETTLED,
+    UP,
+    Running,
+    all_around,
+    all_steady,
+    settle,
+)
 from obsynth.designs.core.signals import LARGEST_SIGNAL
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.lmis import rounding_in
-from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign, PeakBound
+from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.system import error_system, magnitude
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
-
-ROUND_UP = 1.0 + 2.0**-50
-# covers the rounding of estimate - half and estimate + half
-ULPS = 2.0**-50
-# Above the relative rounding error of the few dozen operations of each formula below.
-UP = 1.0 + 2.0**-44
-SETTLED = 0.01
-MOST_CALLS = 100_000
 
 
 def curved(plant: Plant) -> BoolArray:
@@ -113,18 +114,23 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
 
 
 def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> ca.SX:
-    """Return an s that holds for a state and a fault in boxes, around a prediction."""
+    """Return an s of every bound, for a state and a fault in boxes around a prediction."""
     low, high = (
         ca.vertcat(x.lower, _followed(design, f.lower)),
         ca.vertcat(x.upper, _followed(design, f.upper)),
     )
     apart = ca.fmax(high - prediction, prediction - low) * UP
-    if isinstance(design.bound, PeakBound):
-        return ca.sparsify(ca.DM(design.bound.fading.start * UP)) @ apart
-    M, other, added = start_of_ellipsoid(design)
+    return ca.vertcat(*(_start(design, bound, apart) for bound in design.bounds))
+
+
+def _start(design: GeneralDesign, bound: PeakBound | EllipsoidBound, apart: ca.SX) -> ca.SX:
+    """Return an s for first errors of at most `apart`."""
+    if isinstance(bound, PeakBound):
+        return ca.sparsify(ca.DM(bound.fading.start * UP)) @ apart
+    M, other, added = start_of_ellipsoid(design, bound)
     # sqrt V of M e_p, and of what channels, disturbances and rounding add to it
     rest = ca.DM(other) @ apart + added
-    size = np.abs(design.bound.P)
+    size = np.abs(bound.P)
     parts = [ca.sqrt(ca.dot(a, ca.DM(W) @ a)) for a, W in ((apart, M), (rest, size))]
     return (parts[0] + parts[1]) ** 2 * UP
 
@@ -134,61 +140,36 @@ def _followed(design: GeneralDesign, f: ca.SX) -> ca.SX:
     return ca.vertcat(*(f[names.index(name)] for name in design.extended.followed))
 
 
-@dataclass(frozen=True, eq=False)
-class Running:
-    """How half widths evolve: ``s+ = decay s + offset``, half widths ``reach s + add``, (N,).
+def running(design: GeneralDesign) -> tuple[Running, ...]:
+    """Return how the half widths of every bound evolve, none of an energy gain."""
+    return tuple(_running(design, bound) for bound in design.bounds)
 
-    root: of ``reach s`` the square root, for ellipsoids, where s bounds V
+
+def _running(design: GeneralDesign, bound: PeakBound | EllipsoidBound) -> Running:
+    """Return the recursion of a bound; underflow is far below what `add` counts twice.
+
+    In the norm of P, rounding is at most rho: V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho +
+    rho^2.
     """
-
-    decay: FloatArray
-    offset: FloatArray
-    reach: FloatArray
-    add: FloatArray
-    root: bool
-
-    @classmethod
-    def of(cls, design: GeneralDesign) -> "Running":
-        """Read the recursion of a design; underflow is far below what `add` counts twice.
-
-        In the norm of P, rounding is at most rho: V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho +
-        rho^2.
-        """
-        bound = design.bound
-        if isinstance(bound, PeakBound):
-            add = bound.b[design.size :] * ROUND_UP
-            nothing = np.zeros(len(bound.fading.G))
-            return cls(bound.fading.G * UP, nothing, bound.fading.reach * UP, add, root=False)
-        if not isinstance(bound, EllipsoidBound):
-            raise TypeError("an energy gain has no half widths")
-        step, gamma = rounding_in(error_system(design), design.rounding), bound.gamma
-        rho = float(np.sqrt(step @ np.abs(bound.P) @ step)) * UP
-        return cls(
-            decay=np.array([[(1.0 - gamma) * (1.0 + rho) * UP]]),
-            offset=np.array([(gamma * (1.0 + rho) + rho + rho**2) * UP]),
-            reach=bound.inverse_diagonal[:, None] * UP,
-            add=np.zeros(design.size),
-            root=True,
-        )
-
-    def half_widths(self, s: FloatArray) -> FloatArray:
-        """Return the half widths that belong to a value of s."""
-        inner = self.reach @ s
-        return np.asarray((np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add)
-
-    @property
-    def steady(self) -> FloatArray:
-        """The half widths after long, (N,)."""
-        limit = np.linalg.solve(np.eye(len(self.decay)) - self.decay, self.offset)
-        return self.half_widths(np.asarray(limit, dtype=float))
+    if isinstance(bound, PeakBound):
+        add, fading = bound.b[design.size :] * ROUND_UP, bound.fading
+        return Running(fading.G * UP, np.zeros(len(fading.G)), fading.reach * UP, add, root=False)
+    step, gamma = rounding_in(error_system(design), design.rounding), bound.gamma
+    rho = float(np.sqrt(step @ np.abs(bound.P) @ step)) * UP
+    return Running(
+        decay=np.array([[(1.0 - gamma) * (1.0 + rho) * UP]]),
+        offset=np.array([(gamma * (1.0 + rho) + rho + rho**2) * UP]),
+        reach=bound.inverse_diagonal[:, None] * UP,
+        add=np.zeros(design.size),
+        root=True,
+    )
 
 
-def start_of_ellipsoid(design: GeneralDesign) -> tuple[FloatArray, FloatArray, FloatArray]:
+def start_of_ellipsoid(
+    design: GeneralDesign, bound: EllipsoidBound
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return ``|M'PM|`` and what bounds ``e_c - M e_p`` by ``|e_p|``: (N, N), (N, N), (N,)."""
     system, N = error_system(design), design.size
-    bound = design.bound
-    if not isinstance(bound, EllipsoidBound):
-        raise TypeError("the design has no ellipsoid")
     shaped = system.M.T @ bound.P @ system.M
     h, Z = system.of_h, np.abs(system.Z)
     # M holds the rest of the outputs that L0 reads alone
@@ -219,37 +200,31 @@ def per_signal(design: GeneralDesign, widths: FloatArray) -> FloatArray:
 
 def steady(design: GeneralDesign) -> FloatArray:
     """Return the steady half widths of the core, states then faults, (n + n_f,)."""
-    return per_signal(design, Running.of(design).steady)
+    return per_signal(design, all_steady(running(design)))
 
 
 def settling(
     design: GeneralDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray] | None:
-    """Return how many calls the bounds take to come within 1 % of their limits, and what they are.
+    """Return how many calls the bounds take to settle, and the largest from then on, see `settle`.
 
     They begin from boxes of half widths `box` (n + n_f,), around estimates that are as near as the
-    limits say; with `calls` given, the half widths after so many, infinite where a box has no
-    bound. None of an energy gain.
+    limits say; infinite where a box has no bound. None of an energy gain.
     """
-    if isinstance(design.bound, EnergyBound):
+    bounds = running(design)
+    if not bounds:
         return None
-    running = Running.of(design)
     n, names = len(design.plant.x), design.plant.names("f")
     pick = [*range(n), *(n + names.index(name) for name in design.extended.followed)]
-    near = running.steady * (1.0 + SETTLED)
     if not np.isfinite(box[pick]).all():
         return 0, np.full(box.shape, np.inf)
-    half, middle = box[pick], ca.SX(ca.DM(near + box[pick]))
+    half = box[pick]
+    middle = ca.SX(ca.DM(all_steady(bounds) * (1.0 + SETTLED) + half))
     ends = np.zeros((n + len(names), 2))
     ends[pick] = np.column_stack([-half, half])
     first = start_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), middle)
-    s = np.array(ca.evalf(first)).ravel() * (1.0 + 2.0**-40)
-    k = 0
-    while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
-        if calls is None and np.all(running.half_widths(s) <= near):
-            break
-        s, k = running.decay @ s + running.offset, k + 1
-    return k, per_signal(design, running.half_widths(s) * (1.0 + 2.0**-30))
+    k, widths = settle(bounds, np.array(ca.evalf(first)).ravel() * UP, calls)
+    return k, per_signal(design, widths)
 
 
 def fault_delay(design: GeneralDesign) -> int:
@@ -259,10 +234,9 @@ def fault_delay(design: GeneralDesign) -> int:
 
 def memory_sizes(design: GeneralDesign) -> dict[str, int]:
     """Return the parts of the memory: the prediction of states and followed faults, and s."""
-    bound, sizes = design.bound, {"prediction": design.size}
-    if isinstance(bound, EnergyBound):
-        return sizes
-    return {**sizes, "bound": len(bound.fading.G) if isinstance(bound, PeakBound) else 1}
+    sizes = {"prediction": design.size}
+    parts = [len(b.fading.G) if isinstance(b, PeakBound) else 1 for b in design.bounds]
+    return {**sizes, "bound": sum(parts)} if parts else sizes
 
 
 def first_memory(design: GeneralDesign, start: Start) -> dict[str, ArrayLike]:
@@ -281,7 +255,7 @@ def build_core(design: GeneralDesign) -> Core:
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
     limits = Limits.of(plant)
-    running = None if isinstance(design.bound, EnergyBound) else Running.of(design)
+    bounds = running(design)
     names, followed = design.plant.names("f"), design.extended.followed
     own = curved(plant)[:n]
     domain = np.where(own[:, None], design.plant.box("x"), [-np.inf, np.inf])
@@ -305,15 +279,10 @@ def build_core(design: GeneralDesign) -> Core:
         sound = ca.logic_and(sound, inside(c, c, limits.x))
         sound = ca.logic_and(sound, inside(u, u, limits.u))
         moved = {"prediction": third(c, u, nu)}
-        if running is None:
+        if not bounds:
             return Known(c[:n], spread(c, 0.0), None, None, moved, sound=sound)
-        s = seen.memory["bound"]
-        reach, decay = (ca.sparsify(ca.DM(part)) for part in (running.reach, running.decay))
-        inner = reach @ s
-        half = (ca.sqrt(inner) if running.root else inner) * ROUND_UP + ca.DM(running.add)
-        half = half + ULPS * ca.fabs(c)
+        half, moved["bound"] = all_around(bounds, seen.memory["bound"], c)
         low, high = c - half, c + half
-        moved["bound"] = decay @ s + ca.DM(running.offset) if running.root else decay @ s
         return Known(
             c[:n],
             spread(c, 0.0),
@@ -324,7 +293,7 @@ def build_core(design: GeneralDesign) -> Core:
         )
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
-        return {} if running is None else {"bound": start_bound(design, x, f, kept["prediction"])}
+        return {"bound": start_bound(design, x, f, kept["prediction"])} if bounds else {}
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         near = x.nearest(kept["prediction"][:n])

@@ -18,11 +18,12 @@ import obsynth as ob
 from methods import observer_of
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
+from obsynth.designs.general.claims import claims
 from obsynth.designs.general.frozen import attained_gain
 from obsynth.designs.general.lmis import rounding_in
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.record import Rounding
-from obsynth.designs.general.step import Running, stages, start_bound
+from obsynth.designs.general.step import running, stages, start_bound
 from obsynth.designs.general.storage import prove_storage
 from obsynth.designs.general.system import error_system
 
@@ -80,10 +81,10 @@ def battery():
 
 
 def shares(observer):
-    """Half widths of the core over half ranges."""
+    """Half widths of the ellipsoid alone over half ranges."""
     signals = (*observer.model.x, *observer.model.f)
     half = np.array([0.5 * (s.upper - s.lower) for s in signals])
-    return observer.performance["core_half_widths"] / half
+    return running(observer.certificate.design)[0].steady / half
 
 
 # -- numbers -----------------------------------------------------------------------------------
@@ -155,7 +156,7 @@ def test_widths_of_one_state_are_above_the_worst_and_near_it(Z, sign, touched):
     half = 0.5 * np.diff(design.family.ranges, axis=1)[:, 0]
     reach = np.tensordot(half, np.abs(design.family.directions), axes=1)
     least, most = (worst(Z, design.middle, reach, apart) for apart in (False, True))
-    found = Running.of(design).steady[0]
+    found = running(design)[0].steady[0]
     assert least <= found <= 1.1 * most
     assert found >= most * (1.0 - 1e-6)
 
@@ -413,7 +414,7 @@ def test_rounding_enters_the_recursion(name):
         less = replace(allowed, **{stage: np.zeros(N)})
         assert np.all(rounding_in(system, less) <= bound)
     wide = replace(ellipsoid, rounding=Rounding(*(1e-3 * np.ones((3, N)))))
-    assert np.all(Running.of(wide).steady > Running.of(ellipsoid).steady)
+    assert np.all(running(wide)[0].steady > running(ellipsoid)[0].steady)
 
 
 @pytest.mark.parametrize("name", ["bent", "motor", "scalar"])
@@ -425,7 +426,7 @@ def test_a_first_set_holds_the_errors_after_the_first_reading(name):
         half = size * rng.uniform(0.5, 1.0, N)
         ends = np.column_stack([-half, half])
         s = start_bound(ellipsoid, Ends.of(ends[:n]), Ends.of(ends[n:]), ca.SX(ca.DM.zeros(N)))
-        found = float(ca.evalf(s))
+        found = float(ca.evalf(s)[0])
         most = 0.0
         for _ in range(400):
             J = corner(ellipsoid.family, rng)
@@ -436,6 +437,72 @@ def test_a_first_set_holds_the_errors_after_the_first_reading(name):
             e = e_q - ellipsoid.Z @ (C @ e_q + V @ v)
             most = max(most, float(e @ ellipsoid.bound.P @ e))
         assert most <= found <= 12.0 * most
+
+
+# -- cut with peak bounds ----------------------------------------------------------------------
+
+
+def turning(bend):
+    """Errors that turn: sums of absolute responses are far above what an energy says."""
+    plant = ob.Plant("turning")
+    x, z = plant.states("x z", range=[(-1, 1), (-1, 1)])
+    w = plant.disturbances("w1 w2", bound=[0.4, 0.2])
+    plant.dynamics([x / 2 + R(8, 10) * z + w[1], R(-8, 10) * x + z / 2 + R(bend, 100) * z**2], Ts=1)
+    plant.outputs([x + w[0]])
+    return plant
+
+
+def test_ellipsoids_are_cut_with_peak_bounds_of_the_same_gain_where_small_gain_holds():
+    """Mutants: no peak bounds; those that fail taken for a refusal of the ellipsoid."""
+    for bend, cut in ((3, True), (4, False)):
+        observer = ELLIPSOID.analyse(turning(bend), {"L": [[1e-3], [0.0]]})
+        design, names = observer.certificate.design, [c.name for c in observer.certificate]
+        assert (design.bound.peak is not None) == cut == ("small_gain" in names)
+        assert ("ellipsoidal and peak" in observer.guarantee.claims[0]) == cut
+    own, peak = (bound.steady for bound in running(design_of("bent")))
+    found = ELLIPSOID.design(bent()).performance["core_half_widths"]
+    assert np.array_equal(found, np.minimum(own, peak)) and np.any(peak < 0.95 * own)
+
+
+def test_the_peak_bounds_of_an_ellipsoid_are_proved_as_stored(ellipsoid):
+    """Mutant: claims of the ellipsoid alone."""
+    peak = ellipsoid.bound.peak
+
+    def fell(changed):
+        design = replace(ellipsoid, bound=replace(ellipsoid.bound, peak=changed))
+        return {claim.name for claim in claims(design) if not claim.holds}
+
+    assert not fell(peak)
+    assert fell(replace(peak, b=0.99 * peak.b)) == {"peak"}
+    for part in ("G", "reach", "start"):
+        less = {part: 0.99 * getattr(peak.fading, part)}
+        assert fell(replace(peak, fading=replace(peak.fading, **less))) == {"transient"}
+    record = ellipsoid.to_record()
+    assert GeneralUIO.CONTRACT.record.from_record(record).bound.peak.b.tolist() == peak.b.tolist()
+
+
+def test_sets_are_the_smaller_ones_of_both_at_every_call():
+    """Mutants: the larger; peak bounds or ellipsoids that do not fade; one of them alone."""
+    ellipsoid = design_of("bent")
+    observer = GeneralUIO.CONTRACT.certify(
+        replace(ellipsoid, options=GeneralUIO(cuts=(), horizon=99).options())
+    ).observer()
+    plant, N = observer.model, ellipsoid.size
+    box, still = np.array([[-1.0, 1.0]] * 2), np.zeros((0, 2))
+    memory = observer.memory0(np.zeros(2), x_range=box, f_range=still)
+    both = running(ellipsoid)
+    ends = [Ends.of(part) for part in (box, still)]
+    first = np.array(ca.evalf(start_bound(ellipsoid, *ends, ca.SX(ca.DM.zeros(N))))).ravel()
+    parts, smaller = np.split(first, [1]), set()
+    for k in range(60):
+        out = observer.step(memory, [], np.zeros(len(plant.output_names)))
+        memory, low, high = out[0], *(np.array(out[i]).ravel() for i in (3, 4))
+        halves = [bound.half_widths(s)[:2] for bound, s in zip(both, parts, strict=True)]
+        least = np.minimum(np.minimum(*halves), np.inf if k else 1.0)
+        assert 0.5 * (high - low) == pytest.approx(least, rel=1e-9), k
+        smaller |= set(np.argmin(halves, axis=0).tolist())
+        parts = [bound.decay @ s + bound.offset for bound, s in zip(both, parts, strict=True)]
+    assert smaller == {0, 1}
 
 
 # -- refusals ----------------------------------------------------------------------------------

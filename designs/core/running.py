@@ -1,0 +1,114 @@
+"""Half widths that a core carries from call to call, and when they have settled.
+
+``s+ = decay s + offset``, all nonnegative, and half widths ``reach s + add``. The map is monotone:
+from an s that it maps below itself nothing that follows exceeds what that s says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from obsynth.symbolic.arrays import FloatArray
+
+ROUND_UP = 1.0 + 2.0**-50
+# covers the rounding of estimate - half and estimate + half
+ULPS = 2.0**-50
+# Above the relative rounding error of the few dozen operations of each formula here.
+UP = 1.0 + 2.0**-44
+# Far below the rounding of estimates, which half widths count.
+UNDERFLOW = 2.0**-900
+SETTLED = 0.01
+"""Half widths have settled where they stay within this share of their limits."""
+MOST_CALLS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Running:
+    """One recursion of s (k,): decay (k, k), offset (k,), reach (N, k), add (N,).
+
+    root: the half widths are ``sqrt(reach s) + add``, for ellipsoids, where s bounds V
+    """
+
+    decay: FloatArray
+    offset: FloatArray
+    reach: FloatArray
+    add: FloatArray
+    root: bool
+
+    @property
+    def limit(self) -> FloatArray:
+        """What s goes to, (k,)."""
+        return np.asarray(np.linalg.solve(np.eye(len(self.decay)) - self.decay, self.offset))
+
+    @property
+    def steady(self) -> FloatArray:
+        """The half widths after long, (N,)."""
+        return self.half_widths(self.limit)
+
+    def half_widths(self, s: FloatArray) -> FloatArray:
+        """Return the half widths that belong to a value of s."""
+        inner = self.reach @ s
+        return np.asarray((np.sqrt(inner) if self.root else inner) * ROUND_UP + self.add)
+
+    def falls(self, s: FloatArray) -> bool:
+        """Whether s is mapped below itself, however that is rounded; underflow does not count."""
+        return bool(np.all((self.decay @ s + self.offset) * UP <= s + UNDERFLOW))
+
+    def around(self, s: ca.SX, estimate: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return half widths around an estimate, and the next s."""
+        reach, decay = (ca.sparsify(ca.DM(part)) for part in (self.reach, self.decay))
+        inner = reach @ s
+        half = (ca.sqrt(inner) if self.root else inner) * ROUND_UP + ca.DM(self.add)
+        moved = decay @ s
+        if self.offset.any():
+            moved = moved + ca.DM(self.offset)
+        return half + ULPS * ca.fabs(estimate), moved
+
+
+def all_around(bounds: Sequence[Running], s: ca.SX, estimate: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the smallest half widths of bounds that all hold, and their next s, stacked."""
+    ends = np.cumsum([0, *(len(bound.offset) for bound in bounds)]).tolist()
+    pairs = zip(bounds, ca.vertsplit(s, ends), strict=True)
+    halves, moved = zip(*(bound.around(part, estimate) for bound, part in pairs), strict=True)
+    half = halves[0]
+    for other in halves[1:]:
+        half = ca.fmin(half, other)
+    return half, ca.vertcat(*moved)
+
+
+def all_steady(bounds: Sequence[Running]) -> FloatArray:
+    """Return the half widths after long, the smallest of bounds that all hold, (N,)."""
+    return _least(bounds, [bound.limit for bound in bounds])
+
+
+def settle(
+    bounds: Sequence[Running], first: FloatArray, calls: int | None
+) -> tuple[int, FloatArray]:
+    """Return after how many calls half widths stay within 1 % of limits, and the largest then.
+
+    They are the smallest of bounds that all hold, begun from `first`, stacked. With `calls` given,
+    the largest from so many on. Infinite where it is not shown that they stay below anything.
+    """
+    s = np.split(first, np.cumsum([len(bound.offset) for bound in bounds])[:-1])
+    limits = [bound.limit * (1.0 + 2.0**-20) for bound in bounds]
+    near = all_steady(bounds) * (1.0 + SETTLED)
+    since, largest = 0, np.zeros(len(near))
+    for k in range(MOST_CALLS + 1):
+        tops = [np.maximum(*pair) for pair in zip(s, limits, strict=True)]
+        now = _least(bounds, tops)
+        if k < MOST_CALLS and (np.any(now > near) if calls is None else k < calls):
+            since = k + 1
+        else:
+            largest = np.maximum(largest, now)
+            if all(bound.falls(top) for bound, top in zip(bounds, tops, strict=True)):
+                return since, largest * (1.0 + 2.0**-30)
+        pairs = zip(bounds, s, strict=True)
+        s = [(bound.decay @ part + bound.offset) * UP for bound, part in pairs]
+    return since, np.full(len(near), np.inf)
+
+
+def _least(bounds: Sequence[Running], s: Sequence[FloatArray]) -> FloatArray:
+    pairs = zip(bounds, s, strict=True)
+    return np.asarray(np.min([bound.half_widths(part) for bound, part in pairs], axis=0))
