@@ -13,6 +13,7 @@ from obsynth.symbolic.plant import Plant
 
 RTOL = 1e-3
 """Of the bounds of the joint Jacobian."""
+NO_RATE = "it has no rate"
 _DECAYS = 1.0 - 1e-7
 _HIDDEN = 1e-8
 
@@ -52,54 +53,71 @@ def follow(model: Plant, divided: Sequence[str] = (), bounded: Sequence[str] = (
     divided, bounded: faults that are not to be followed, see `extend`. StructureError where states
     alone cannot be detected, or where faults to be divided act in too few directions.
     """
-    unfollowed, reasons = list(bounded), {}
-    while True:
-        extended = extend(model, unfollowed, divided)
-        free, rank = extended.free, extended.D0.shape[1]
-        if divided and rank < len(free):
-            raise StructureError(
-                f"{', '.join(free)} act in {rank} direction{'s' if rank > 1 else ''} on the "
-                "states: of any size they cannot be told apart",
-                symbols=free,
-                condition="faults in different directions",
-            )
+    extended = extend(model, bounded, divided)
+    free, rank = extended.free, extended.D0.shape[1]
+    if divided and rank < len(free):
+        raise StructureError(
+            f"{', '.join(free)} act in {rank} direction{'s' if rank > 1 else ''} on the "
+            "states: of any size they cannot be told apart",
+            symbols=free,
+            condition="faults in different directions",
+        )
+    bounds = jacobian_bounds(extended.plant, wrt="joint", rtol=RTOL, effort="fast")
+    hidden = untold(extended, bounds.family.midpoint)
+    if hidden:
+        extended = extend(model, (*bounded, *hidden), divided)
         bounds = jacobian_bounds(extended.plant, wrt="joint", rtol=RTOL, effort="fast")
-        lost = _hidden_fault(model, extended, bounds.family.midpoint)
-        if lost is None:
-            break
-        unfollowed.append(lost[0])
-        reasons[lost[0]] = lost[1]
-    for s in model.f:
-        if s.rate is None and not s.constant and s.name not in divided:
-            reasons.setdefault(s.name, "it has no rate")
+    rateless = [s for s in model.f if s.rate is None and not s.constant]
+    reasons = hidden | {s.name: NO_RATE for s in rateless if s.name not in (*divided, *bounded)}
     return Following(extended, bounds, reasons)
 
 
-def _hidden_fault(model: Plant, extended: Extended, middle: FloatArray) -> tuple[str, str] | None:
-    """Return a followed fault of a mode that no output sees, and why; refuse modes of states.
+def untold(extended: Extended, middle: FloatArray, again: Sequence[str] = ()) -> dict[str, str]:
+    """Return the faults that no output tells from other states, and why; refuse modes of states.
 
-    Of several faults that nothing tells from each other, the one with the smallest range.
+    Of several that nothing tells from each other, the one with the smallest range goes first.
+
+    middle: of the extended plant's joint Jacobian, (N + m, N + n_v)
+    again: disturbances of it that are read as followed faults again
     """
-    names, n = extended.plant.names("x"), len(model.x)
-    half = half_ranges(extended.plant, "x")
-    for value, vector in hidden_modes(extended, middle, half):
-        moved = [i for i in np.argsort(-vector) if vector[i] > 1e-6 * vector.max()]
-        faults = [int(i) for i in moved if i >= n]
-        others = [names[i] for i in moved]
-        if faults:
-            name = names[min(faults, key=lambda i: float(half[i]))]
-            rest = ", ".join(other for other in others if other != name) or "nothing"
-            return name, (
-                f"the outputs do not tell it from {rest} (a mode {abs(value):.6g} of the middle of "
-                "the family)"
+    plant, (N, m) = extended.plant, extended.L0.shape
+    noise = plant.names("w")
+    columns = [*range(N), *(N + noise.index(name) for name in again)]
+    names = [*plant.names("x"), *again]
+    half = np.concatenate([half_ranges(plant, "x"), half_ranges(plant, "w")])[columns]
+    rest = [j for j in range(N, N + len(noise)) if j not in columns]
+    size = np.abs(middle[N:, rest]) @ half_ranges(plant, "w")[[j - N for j in rest]]
+    F = np.vstack([middle[:N, columns], np.eye(len(columns))[N:]])
+    C = middle[N:, columns]
+    L0 = np.zeros((len(columns), m))
+    L0[:N] = np.array(extended.L0.evalf(17).tolist(), dtype=float).reshape(N, m)
+    size = np.maximum(size, 1e-6 * (np.abs(C) @ half))
+    T = np.eye(len(columns)) - L0 @ C
+    A = (T @ F) * half / half[:, None]
+    C = ((C @ T) * half) / np.where(size > 0.0, size, 1.0)[:, None]
+    states, kept = names[: N - len(extended.followed)], np.arange(len(names))
+    found: dict[str, str] = {}
+    while True:
+        lost = _hidden(A[np.ix_(kept, kept)], C[:, kept])
+        if lost is None:
+            return found
+        value, vector = lost
+        moved = [names[kept[i]] for i in np.argsort(-vector) if vector[i] > 1e-6 * vector.max()]
+        faults = [name for name in moved if name not in states]
+        if not faults:
+            raise StructureError(
+                f"a mode {abs(value):.6g} of {', '.join(moved)} does not decay and no output shows "
+                f"it ({', '.join(plant.output_names)}); measure one of them",
+                symbols=tuple(moved),
+                condition="detectability",
             )
-        raise StructureError(
-            f"a mode {abs(value):.6g} of {', '.join(others)} does not decay and no output shows it "
-            f"({', '.join(model.output_names)}); measure one of them",
-            symbols=tuple(others),
-            condition="detectability",
+        gone = min(faults, key=lambda name: float(half[names.index(name)]))
+        others = ", ".join(name for name in moved if name != gone) or "nothing"
+        found[gone] = (
+            f"the outputs do not tell it from {others} (a mode {abs(value):.6g} of the middle of "
+            "the family)"
         )
-    return None
+        kept = kept[[names[i] != gone for i in kept]]
 
 
 def half_ranges(plant: Plant, kind: str) -> FloatArray:
@@ -109,24 +127,12 @@ def half_ranges(plant: Plant, kind: str) -> FloatArray:
     return np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
 
-def hidden_modes(
-    extended: Extended, middle: FloatArray, half: FloatArray
-) -> list[tuple[complex, FloatArray]]:
-    """Return modes of the middle that do not decay and that no output sees, with their vectors.
-
-    In units of the half ranges (N,), and of the readings' noise.
-    """
-    N = len(half)
-    T = np.array(extended.T0.evalf(17).tolist(), dtype=float).reshape(N, N)
-    noise = np.abs(middle[N:, N:]) @ half_ranges(extended.plant, "w")
-    size = np.maximum(noise, 1e-6 * (np.abs(middle[N:, :N]) @ half))
-    A = (T @ middle[:N, :N]) * half / half[:, None]
-    C = ((middle[N:, :N] @ T) * half) / np.where(size > 0.0, size, 1.0)[:, None]
-    found = []
+def _hidden(A: FloatArray, C: FloatArray) -> tuple[complex, FloatArray] | None:
+    """Return a mode that does not decay and that no output sees, with its vector; None without."""
     for value in np.linalg.eigvals(A):
         if abs(value) < _DECAYS:
             continue
-        _, sizes, vectors = np.linalg.svd(np.vstack([A - value * np.eye(N), C]))
+        _, sizes, vectors = np.linalg.svd(np.vstack([A - value * np.eye(len(A)), C]))
         if sizes[-1] < _HIDDEN:
-            found.append((complex(value), np.abs(vectors[-1])))
-    return found
+            return complex(value), np.abs(vectors[-1])
+    return None

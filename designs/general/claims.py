@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.derive.structure.following import NO_RATE, untold
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
@@ -16,6 +17,8 @@ from obsynth.designs.general.rounding import prove_rounding
 from obsynth.designs.general.step import Limits, curved, steady
 from obsynth.designs.general.storage import prove_storage
 from obsynth.designs.general.system import error_system, extra_inputs
+
+LOST = "no gain was found that follows it"
 
 
 def claims(design: GeneralDesign) -> Iterator[Claim]:
@@ -140,17 +143,7 @@ def guarantee(design: GeneralDesign) -> Guarantee:
         claims = [f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds"]
     if extended.free:
         claims.append(f"whatever {', '.join(extended.free)} does")
-    if design.divided:
-        claims.append(
-            f"{', '.join(design.divided)} of the call before is what moved the states, divided by "
-            "its gain: it lies inside the returned interval too"
-        )
-    if design.unfollowed:
-        claims.append(
-            f"{', '.join(design.unfollowed)} counts as a disturbance within its range, since the "
-            "outputs do not tell it from the states, or no gain was found that follows it: the "
-            "data alone say something of it"
-        )
+    claims += _on_faults(design)
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
         *([f"{where} [monitored in part: status bit 8]"] if where else []),
@@ -166,6 +159,30 @@ def guarantee(design: GeneralDesign) -> Guarantee:
         assumptions.append(f"{noise}{steps} [monitored in part: status bit 8]")
     assumptions.append(_on_rounding(design))
     return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def _on_faults(design: GeneralDesign) -> Iterator[str]:
+    """Say what is made of every fault, and why; see `follow`."""
+    plant, extended, asked = design.plant, design.extended, design.options.get("faults")
+    reason = f'as faults="{asked}" asks' if asked in ("divided", "bounded") else ""
+    for s in plant.f:
+        if s.name in extended.followed:
+            moves = "constant" if s.constant else f"by {s.rate:g} per sample at most"
+            yield f"{s.name} is followed as a state, {moves}: the outputs tell it from the others"
+    if design.divided:
+        yield (
+            f"{', '.join(design.divided)} of the call before is what moved the states, divided by "
+            f"its gain: it lies inside the returned interval too; {reason or LOST}"
+        )
+    moving = [s.name for s in plant.f if s.rate is not None or s.constant]
+    again = [name for name in design.unfollowed if name in moving and not reason]
+    told = untold(extended, design.middle, again) if again else {}
+    for name in design.unfollowed:
+        why = told.get(name, LOST) if name in moving else NO_RATE
+        yield (
+            f"{name} counts as a disturbance within its range, of which the data alone say "
+            f"something; {reason or why}"
+        )
 
 
 def _energy_claims(design: GeneralDesign, bound: EnergyBound) -> Iterator[str]:

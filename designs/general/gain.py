@@ -26,9 +26,12 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 HORIZON = 1e-6
 MOST_STEPS = 6000
 LEFT = 1e-4
+SLOWEST = LEFT ** (1.0 / MOST_STEPS)
 INFEASIBLE = 1e9
 INFLATIONS = (1.0, 10.0, 0.1, 100.0)
 ERRORS = (0.02, 0.2)
+# Of every state; the second where constants, which nothing drives, would be found too slowly.
+LEAST_NOISE = (1e-10, 1e-4)
 # Evaluations of a search, and numbers that all of them together may handle.
 MOST_EVALUATIONS, WORK = 1500, 6e10
 SMALL = 1e-12
@@ -176,7 +179,7 @@ class GainSearch:
         M = (np.eye(N) - Z @ data.C0) @ data.T
         closed = M @ data.A0
         radius = spectral_radius(closed)
-        if not radius < LEFT ** (1.0 / MOST_STEPS):
+        if not radius < SLOWEST:
             return Value(np.inf, nothing, np.inf, radius), None
         direct, own = data.L0V + Z @ data.V, Z @ data.of_h
         B = np.hstack([data.W0 - data.A0 @ direct, -data.A0 @ own, data.of_F])
@@ -286,11 +289,15 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
             floor = max(float(np.trace(noise)) / max(len(noise), 1), 1e-9)
             noise = noise + 1e-5 * floor * np.eye(len(noise))
             C = data.C0 @ data.T
-            try:
-                X = solve_discrete_are(AT.T, C.T, Q @ Q.T + 1e-10 * np.eye(N), noise)
-                yield X @ C.T @ np.linalg.inv(C @ X @ C.T + noise)
-            except np.linalg.LinAlgError:
-                continue
+            for least in LEAST_NOISE:
+                try:
+                    X = solve_discrete_are(AT.T, C.T, Q @ Q.T + least * np.eye(N), noise)
+                    Z = X @ C.T @ np.linalg.inv(C @ X @ C.T + noise)
+                except np.linalg.LinAlgError:
+                    continue
+                yield Z
+                if spectral_radius(AT - Z @ (data.C0 @ AT)) < SLOWEST:
+                    break
 
 
 def find_gain(design: GeneralDesign, weights: FloatArray, seed: int = 0) -> FloatArray:

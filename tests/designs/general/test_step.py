@@ -9,6 +9,7 @@ import sympy as sp
 
 import obsynth as ob
 from methods import motor, observer_of
+from obsynth.derive.structure.following import follow
 from obsynth.designs.general.claims import claims
 from obsynth.designs.general.method import GeneralUIO, bound_peak
 from obsynth.designs.general.model import read
@@ -123,8 +124,58 @@ def test_a_fault_that_no_output_tells_from_a_state_counts_as_a_disturbance():
     assert len(model.design.unfollowed) == 1
     observer = ob.BoundedErrorUIO(bounds="peak").design(blind)
     assert np.isfinite(observer.half_widths).all()
-    (lost,) = model.design.unfollowed
-    assert any(text.startswith(f"{lost} counts as") for text in observer.guarantee.claims)
+    assert model.design.unfollowed == ("g",)
+    assert any(text.startswith("g counts as") for text in observer.guarantee.claims)
+
+
+def alike():
+    """Two faults that act alike, one that comes without a rate, one that is constant."""
+    plant = ob.Plant("alike")
+    x, z = plant.states("x z", range=(-5, 5))
+    g, f, jump = plant.faults(
+        "g f jump", range=[(-0.1, 0.1), (-1, 1), (-0.1, 0.1)], rate=[0.01, 0.05, None]
+    )
+    (drift,) = plant.faults("drift", range=(-0.1, 0.1), constant=True)
+    w = plant.disturbances("w1:3", bound=0.05)
+    plant.dynamics([x / 2 + f + g, z / 2 + x * z / 99 + jump + drift], Ts=1)
+    plant.outputs([x + w[0], z + w[1]])
+    return plant
+
+
+def said(observer):
+    """What the guarantee says of every fault."""
+    claimed, names = observer.guarantee.claims, observer.model.names("f")
+    return {name: [text for text in claimed if text.startswith(f"{name} ")] for name in names}
+
+
+def test_what_is_made_of_a_fault_and_why_stands_in_the_guarantee():
+    """As `follow` has it, from what is stored. Mutants: one reason for all; no other look at g."""
+    observer = GeneralUIO(bounds="ellipsoid").design(alike())
+    reasons = follow(alike()).reasons
+    assert "do not tell it from f" in reasons["g"]
+    (g,), (f,), (jump,), (drift,) = told = said(observer).values()
+    assert g.startswith("g counts as a disturbance") and g.endswith(reasons["g"])
+    assert jump.startswith("jump counts as a disturbance") and jump.endswith("; it has no rate")
+    assert f.startswith("f is followed as a state, by 0.05 per sample")
+    assert drift.startswith("drift is followed as a state, constant")
+    contract, record = GeneralUIO.CONTRACT, observer.certificate.design.to_record()
+    again = contract.guarantee(contract.record.from_record(record)).claims
+    assert {text for (text,) in told} <= set(again)
+    for way in ("bounded", "divided"):
+        found = said(GeneralUIO(faults=way).design(vanishing()))["f"]
+        assert found[0].endswith(f'as faults="{way}" asks')
+
+
+def test_a_constant_fault_is_followed_by_peak_bounds():
+    """Nothing drives it. Mutant: Riccati gains for the disturbances alone, which are none."""
+    plant = ob.Plant("drifting")
+    (x,) = plant.states("x", range=(-5, 5))
+    plant.faults("drift", range=(-0.1, 0.1), constant=True)
+    w = plant.disturbances("w1:3", bound=0.05)
+    plant.dynamics([x / 2 + plant.f[0].symbol + x**2 / 99 + w[1]], Ts=1)
+    plant.outputs([x + w[0]])
+    design = GeneralUIO().solve(GeneralUIO().read(plant))
+    assert design.extended.followed == ("drift",) and design.bound.b[3] < 0.1
 
 
 def marched(observer, steps, seed, cuts_u=1.0):
@@ -268,7 +319,8 @@ def test_a_fault_whose_gain_vanishes_is_divided_out_by_itself():
         GeneralUIO().solve(GeneralUIO().read(vanishing()))
     observer = ob.BoundedErrorUIO(bounds="peak").design(vanishing())
     assert observer.fault_delay == 1
-    assert any("divided by its gain" in text for text in observer.guarantee.claims)
+    (told,) = (text for text in observer.guarantee.claims if "divided by its gain" in text)
+    assert told.endswith("; no gain was found that follows it")
     plant, rng = observer.model, np.random.default_rng(2)
     x, f, before = np.array([1.0]), np.zeros(1), np.zeros(1)
     memory = observer.memory0(x, x_range=[(0.5, 1.5)])
