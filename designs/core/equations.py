@@ -85,6 +85,23 @@ class Equations:
             slopes[i, j] = low.min(), high.max()
         return slopes
 
+    @property
+    def nominal_slopes(self) -> FloatArray:
+        """The derivatives at nominal states and inputs, or middles of ranges, without faults."""
+        plant = self.plant
+        known = (*plant.u, *(s for s in plant.rho if s.measured))
+        at = np.concatenate([self.box.mean(axis=1), np.zeros(len(known))])
+        at[self.n : self.n + self.n_f] = 0.0
+        for j, s in [*enumerate(plant.x), *enumerate(known, self.n_v)]:
+            middle = 0.5 * (s.lower + s.upper) if s.bounded else 0.0
+            at[j] = middle if s.nominal is None else float(s.nominal)
+        slopes, which = self.slopes.copy(), [*self.entries.values()]
+        with np.errstate(all="ignore"):
+            ends = evaluate(self.program, at[:, None], at[:, None], which)
+        for pair, found in zip(self.entries, np.hstack(ends).tolist(), strict=True):
+            slopes[pair] = found if np.isfinite(found).all() else slopes[pair]
+        return slopes
+
     @cached_property
     def bends(self) -> dict[tuple[int, int], FloatArray]:
         """How slopes by faults vary: bounds of their derivatives over the box, (variables,)."""

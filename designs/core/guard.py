@@ -22,7 +22,7 @@ Estimates need no second copy: a core is begun around whatever its estimate is.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -179,12 +179,15 @@ class Guard:
         """N."""
         return self.settled[0]
 
-    def widths(self, core: FloatArray | None) -> FloatArray | None:
-        """Return steady half widths of the returned sets from the core's; None without any."""
+    def widths(self, core: FloatArray | None, nominal: bool = False) -> FloatArray | None:
+        """Return steady half widths of the returned sets from the core's; None without any.
+
+        nominal: predicted for a plant near its nominal point, not guaranteed
+        """
         _, own, passes = self.settled
         own = core if own is None else own
         own = np.full(len(self.plant.x) + len(self.plant.f), np.inf) if own is None else own
-        found, _ = self.half_widths.steady(own, passes)
+        found, _ = replace(self.half_widths, nominal=nominal).steady(own, passes)
         return found if np.isfinite(found).any() else None
 
 

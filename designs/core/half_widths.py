@@ -24,10 +24,18 @@ class HalfWidths:
 
     contractor: the cuts
     delay: of the fault interval, 0 or 1
+    nominal: with the derivatives of the nominal point: what is to be expected near it, no promise
     """
 
     contractor: Contractor
     delay: int
+    nominal: bool = False
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """Ranges of the rows' derivatives, see `Equations`."""
+        equations = self.contractor.equations
+        return equations.nominal_slopes if self.nominal else equations.slopes
 
     @cached_property
     def declared(self) -> FloatArray:
@@ -94,7 +102,7 @@ class HalfWidths:
     def _call(self, held: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what one call carries on, and what it returns."""
         cuts, equations = self.contractor.cuts, self.contractor.equations
-        n, slopes = len(self.contractor.domain), np.abs(equations.slopes).max(axis=2)
+        n, slopes = len(self.contractor.domain), np.abs(self.slopes).max(axis=2)
         fixed = 0.5 * np.diff(equations.box[held.size :], axis=1)[:, 0]
         x = self.ranges[:n].copy()
         for i in np.flatnonzero(equations.usable).tolist() if "image" in cuts else ():
@@ -121,7 +129,7 @@ class HalfWidths:
         """
         equations, plant = self.contractor.equations, self.contractor.plant
         place = row, len(self.contractor.domain) + fault
-        ends = np.abs(equations.slopes[place])
+        ends = np.abs(self.slopes[place])
         low, high = float(ends.min()), float(ends.max())
         spread = min(0.5 * (high - low), _times(equations.bends[place], halves))
         if spread <= 1e-9 * high:

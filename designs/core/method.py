@@ -122,6 +122,10 @@ class Contract(Generic[D]):
         performance = dict(numbers.performance)
         if numbers.half_widths is not None:
             performance["core_half_widths"] = numbers.half_widths
+        searched = numbers.searched
+        if guard.delay and guard.discrete:
+            performance["predicted_half_widths"] = guard.widths(numbers.half_widths, nominal=True)
+            searched = (*searched, "predicted_half_widths")
         ode = None if self.ode is None else self.ode(design)
         return Observer(
             method=self.name,
@@ -138,7 +142,7 @@ class Contract(Generic[D]):
             fault_delay=guard.delay,
             ode=None if ode is None else extended(ode, guard.sizes, layout, YOUNG),
             step_covered=self.step_covered,
-            searched=numbers.searched,
+            searched=searched,
         )
 
     def guard(self, design: Any) -> Guard:

@@ -65,7 +65,9 @@ class Observer:
     performance : mapping of str to float
     half_widths : ndarray of shape (n + n_f,) or None
         Guaranteed steady half widths of the returned sets, states then faults; those of the
-        method alone are ``performance["core_half_widths"]``.
+        method alone are ``performance["core_half_widths"]``. Where faults are known one call late,
+        ``performance["predicted_half_widths"]`` are what is to be expected at the nominal point,
+        without a guarantee.
     certificate : Certificate
     guarantee : Guarantee
     fault_delay : int
@@ -111,10 +113,16 @@ class Observer:
         boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
         declared = 0.5 * np.diff(boxes, axis=1)[:, 0]
         names = (*self.model.names("x"), *self.model.names("f"))
-        return {
+        found = {
             name: f"+-{width:.4g}" + (", no more than is declared" if width >= limit else "")
             for name, width, limit in zip(names, self.half_widths, declared, strict=True)
         }
+        nominal = self.performance.get("predicted_half_widths")
+        rows = () if nominal is None else zip(names, self.half_widths, nominal, strict=True)
+        for name, width, near in rows:
+            if near < 0.99 * width:
+                found[name] += f" (predicted at the nominal point: +-{near:.4g})"
+        return found
 
     @property
     def record(self) -> Mapping[str, Any]:

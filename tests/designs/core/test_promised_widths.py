@@ -139,3 +139,23 @@ def test_what_a_varying_gain_leaves_of_a_fault():
     for b_half, spread in ((0.5, 0.05), (2.0, 0.1), (0.0, 0.0)):
         told = found._divided(0, 0, 0.025, np.array([0.01, b_half, 4.2]))
         assert told == pytest.approx(0.25 + 1.285 * spread / 0.01, rel=1e-6)
+
+
+def test_a_prediction_at_the_nominal_point_stands_beside_what_is_promised():
+    """By hand: (h + h / 2 + w) 9 / x for x+ = x / 2 + x f / 9 + w, h of the strip, at x = 2.
+
+    Mutants: middles in place of nominal values; the range of the fault; the prediction promised.
+    """
+    given = ob.Plant("gained")
+    (x,) = given.states("x", range=(1, 5), nominal=2)
+    (f,) = given.faults("f", range=(-1, 3))
+    w, v = given.disturbances("w v", bound=[0.02, 0.01])
+    given.dynamics([x / 2 + x * f / 9 + w], Ts=1)
+    given.outputs([x + v])
+    observer = ob.IntervalObserver(cuts=("strips", "inversion")).design(given)
+    told = observer.performance["predicted_half_widths"]
+    assert told == pytest.approx([0.01, (0.01 + 0.01 / 2 + 0.02) * 9 / 2], rel=1e-6)
+    assert observer.half_widths[1] > 2.0 * told[1]
+    assert observer.widths["f"].endswith(f"(predicted at the nominal point: +-{told[1]:.4g})")
+    assert "predicted" not in observer.widths["x"]
+    assert "predicted_half_widths" in observer.searched
