@@ -1,5 +1,7 @@
 """What it is worth: simulation, coverage, plots, report."""
 
+from obsynth.evaluate.choosing.choice import Choice as Choice
+from obsynth.evaluate.choosing.choose import choose as choose
 from obsynth.evaluate.coverage import coverage_table as coverage_table
 from obsynth.evaluate.domain import Domain as Domain
 from obsynth.evaluate.domain import StatusCount as StatusCount

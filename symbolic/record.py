@@ -32,11 +32,9 @@ class Record:
 
     Examples
     --------
-    >>> names = {"u": ("v",), "y": ("h",), "reference": ()}
-    >>> units = {"u": ("V",), "y": ("cm",), "reference": ()}
-    >>> record = Record([0, 1], [[5], [5]], [[40], [41]], np.empty((2, 0)), names, units, "by hand")
-    >>> record["h"].tolist()
-    [40.0, 41.0]
+    >>> from obsynth.symbolic.records import three_tank_leak
+    >>> three_tank_leak()["y2"].shape
+    (181,)
     """
 
     time: FloatArray
@@ -48,38 +46,33 @@ class Record:
     source: str
 
     def __post_init__(self) -> None:
-        time = np.array(self.time, dtype=float)
-        if time.ndim != 1 or time.size < 2 or not np.all(np.diff(time) > 0):
-            raise PlantError(f"record {self.source!r}: the time has to increase", field="time")
-        for group in GROUPS:
+        for group in ("time", *GROUPS):
             array = np.array(getattr(self, group), dtype=float)
-            shape = (time.size, len(self.names[group]))
-            if array.shape != shape or len(self.units[group]) != shape[1]:
-                raise PlantError(
-                    f"record {self.source!r}: {group} has shape {array.shape}; {shape} is needed, "
-                    f"a row for each instant, and a name and a unit for each column",
-                    field=group,
-                )
             array.flags.writeable = False
             object.__setattr__(self, group, array)
-        time.flags.writeable = False
-        object.__setattr__(self, "time", time)
+        if self.time.ndim != 1 or self.time.size < 2 or not np.all(np.diff(self.time) > 0):
+            raise PlantError(f"record {self.source!r}: the time has to increase", field="time")
+        for group in GROUPS:
+            given, shape = getattr(self, group).shape, (len(self), len(self.names[group]))
+            if given != shape or len(self.units[group]) != shape[1]:
+                raise PlantError(
+                    f"record {self.source!r}: {group} has shape {given}; {shape} is needed, a row "
+                    "for each instant, and a name and a unit for each column",
+                    field=group,
+                )
 
     def __len__(self) -> int:
         return int(self.time.size)
 
     def __getitem__(self, name: str) -> FloatArray:
         """Return a channel by its name, shape (N,)."""
-        for group in GROUPS:
-            if name in self.names[group]:
-                column: FloatArray = getattr(self, group)[:, self.names[group].index(name)]
-                return column
-        known = ", ".join(n for group in GROUPS for n in self.names[group])
-        raise PlantError(f"no channel is called {name!r}; there are {known}", symbol=name)
+        names = [n for group in GROUPS for n in self.names[group]]
+        if name not in names:
+            raise PlantError(
+                f"no channel is called {name!r}; there are {', '.join(names)}", symbol=name
+            )
+        return np.hstack([self.u, self.y, self.reference])[:, names.index(name)]
 
     def __repr__(self) -> str:
-        return (
-            f"<Record {self.source!r}, {len(self)} samples, t = {self.time[0]:g} to "
-            f"{self.time[-1]:g}, inputs {', '.join(self.names['u'])}, "
-            f"outputs {', '.join(self.names['y'])}>"
-        )
+        u, y = (", ".join(self.names[group]) for group in ("u", "y"))
+        return f"<Record {self.source!r}, {len(self)} samples, inputs {u}, outputs {y}>"

@@ -32,9 +32,11 @@ from .designs import SetAdaptiveObserver as SetAdaptiveObserver
 from .designs import SolverTrouble as SolverTrouble
 from .designs import load as load
 from .designs import worst_case as worst_case
+from .evaluate import Choice as Choice
 from .evaluate import Run as Run
 from .evaluate import SimulationError as SimulationError
 from .evaluate import Table as Table
+from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
 from .evaluate import plot_alarms as plot_alarms
 from .evaluate import plot_errors as plot_errors

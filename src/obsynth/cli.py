@@ -8,16 +8,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from obsynth import __version__
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from obsynth.evaluate import Table
+    from obsynth.symbolic import Plant
 
 STUDIES = ("quadruple-tank",)
 
@@ -69,11 +68,12 @@ def run(
     folder = Path("out", study) if out is None else out
     with _refusals():
         from obsynth.codegen.folder import check_target
+        from obsynth.evaluate.progress import bar
         from obsynth.evaluate.studies import RUN, quadruple_tank
 
         check_target(folder, RUN)
         start = time.perf_counter()
-        with _progress() as advance:
+        with bar() as advance:
             found = quadruple_tank(folder, steps=steps, seeds=seeds, progress=advance)
     console = _console()
     for table in found.tables():
@@ -96,8 +96,9 @@ def check(
     with _refusals():
         from obsynth.designs import load
         from obsynth.evaluate import Table
+        from obsynth.evaluate.progress import bar
 
-        with _progress() as advance:
+        with bar() as advance:
             advance("reading the design and proving its LMIs", 0.0)
             observer = load(design)
             advance("deriving the bounds again and proving every claim", 0.3)
@@ -108,6 +109,51 @@ def check(
     console = _console()
     console.print(_rich(Table(title, ["claim", "margin", "proof"], rows)))
     console.print(str(observer.guarantee), markup=False, highlight=False)
+
+
+@app.command()
+def choose(
+    plant: Annotated[str, typer.Argument(help="A name in obsynth.plants, or a JSON file.")],
+    ts: Annotated[
+        float | None, typer.Option(help="Sample time in s, for continuous plants.", min=0)
+    ] = None,
+    budget: Annotated[int | None, typer.Option(help="Operations a step may take.", min=1)] = None,
+    criterion: Annotated[str, typer.Option(help="faults, states, all, or a name.")] = "faults",
+    limit: Annotated[float, typer.Option(help="Seconds for each method.", min=0)] = 60.0,
+) -> None:
+    """Try every method on a plant, compare and recommend one; exit 1 if there is none."""
+    with _refusals():
+        import obsynth
+
+        given = _plant(plant)
+        choice = obsynth.choose(given, budget=budget, criterion=criterion, Ts=ts, limit=limit)
+    console = _console()
+    for table in (choice.table, choice.widths):
+        console.print(_rich(table))
+        console.print()
+    if choice.recommended is None:
+        _refuse(choice.reason)
+
+
+def _plant(given: str) -> Plant:
+    """Return a plant by its name, or from the file of a plant or of a design."""
+    import json
+
+    from obsynth.symbolic import Plant, plants
+
+    if given in plants.__all__:
+        try:
+            found: Plant = getattr(plants, given)()
+        except TypeError as error:
+            _refuse(f"{given} is made in Python ({error}); give a file of what to_dict returns.")
+        return found
+    if not Path(given).is_file():
+        _refuse(f"there is no plant and no file {given!r}; plants are {', '.join(plants.__all__)}.")
+    try:
+        data = json.loads(Path(given).read_text())
+    except ValueError as error:
+        _refuse(f"{given!r} is no JSON file: {error}.")
+    return Plant.from_dict(data.get("plant", data) if isinstance(data, dict) else data)
 
 
 def _console(stderr: bool = False) -> Any:
@@ -142,24 +188,6 @@ def _rich(table: Table) -> Any:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[str, float], None]]:
-    """Show a bar with the stage and the time, on terminals only."""
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    console = _console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description:<34}"), BarColumn(28))
-    with Progress(
-        *columns,
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda stage, done: bar.update(task, description=stage, completed=done)
-
-
-@contextmanager
 def _refusals() -> Iterator[None]:
     """Turn refusals into one sentence and an exit code; anything else keeps its traceback."""
     from obsynth.symbolic.errors import ObsynthError
@@ -172,6 +200,6 @@ def _refusals() -> Iterator[None]:
         _refuse(f"{error.strerror}: {error.filename}")
 
 
-def _refuse(message: str) -> None:
+def _refuse(message: str) -> NoReturn:
     print(f"obsynth: {message}", file=sys.stderr)
     raise typer.Exit(code=1)

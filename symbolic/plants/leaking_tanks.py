@@ -38,7 +38,7 @@ def leaking_tanks(wx: float = 0.003, wy: float = 0.006, rate: float | None = Non
     plant = Plant("leaking tanks")
     span = (0.02, 0.36)
     e1, h2, e3 = plant.states(
-        "e1 h2 e3", range=[span, (0, 0.6), span], nominal=[0.12, 0.35, 0.12], unit="V"
+        "e1 h2 e3", range=[span, (0, 0.6), span], nominal=[0.12, 0.1, 0.12], unit="V"
     )
     u1, u3 = plant.inputs("u1 u3", range=(0, 1), nominal=0.47)
     (leak,) = plant.faults("leak", range=(-0.05, 0.05), rate=rate, unit="V/s")

@@ -151,3 +151,62 @@ def test_the_whole_command_from_outside(tmp_path):
             check=False,
         )
         assert proof.returncode == 0, proof.stderr
+
+
+@pytest.fixture
+def chosen(monkeypatch):
+    """`obsynth.choose` with a table of its own; what it was given."""
+    given = []
+
+    def choose(plant, **options):
+        given.append((plant, options))
+        table = Table("Observers", ["observer"], [["interval"]])
+        return SimpleNamespace(
+            table=table, widths=table, recommended=choose.best, reason="none fits"
+        )
+
+    choose.best = object()
+    monkeypatch.setattr(obsynth, "choose", choose)
+    return SimpleNamespace(given=given, choose=choose)
+
+
+def test_choose_takes_a_name_the_file_of_a_plant_or_of_a_design(chosen, tmp_path):
+    result = runner.invoke(app, ["choose", "battery", "--ts", "1", "--budget", "900"])
+    assert result.exit_code == 0 and "interval" in result.output
+    plant = obsynth.plants.leaking_tanks()
+    for name, data in (("plant", plant.to_dict()), ("design", {"plant": plant.to_dict()})):
+        (tmp_path / name).write_text(json.dumps(data))
+        assert runner.invoke(app, ["choose", str(tmp_path / name)]).exit_code == 0
+    (battery, options), (first, _), (second, _) = chosen.given
+    assert battery.name == "battery 1RC" and first.to_dict() == second.to_dict() == plant.to_dict()
+    assert options == {"budget": 900, "criterion": "faults", "Ts": 1.0, "limit": 60.0}
+
+
+def test_choose_without_a_recommendation_is_a_failure_that_shows_the_table(chosen):
+    chosen.choose.best = None
+    result = runner.invoke(app, ["choose", "battery"])
+    assert result.exit_code == 1
+    assert "interval" in result.output and "obsynth: none fits" in said(result)
+
+
+@pytest.mark.parametrize(
+    ("text", "refusal"),
+    [
+        (None, "there is no plant and no file"),
+        ("no json", "is no JSON file"),
+        ("[1]", "a table with 'format' is needed"),
+        ("{}", "format"),
+    ],
+)
+def test_choose_refuses_what_is_no_plant(chosen, tmp_path, text, refusal):
+    path = tmp_path / "plant.json"
+    if text is not None:
+        path.write_text(text)
+    result = runner.invoke(app, ["choose", str(path)])
+    assert result.exit_code == 1 and refusal in said(result) and "Traceback" not in result.output
+    assert "planar_arm is made in Python" in said(runner.invoke(app, ["choose", "planar_arm"]))
+
+
+def test_choose_refuses_a_continuous_plant_without_a_sample_time():
+    result = runner.invoke(app, ["choose", "battery"])
+    assert result.exit_code == 1 and "battery 1RC is a continuous plant: give Ts=" in said(result)

@@ -1,0 +1,1 @@
+"""Which observer for this plant: every method tried in one run, beside a Kalman filter."""
