@@ -106,16 +106,25 @@ class Observer:
         }
 
     @property
+    def vacuous(self) -> tuple[str, ...]:
+        """Names of states and faults whose half width is no less than what is declared."""
+        boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
+        declared = 0.5 * np.diff(boxes, axis=1)[:, 0]
+        names = (*self.model.names("x"), *self.model.names("f"))
+        found = (
+            () if self.half_widths is None else zip(names, self.half_widths, declared, strict=True)
+        )
+        return tuple(name for name, width, limit in found if width >= limit)
+
+    @property
     def widths(self) -> Mapping[str, str]:
         """The half widths in words, by the names of states and faults; vacuous ones say so."""
         if self.half_widths is None:
             return {}
-        boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
-        declared = 0.5 * np.diff(boxes, axis=1)[:, 0]
         names = (*self.model.names("x"), *self.model.names("f"))
         found = {
-            name: f"+-{width:.4g}" + (", no more than is declared" if width >= limit else "")
-            for name, width, limit in zip(names, self.half_widths, declared, strict=True)
+            name: f"+-{width:.4g}" + (", no more than is declared" if name in self.vacuous else "")
+            for name, width in zip(names, self.half_widths, strict=True)
         }
         nominal = self.performance.get("predicted_half_widths")
         rows = () if nominal is None else zip(names, self.half_widths, nominal, strict=True)
@@ -194,7 +203,12 @@ class Observer:
         if self.widths:
             lines.append("  " + ", ".join(f"{name} {word}" for name, word in self.widths.items()))
         lines += [f"  {key} = {value:.6g}" for key, value in self.figures.items()]
-        return "\n".join(lines)
+        return "\n".join([*lines, *([f"  {self._advice}"] if self.vacuous else [])])
+
+    @property
+    def _advice(self) -> str:
+        told = ", ".join(self.vacuous)
+        return f"says no more of {told} than is declared: obsynth.choose tries the other methods"
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -210,4 +224,5 @@ class Observer:
         )
         words = f"{escape(self.method)} for {escape(self.model.name)}"
         title = f"<caption style='text-align:left;white-space:nowrap'>{words}</caption>"
-        return f"<table>{title}{rows}{facts}</table>{self.certificate._repr_html_()}"
+        advice = f"<p>{escape(self._advice)}</p>" if self.vacuous else ""
+        return f"<table>{title}{rows}{facts}</table>{advice}{self.certificate._repr_html_()}"
