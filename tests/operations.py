@@ -1,5 +1,6 @@
 """Operations of interval programs with the ranges for which they are tried, and their values."""
 
+import casadi as ca
 import mpmath as mp
 import numpy as np
 
@@ -57,6 +58,7 @@ OPERATIONS = {
     "acosh": (one((1.0, 3.0), (1.0, FAR)), mp.acosh),
     "atanh": (one((-0.9, 0.9), (0.2, 0.7)), mp.atanh),
     "asin": (one((-1.0, 1.0), (0.2, 0.7)), mp.asin),
+    "acos": (one((-1.0, 1.0), (0.2, 0.7)), mp.acos),
     "atan": (one(NEAR, UP, WHOLE), mp.atan),
     "erf": (one(NEAR, UP, WHOLE), mp.erf),
     "sine": (one(NEAR, (0.2, 0.7), (-1e3, 1e3), WHOLE), mp.sin),
@@ -96,7 +98,7 @@ def points(rng, boxes):
 # every operation of the rules, and where operands leave the domain or the branch
 HALF, PI = 0.5 * np.pi, np.pi
 MORE = {
-    "acos": ([((-1.0, 1.0),), ((0.2, 0.7),)], mp.acos),
+    "acos": ([((-2.0, 2.0),)], mp.acos),
     "sine": ([((-HALF, HALF),)], mp.sin),
     "cosine": ([((-PI, PI),), ((0.0, PI),)], mp.cos),
     "sqrt": ([(WHOLE,), ((-2.0, 4.0),)], mp.sqrt),
@@ -133,3 +135,40 @@ def result(value, point):
         except (ValueError, ZeroDivisionError):
             return None
         return None if isinstance(found, mp.mpc) or not abs(found) < FAR else found
+
+
+UNARY = [
+    (ca.sin, mp.sin),
+    (ca.cos, mp.cos),
+    (ca.tanh, mp.tanh),
+    (ca.atan, mp.atan),
+    (ca.fabs, abs),
+    (lambda a: a * a, lambda a: a * a),
+    (lambda a: a**3, lambda a: a**3),
+    (lambda a: ca.sqrt(1 + a * a), lambda a: mp.sqrt(1 + a * a)),
+    (lambda a: ca.log(2 + ca.sin(a)), lambda a: mp.log(2 + mp.sin(a))),
+    (lambda a: ca.exp(ca.sin(a)), lambda a: mp.exp(mp.sin(a))),
+    (lambda a: a / (3 + ca.cos(a)), lambda a: a / (3 + mp.cos(a))),
+    (lambda a: 0.375 - 1.5 * a, lambda a: mp.mpf(0.375) - mp.mpf(1.5) * a),
+]
+BINARY = [
+    (lambda a, b: a + b, lambda a, b: a + b),
+    (lambda a, b: a - b, lambda a, b: a - b),
+    (lambda a, b: a * b, lambda a, b: a * b),
+    (ca.fmin, min),
+    (ca.fmax, max),
+    (lambda a, b: ca.if_else(a < b, 2 * a, b - 1), lambda a, b: 2 * a if a < b else b - 1),
+]
+
+
+def written(rng, depth):
+    """A random expression as CasADi and as mpmath functions of x."""
+    if depth == 0:
+        j = int(rng.integers(3))
+        return (lambda x: x[j]), (lambda x: x[j])
+    if rng.uniform() < 0.45:
+        (f, g), (a, b) = UNARY[rng.integers(len(UNARY))], written(rng, depth - 1)
+        return (lambda x: f(a(x))), (lambda x: g(b(x)))
+    f, g = BINARY[rng.integers(len(BINARY))]
+    (a, b), (c, d) = written(rng, depth - 1), written(rng, depth - 1)
+    return (lambda x: f(a(x), c(x))), (lambda x: g(b(x), d(x)))

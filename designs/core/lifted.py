@@ -439,6 +439,9 @@ _FORMS: Mapping[str, Callable[..., Lifted | None]] = {
     **{name: getattr(_Arithmetic, name) for name in _OWN.split()},
     **{name: _increasing(getattr(ca, name)) for name in _INCREASING.split()},
     "tangent": _increasing(ca.tan),
+    "acos": lambda self, args, *given: _increasing(ca.acos)(
+        self, [Lifted(args[0].upper, args[0].lower)], *given
+    ),
     "power": lambda self, *given: self.corners(lambda a, b: a**b, *given),
     "conjunction": _Arithmetic.minimum,
     "disjunction": _Arithmetic.maximum,
