@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from obsynth.derive.errors import StructureError
@@ -10,10 +11,13 @@ from obsynth.derive.forms.extended import Extended, extend
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import Signal
 
 RTOL = 1e-3
 """Of the bounds of the joint Jacobian."""
 NO_RATE = "it has no rate"
+MOST_FREE = 6
+"""Signals along which a point of the box is looked for, three values each."""
 _DECAYS = 1.0 - 1e-7
 _HIDDEN = 1e-8
 
@@ -80,22 +84,9 @@ def untold(extended: Extended, middle: FloatArray, again: Sequence[str] = ()) ->
     middle: of the extended plant's joint Jacobian, (N + m, N + n_v)
     again: disturbances of it that are read as followed faults again
     """
-    plant, (N, m) = extended.plant, extended.L0.shape
-    noise = plant.names("w")
-    columns = [*range(N), *(N + noise.index(name) for name in again)]
-    names = [*plant.names("x"), *again]
-    half = np.concatenate([half_ranges(plant, "x"), half_ranges(plant, "w")])[columns]
-    rest = [j for j in range(N, N + len(noise)) if j not in columns]
-    size = np.abs(middle[N:, rest]) @ half_ranges(plant, "w")[[j - N for j in rest]]
-    F = np.vstack([middle[:N, columns], np.eye(len(columns))[N:]])
-    C = middle[N:, columns]
-    L0 = np.zeros((len(columns), m))
-    L0[:N] = np.array(extended.L0.evalf(17).tolist(), dtype=float).reshape(N, m)
-    size = np.maximum(size, 1e-6 * (np.abs(C) @ half))
-    T = np.eye(len(columns)) - L0 @ C
-    A = (T @ F) * half / half[:, None]
-    C = ((C @ T) * half) / np.where(size > 0.0, size, 1.0)[:, None]
-    states, kept = names[: N - len(extended.followed)], np.arange(len(names))
+    A, C, half = _pair(extended, middle, again)
+    names = [*extended.plant.names("x"), *again]
+    states, kept = names[: extended.L0.shape[0] - len(extended.followed)], np.arange(len(names))
     found: dict[str, str] = {}
     while True:
         lost = _hidden(A[np.ix_(kept, kept)], C[:, kept])
@@ -107,7 +98,7 @@ def untold(extended: Extended, middle: FloatArray, again: Sequence[str] = ()) ->
         if not faults:
             raise StructureError(
                 f"a mode {abs(value):.6g} of {', '.join(moved)} does not decay and no output shows "
-                f"it ({', '.join(plant.output_names)}); measure one of them",
+                f"it ({', '.join(extended.plant.output_names)}); measure one of them",
                 symbols=tuple(moved),
                 condition="detectability",
             )
@@ -118,6 +109,64 @@ def untold(extended: Extended, middle: FloatArray, again: Sequence[str] = ()) ->
             "the family)"
         )
         kept = kept[[names[i] != gone for i in kept]]
+
+
+def hidden_somewhere(extended: Extended) -> str | None:
+    """Say where in the box a mode does not decay that no output shows: no gain serves there.
+
+    Looked for at lower ends, upper ends and nominal values or middles; None where none is found.
+    """
+    plant = extended.plant
+    sx, signals = plant.sx(), (*plant.x, *plant.u, *plant.w)
+    v, known = ca.vertcat(sx.x, sx.w), ca.vertcat(sx.x, sx.u, sx.w)
+    J = ca.densify(ca.jacobian(ca.vertcat(sx.rhs, sx.y), v))
+    matters = np.array(ca.which_depends(ca.vec(J), known, 1, False), dtype=bool)
+    matters &= [s.bounded for s in signals]
+    ends = [(0.0,) * 3 if not s.bounded else (_middle(s), s.lower, s.upper) for s in signals]
+    free = np.flatnonzero(matters)
+    picks = np.indices((3,) * min(len(free), MOST_FREE)).reshape(min(len(free), MOST_FREE), -1)
+    function = ca.Function("J", [known], [J])
+    for pick in picks.T:
+        point = np.array([end[0] for end in ends])
+        for place, k in zip(free, pick, strict=False):
+            point[place] = ends[place][k]
+        found = np.array(function(point))
+        lost = _hidden(*_pair(extended, found)[:2]) if np.isfinite(found).all() else None
+        if lost is not None:
+            value, vector = lost
+            names = [n for n, size in zip(plant.names("x"), vector, strict=True) if size > 1e-6]
+            at = ", ".join(f"{signals[k].name} = {point[k]:g}" for k in free)
+            return (
+                f"where {at}, the error of {', '.join(names)} does not decay (a mode "
+                f"{abs(value):.6g}) and no output shows it ({', '.join(plant.output_names)}): no "
+                f"gain serves there; measure {names[0]}, or narrow a range that this point is in"
+            )
+    return None
+
+
+def _middle(s: Signal) -> float:
+    return 0.5 * (s.lower + s.upper) if s.nominal is None else float(s.nominal)
+
+
+def _pair(
+    extended: Extended, middle: FloatArray, again: Sequence[str] = ()
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A and C of the errors, in units of half ranges and noise, and the half ranges."""
+    plant, (N, m) = extended.plant, extended.L0.shape
+    noise = plant.names("w")
+    columns = [*range(N), *(N + noise.index(name) for name in again)]
+    half = np.concatenate([half_ranges(plant, "x"), half_ranges(plant, "w")])
+    rest = [j for j in range(N, N + len(noise)) if j not in columns]
+    size = np.abs(middle[N:, rest]) @ half[rest]
+    half = half[columns]
+    F = np.vstack([middle[:N, columns], np.eye(len(columns))[N:]])
+    C = middle[N:, columns]
+    L0 = np.zeros((len(columns), m))
+    L0[:N] = np.array(extended.L0.evalf(17).tolist(), dtype=float).reshape(N, m)
+    size = np.maximum(size, 1e-6 * (np.abs(C) @ half))
+    T = np.eye(len(columns)) - L0 @ C
+    A = (T @ F) * half / half[:, None]
+    return A, ((C @ T) * half) / np.where(size > 0.0, size, 1.0)[:, None], half
 
 
 def half_ranges(plant: Plant, kind: str) -> FloatArray:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive import JacobianBounds
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import TINY
-from obsynth.derive.structure.following import follow
+from obsynth.derive.structure.following import follow, hidden_somewhere
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
@@ -96,16 +96,19 @@ class GeneralUIO(Method):
         try:
             return super()._design(model, bounds)
         except SolverTrouble as trouble:
-            if self.bounds != "peak" or self.faults != "followed" or not model.f:
-                raise
-            for way in WAYS:
+            others = WAYS if self.bounds == "peak" and self.faults == "followed" else ()
+            for way in others if model.f else ():
                 with suppress(StructureError, SolverTrouble, InfeasibleDesign):
                     other = replace(self, faults=way)
                     found = other.read(model)
                     # what was asked for is stored: the guarantee says why it came otherwise
                     design = other.solve(found).changed(options=self.options())
                     return self._certified(design, found)
-            raise trouble from None
+            where = hidden_somewhere(self.read(model).extended)
+            if where is None:
+                raise trouble from None
+            told = str(trouble).splitlines()[0].split(";")[0]
+            raise SolverTrouble(f"{model.name}: {where}", [told]) from None
 
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""

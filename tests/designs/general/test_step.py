@@ -9,7 +9,8 @@ import sympy as sp
 
 import obsynth as ob
 from methods import motor, observer_of
-from obsynth.derive.structure.following import follow
+from obsynth.derive.forms.extended import extend
+from obsynth.derive.structure.following import follow, hidden_somewhere
 from obsynth.designs.general.claims import claims
 from obsynth.designs.general.method import GeneralUIO, bound_peak
 from obsynth.designs.general.model import read
@@ -140,6 +141,26 @@ def alike():
     plant.dynamics([x / 2 + f + g, z / 2 + x * z / 99 + jump + drift], Ts=1)
     plant.outputs([x + w[0], z + w[1]])
     return plant
+
+
+def sliding(most=2):
+    """A state that does not decay, seen through a slope that vanishes at -2 and 2."""
+    plant = ob.Plant("sliding")
+    v, r = plant.states("v r", range=[(-most, most), (-3, 3)], nominal=[0.5, 0])
+    w = plant.disturbances("w1 w2", bound=[0.01, 0.02])
+    plant.dynamics([v * sp.Rational(101, 100) + w[0], r / 2 + v - v**3 / 12], Ts=1)
+    plant.outputs([r + w[1]])
+    return plant
+
+
+@pytest.mark.parametrize("bounds", ["peak", "ellipsoid"])
+def test_where_no_gain_serves_is_said_by_the_names_of_the_signals(bounds):
+    """Mutants: the nominal point alone; what the search tried in place of why it had to fail."""
+    with pytest.raises(ob.SolverTrouble) as refusal:
+        GeneralUIO(bounds=bounds).design(sliding())
+    assert "where v = -2, the error of v does not decay (a mode 1.01)" in str(refusal.value)
+    assert "no output shows it (y1)" in str(refusal.value) and "measure v" in str(refusal.value)
+    assert hidden_somewhere(extend(sliding(sp.Rational(3, 2)))) is None
 
 
 def said(observer):
