@@ -10,6 +10,8 @@ d, w) with y = C x + W2 w:
   f_j alone) where zero is not in the range of J_ij over the sets;
 - rates: ``f_j`` lies in ``F'_j +- r_j``, and everything in its declared range.
 
+- sweeps: every operation of the equations inverted, over two instants (see `sweeps`).
+
 Each keeps every point that the plant's equations and ranges allow. A row with an unbounded unknown
 input or disturbance has no image and no inversion. A plant in continuous time has strips, ranges
 and rates alone. States are held to a range only if some derivative depends on them.
@@ -31,9 +33,11 @@ from obsynth.designs.core.lifted import FAR, Lifted, Rounding
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
-Cut = Literal["ranges", "strips", "image", "inversion", "rates"]
-CUTS: tuple[Cut, ...] = get_args(Cut)
+Cut = Literal["ranges", "strips", "image", "inversion", "rates", "sweeps"]
+EVERY_CUT: tuple[Cut, ...] = get_args(Cut)
 """Parts of the contractor, for an option that names those that are used."""
+CUTS = EVERY_CUT[:-1]
+"""Those that are used where nothing is said."""
 
 SWEEPS = 2
 
@@ -152,11 +156,14 @@ class Contractor:
 
     def image(self, before: Before) -> Ends:
         """Return what the states can be one call later, unbounded where a row has no image."""
+        # what has no range may have been given one by what it did
+        swept = before.rest.lower.numel() > 0
+        usable = self.equations.small if swept else self.equations.usable
         rows = [
             self.equations.image(i, before, self.rounding)
-            if "image" in self.cuts and usable
+            if "image" in self.cuts and usable[i]
             else Lifted.number(-FAR, FAR)
-            for i, usable in enumerate(self.equations.usable.tolist())
+            for i in range(self.equations.n)
         ]
         return Ends(ca.vertcat(*(r.lower for r in rows)), ca.vertcat(*(r.upper for r in rows)))
 

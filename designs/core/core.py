@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.sweeps import Pair
 from obsynth.symbolic.arrays import FloatArray
 
 Parts = Mapping[str, ca.SX]
@@ -20,6 +21,7 @@ class Seen:
     u, theta: inputs and measured scheduling, made finite
     y: readings, zero where they are not used
     used: 1 where a reading is used, for every output
+    around: boxes of this instant and the one before, where the sweeps find them
     """
 
     memory: Parts
@@ -27,6 +29,7 @@ class Seen:
     theta: ca.SX
     y: ca.SX
     used: Sequence[ca.SX]
+    around: Pair | None = None
 
     @property
     def all_used(self) -> ca.SX:
@@ -71,6 +74,8 @@ class Core:
     """What a method knows, without what the data say by themselves.
 
     run: the instant's sets and the next memory
+    advance: what the memory of the call before says of this instant, before its readings; for cores
+        whose memory speaks of the call before
     begin: parts of the memory that hold for a state and a fault in boxes, around the estimates
         given; for parts that are not shared
     place: estimates (the parts that `Contract.shared` names) from boxes, where those given are of
@@ -87,3 +92,4 @@ class Core:
     domain: FloatArray | None = None
     bridges: bool = False
     mean_fault: bool = False
+    advance: Callable[[Seen], Parts] | None = None

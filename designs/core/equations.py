@@ -1,7 +1,7 @@
 """One step of a discrete plant over boxes: its image, and the faults that explain it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import casadi as ca
@@ -23,11 +23,25 @@ MOST_NODES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """What was known an instant before: sets of states and faults, inputs and scheduling."""
+    """What is known of an instant: sets of states and faults, inputs and scheduling, and the rest.
+
+    rest: sets of unknown inputs, disturbances, parameters and scheduling that is not measured; by
+        default their ranges
+    """
 
     states: Ends
     faults: Ends
     known: ca.SX
+    rest: Ends = field(default_factory=lambda: Ends(ca.SX(0, 1), ca.SX(0, 1)))
+
+    def where(self, condition: ca.SX, other: "Before") -> "Before":
+        """Return this where a condition holds, the other elsewhere."""
+        return Before(
+            self.states.where(condition, other.states),
+            self.faults.where(condition, other.faults),
+            self.known,
+            self.rest.where(condition, other.rest),
+        )
 
 
 class Equations:
@@ -37,7 +51,8 @@ class Equations:
     box: ranges of (x, f, rest), `FAR` where there is none or where it does not matter
     curved: states on which some derivative by a state or a fault depends, (n,)
     slopes: ranges of the derivatives of every row over the box, (n, variables, 2)
-    usable: rows that no unbounded signal enters, (n,)
+    small: rows of few enough operations, in discrete time, (n,)
+    usable: those that no unbounded signal enters, (n,)
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -60,14 +75,11 @@ class Equations:
         }
         self.slopes = self._slopes()
         free = [j for j in range(n + n_f, self.n_v) if not np.isfinite(given[j]).all()]
-        self.usable: BoolArray = np.array(
-            [
-                plant.Ts is not None
-                and not any((i, j) in self.entries for j in free)
-                and self._size(i) <= MOST_NODES
-                for i in range(n)
-            ]
+        self.small: BoolArray = np.array(
+            [plant.Ts is not None and self._size(i) <= MOST_NODES for i in range(n)]
         )
+        bounded = [not any((i, j) in self.entries for j in free) for i in range(n)]
+        self.usable: BoolArray = self.small & np.array(bounded)
 
     def _size(self, row: int) -> int:
         entries = [k for (i, _), k in self.entries.items() if i == row]
@@ -101,6 +113,19 @@ class Equations:
         for pair, found in zip(self.entries, np.hstack(ends).tolist(), strict=True):
             slopes[pair] = found if np.isfinite(found).all() else slopes[pair]
         return slopes
+
+    @cached_property
+    def outputs(self) -> Program:
+        """The outputs over the same variables."""
+        v, known, _, outputs, _ = _symbols(self.plant)
+        return Program.from_casadi(ca.Function("outputs", [v, known], [outputs]))
+
+    @cached_property
+    def shown(self) -> frozenset[int]:
+        """Variables that enter an output."""
+        program = self.outputs
+        places = [program.support(k) for k in range(len(program.outputs))]
+        return frozenset(j for support in places for j in support if j < self.n_v)
 
     @cached_property
     def bends(self) -> dict[tuple[int, int], FloatArray]:
@@ -150,7 +175,11 @@ class Equations:
         ends = [(before.states.lower[i], before.states.upper[i]) for i in range(n)]
         ends += [(before.faults.lower[j], before.faults.upper[j]) for j in range(n_f)]
         found = [Lifted(*pair, *box) for pair, box in zip(ends, self.box.tolist(), strict=False)]
-        found += [Lifted.number(low, high) for low, high in self.box[n + n_f :].tolist()]
+        ranges = self.box[n + n_f :].tolist()
+        lower, upper = (ca.vertsplit(end) for end in (before.rest.lower, before.rest.upper))
+        for k, (low, high) in enumerate(ranges):
+            swept = Lifted(lower[k], upper[k], low, high) if lower else Lifted.number(low, high)
+            found.append(swept)
         return found + [
             Lifted.point(before.known[k], low, high)
             for k, (low, high) in enumerate(self.known_box.tolist())

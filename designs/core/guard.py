@@ -31,11 +31,12 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Guarantee
-from obsynth.designs.core.contractor import CUTS, Contractor, Cut
+from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.stepping import slices
+from obsynth.designs.core.sweeps import Sweeps
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -73,7 +74,7 @@ class Watch:
         horizon, recovery, cuts = (options.get(name) for name in ("horizon", "recovery", "cuts"))
         given = HORIZON if horizon is None else horizon
         named: Any = CUTS if cuts is None else cuts
-        known = isinstance(named, list | tuple) and all(name in CUTS for name in named)
+        known = isinstance(named, list | tuple) and all(name in EVERY_CUT for name in named)
         counts = [n for n in (given, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
         if not known or len(counts) < 2:
             raise CertificateError(
@@ -81,7 +82,7 @@ class Watch:
                 f"cuts {cuts!r} are no options of the guard"
             )
         found = None if horizon is None else counts[0]
-        return cls(found, counts[1], tuple(c for c in CUTS if c in named))
+        return cls(found, counts[1], tuple(c for c in EVERY_CUT if c in named))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +117,8 @@ class Guard:
         known = len(self.plant.u) + sum(s.measured for s in self.plant.rho)
         boxes = {"x_lower": n, "x_upper": n} if self.discrete else {}
         boxes |= {"f_lower": n_f, "f_upper": n_f}
+        if self.sweeps is not None:
+            boxes |= dict.fromkeys(("rest_lower", "rest_upper"), len(self.sweeps.carried))
         single = dict(self.sizes)
         twice = {k: s for k, s in single.items() if k not in self.shared} | boxes | {"begin": 1}
         young = {name + YOUNG: size for name, size in twice.items()}
@@ -131,6 +134,8 @@ class Guard:
         A discrete core begins at the first call from the boxes, cut with the first readings.
         """
         boxes = {"x": x, "f": f} if self.discrete else {"f": self.plant.box("f")}
+        if self.sweeps is not None:
+            boxes["rest"] = self.sweeps.declared[self.sweeps.carried]
         ends: dict[str, ArrayLike] = {}
         layout = self.layout()
         for name, box in boxes.items():
@@ -145,6 +150,12 @@ class Guard:
     def contractor(self) -> Contractor:
         """What the data say by themselves."""
         return Contractor(self.plant, self.Ts, self.watch.cuts, self.precision)
+
+    @cached_property
+    def sweeps(self) -> Sweeps | None:
+        """What the equations say in both directions, where that is asked for."""
+        asked = self.discrete and "sweeps" in self.watch.cuts
+        return Sweeps(self.contractor) if asked else None
 
     @cached_property
     def half_widths(self) -> HalfWidths:

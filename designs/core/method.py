@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
-from obsynth.designs.core.contractor import CUTS
+from obsynth.designs.core.contractor import CUTS, EVERY_CUT
 from obsynth.designs.core.core import Core
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
@@ -197,8 +197,9 @@ class Method:
         many as the method's own sets take to settle, or 400
     recovery: number of calls after a void one that the status marks as recovering
     cuts: what the returned sets are cut with beside the method's own, of ``"ranges"``,
-        ``"strips"``, ``"image"``, ``"inversion"`` and ``"rates"``: everything by default, ``()``
-        for the method's own sets, as its paper has them
+        ``"strips"``, ``"image"``, ``"inversion"``, ``"rates"`` and ``"sweeps"``: by default all but
+        the last, which takes the most operations; ``()`` for the method's own sets, as its paper
+        has them
     """
 
     CLASS: ClassVar[PlantClass]
@@ -216,9 +217,9 @@ class Method:
     def __post_init__(self) -> None:
         check_options(self)
         named = CUTS if self.cuts is None else tuple(self.cuts)
-        if isinstance(self.cuts, str) or not set(named) <= set(CUTS):
+        if isinstance(self.cuts, str) or not set(named) <= set(EVERY_CUT):
             raise ObsynthError(
-                f"cuts is {self.cuts!r}; it takes a tuple of {', '.join(CUTS)}", option="cuts"
+                f"cuts is {self.cuts!r}; it takes a tuple of {', '.join(EVERY_CUT)}", option="cuts"
             )
         object.__setattr__(self, "cuts", None if self.cuts is None else named)
         self.check()

@@ -1,5 +1,7 @@
 """The assembled step: readings, two copies of the sets, what is returned and what is remembered."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -17,6 +19,7 @@ from obsynth.designs.core.stepping import (
     select,
     status_word,
 )
+from obsynth.designs.core.sweeps import Pair
 
 HUGE = 1e50
 """Widths of a core's set from which on it knows nothing."""
@@ -26,11 +29,19 @@ class _Copy:
     """What one of the two copies of sets and bounds holds at an instant."""
 
     def __init__(
-        self, X: Ends, now: Ends, late: Ends, shown: Ends, known: Known, again: ca.SX, told: ca.SX
+        self,
+        X: Ends,
+        now: Ends,
+        late: Ends,
+        shown: Ends,
+        known: Known,
+        again: ca.SX,
+        told: ca.SX,
+        pair: Pair,
     ) -> None:
         self.X, self.now, self.late, self.shown, self.known = X, now, late, shown, known
-        self.again, self.told = again, told
-        self.empty = ca.logic_and(told, known.empty)
+        self.again, self.told, self.rest = again, told, pair.now.rest
+        self.empty = ca.logic_or(ca.logic_and(told, known.empty), pair.empty)
         for box in (X, now, late, shown):
             self.empty = ca.logic_or(self.empty, box.empty())
 
@@ -63,7 +74,7 @@ class Step:
         self.theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
         empty = ca.SX(0, 1)
         self.part = {name: self.memory[place] for name, place in self.layout.items()}
-        for name in (*guard.sizes, "f_lower", "f_upper", "before"):
+        for name in (*guard.sizes, "f_lower", "f_upper", "rest_lower", "rest_upper", "before"):
             for key in (name, name + YOUNG):
                 self.part.setdefault(key, empty)
         self.finite = ca.logic_and(all_finite(self.u), all_finite(self.theta))
@@ -115,8 +126,8 @@ class Step:
         both = ca.logic_and(*copies)
         return {name: select(both, placed[name], kept[name]) for name in kept}
 
-    def _sets(self, end: str, have: ca.SX) -> tuple[Ends, Ends, Before]:
-        """Return the sets of states and faults before the core is asked."""
+    def _sets(self, end: str, have: ca.SX) -> Pair:
+        """Return the sets of this instant and the one before, before the core is asked."""
         contractor, part = self.contractor, self.part
         F = Ends(part["f_lower" + end], part["f_upper" + end])
         stored = self.reset[0]
@@ -129,23 +140,32 @@ class Step:
         X = X.where(have, Ends.of(self.domain).meet(stored))
         X = contractor.measure(X, self.y, self.used)
         now = contractor.drift(F).meet(self.ranges[1]).where(have, F)
-        return X, now, before
+        known = ca.vertcat(self.u_used, self.theta_used)
+        sweeps = self.guard.sweeps
+        if sweeps is None:
+            return Pair(before, Before(X, now, known), ca.SX(0))
+        rest = sweeps.rest(part["rest_lower" + end], part["rest_upper" + end])
+        here = Before(X, now, known, Ends.of(sweeps.declared))
+        return sweeps.run(replace(before, rest=rest), here, have, self.y_clean, self.used)
 
     def _faults(self, F: Ends) -> Ends:
         """Return faults within their ranges, which a core begins from even if they are no cut."""
         return F if "ranges" in self.contractor.cuts else F.meet(self.reset[1])
 
-    def _copy(self, end: str, have: ca.SX, sets: tuple[Ends, Ends, Before], kept: Parts) -> _Copy:
+    def _copy(self, end: str, have: ca.SX, pair: Pair, kept: Parts) -> _Copy:
         """Run the core of one copy on its sets."""
         core, contractor, delay = self.core, self.contractor, self.guard.delay
-        X, now, before = sets
+        X, now, before = pair.now.states, pair.now.faults, pair.before
         names = [name for name in self.guard.sizes if name not in self.guard.shared]
         own = {name: self.part[name + end] for name in names}
         begins = self.part["begin" + end] > 0.5
         X = _declared(X, self.reset[0]).where(begins, X)
         begun = core.begin(X, self._faults(now), kept)
+        signals = self.u_used, self.theta_used, self.y_clean, self.used, pair
+        if core.advance is not None:
+            own = {**core.advance(Seen({**kept, **own}, *signals))}
         own = {name: select(begins, begun[name], own[name]) for name in names}
-        seen = Seen({**kept, **own}, self.u_used, self.theta_used, self.y_clean, self.used)
+        seen = Seen({**kept, **own}, *signals)
         known = core.run(seen)
         told = ca.SX(1) if core.bridges else seen.all_used
         huge = ca.SX(0)
@@ -165,7 +185,7 @@ class Step:
             shown = now.meet(known.f).where(told, now)
             now = now if core.mean_fault else shown
         again = ca.logic_or(ca.logic_not(ca.logic_and(told, known.sound)), huge)
-        return _Copy(X, now, late, shown, known, again, told)
+        return _Copy(X, now, late, shown, known, again, told, pair)
 
     @property
     def y_clean(self) -> ca.SX:
@@ -179,7 +199,7 @@ class Step:
         both = have, ca.logic_and(have, ca.fabs(age - N) > 0.5)
         sets = [self._sets(end, one) for end, one in zip(("", YOUNG), both, strict=True)]
         begins = self.part["begin"] > 0.5, self.part["begin" + YOUNG] > 0.5
-        kept = self._kept(begins, (sets[0][0], sets[0][1]))
+        kept = self._kept(begins, (sets[0].now.states, sets[0].now.faults))
         old, young = (
             self._copy(end, one, found, kept)
             for end, one, found in zip(("", YOUNG), both, sets, strict=True)
@@ -234,6 +254,9 @@ class Step:
         carried = {"f": (old.now, young.now, self.reset[1])}
         if self.guard.discrete:
             carried["x"] = (old.X, young.X, self.reset[0])
+        if (sweeps := self.guard.sweeps) is not None:
+            rests = sweeps.kept(old.rest), sweeps.kept(young.rest)
+            carried["rest"] = (*rests, sweeps.kept(Ends.of(sweeps.declared)))
         for name, (first, second, reset) in carried.items():
             fresh = second.where(ca.logic_and(going, ca.logic_not(turn)), reset)
             kept = second.where(over, first).where(going, reset)
