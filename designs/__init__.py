@@ -23,3 +23,4 @@ from obsynth.designs.interval.method import IntervalObserver as IntervalObserver
 from obsynth.designs.qpv.method import QPVObserver as QPVObserver
 from obsynth.designs.qpv.region import Ellipsoid as Ellipsoid
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver as SetAdaptiveObserver
+from obsynth.designs.set_membership.method import SetMembershipObserver as SetMembershipObserver

@@ -213,6 +213,15 @@ METHODS = {
         option={"gain_cap": 0.0},
         gains=("L",),
     ),
+    "set_membership": Entry(
+        ob.SetMembershipObserver(),
+        motor,
+        motor_turning,
+        outside=ob.plants.quadruple_tank,
+        spoilt=(("size", 1, 1), 0.5, "frame"),
+        option={"columns": 0},
+        gains=("L",),
+    ),
     "qpv_observer": Entry(
         ob.QPVObserver(
             region=ob.Ellipsoid([1.5, 0.09], [5, 0]),

@@ -29,6 +29,7 @@ from .designs import IntervalObserver as IntervalObserver
 from .designs import Observer as Observer
 from .designs import QPVObserver as QPVObserver
 from .designs import SetAdaptiveObserver as SetAdaptiveObserver
+from .designs import SetMembershipObserver as SetMembershipObserver
 from .designs import SolverTrouble as SolverTrouble
 from .designs import load as load
 from .designs import worst_case as worst_case

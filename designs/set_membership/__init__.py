@@ -1,0 +1,1 @@
+"""Set-membership observer: boxes contracted over the equations, and zonotopes between them."""

@@ -1,0 +1,161 @@
+"""The equations over boxes, enclosed by affine functions of what a zonotope carries.
+
+A zonotope carries z = (x, faults that are followed). Everything else that is bounded stands beside:
+what enters several rows is a generator of its own, as is every fault that is not followed, what
+enters one row only widens it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.contractor import Contractor
+from obsynth.designs.core.equations import Before
+from obsynth.designs.core.relaxation import Affine, relax
+from obsynth.designs.core.sweeps import Sweeps
+from obsynth.designs.set_membership.zonotope import STEP, TINY, Zonotope, moved
+from obsynth.symbolic.arrays import IntArray
+
+_UP = 1.0 + 2.0**-40
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """``z+ = J z + offset + columns xi + eta``, |xi| <= 1, |eta| <= spread; N rows."""
+
+    J: ca.SX
+    offset: ca.SX
+    columns: Sequence[ca.SX]
+    spread: ca.SX
+
+    def applied(self, z: Zonotope) -> Zonotope:
+        """Return the image of a zonotope."""
+        return moved(z, self.J, self.offset, self.columns, self.spread)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """``y = H z + offset + eta``, |eta| <= sigma; m rows."""
+
+    H: ca.SX
+    offset: ca.SX
+    sigma: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class Enclosures:
+    """Affine enclosures of the rows and outputs of a plant.
+
+    followed: places of the faults that are followed
+    """
+
+    sweeps: Sweeps
+    followed: IntArray
+
+    @property
+    def size(self) -> int:
+        """N, of z."""
+        return self.sweeps.n + len(self.followed)
+
+    @cached_property
+    def place(self) -> Mapping[int, int]:
+        """Which variable of the equations is which coordinate of z."""
+        n = self.sweeps.n
+        return {i: i for i in range(n)} | {n + int(j): n + k for k, j in enumerate(self.followed)}
+
+    @cached_property
+    def free(self) -> list[int]:
+        """Places of the faults that are not followed."""
+        return [j for j in range(self.sweeps.n_f) if j not in self.followed]
+
+    @cached_property
+    def alone(self) -> list[int]:
+        """Variables beside z with a generator of their own: free faults, then what enters more."""
+        n, entries = self.sweeps.n, self.sweeps.equations.entries
+        faults = [n + j for j in self.free]
+        rows = {j: sum(v == j for _, v in entries) for j in range(n, self.sweeps.equations.n_v)}
+        shared = [j for j, count in rows.items() if count > 1]
+        return faults + [j for j in shared if j not in self.place and j not in faults]
+
+    def rows(self, before: Before) -> Rows:
+        """Enclose the next z over the boxes of an instant."""
+        equations, n, N = self.sweeps.equations, self.sweeps.n, self.size
+        variables = equations.variables(before)
+        program = equations.program
+        found = relax(program, program.outputs[:n], variables, self.sweeps.rounding)
+        boxes = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
+        J, columns = ca.SX(N, N), {j: ca.SX(N, 1) for j in self.alone}
+        offset, spread = [], []
+        for i, form in enumerate(found):
+            for j, k in self.place.items():
+                if j in form.slopes:
+                    J[i, k] = form.slopes[j]
+            middle, reach, own = self._beside(form, boxes)
+            for j, value in own.items():
+                columns[j][i] = value
+            offset.append(middle)
+            spread.append(reach)
+        rates = self.sweeps.contractor.rates
+        for k, j in enumerate(self.followed.tolist()):
+            J[n + k, n + k] = 1.0
+            offset.append(ca.SX(0))
+            spread.append(ca.SX(float(rates[j])))
+        return Rows(J, ca.vertcat(*offset), [*columns.values()], ca.vertcat(*spread))
+
+    def outputs(self, now: Before) -> Shown:
+        """Enclose the outputs over the boxes of an instant."""
+        equations, N = self.sweeps.equations, self.size
+        variables = equations.variables(now)
+        program = equations.outputs
+        found = relax(program, program.outputs, variables, self.sweeps.rounding)
+        boxes = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
+        H = ca.SX(len(found), N)
+        offset, sigma = [], []
+        for q, form in enumerate(found):
+            for j, k in self.place.items():
+                if j in form.slopes:
+                    H[q, k] = form.slopes[j]
+            middle, reach, own = self._beside(form, boxes)
+            offset.append(middle)
+            sigma.append((reach + sum((ca.fabs(v) for v in own.values()), ca.SX(0))) * _UP)
+        return Shown(H, ca.vertcat(*offset), ca.vertcat(*sigma))
+
+    @cached_property
+    def beside(self) -> list[int]:
+        """Variables that z does not carry."""
+        return [j for j in range(self.sweeps.equations.n_v) if j not in self.place]
+
+    def _beside(
+        self, form: Affine, boxes: Mapping[int, tuple[ca.SX, ca.SX]]
+    ) -> tuple[ca.SX, ca.SX, dict[int, ca.SX]]:
+        """Return middle and reach of a form without z, and the generators that stand alone."""
+        middle, reach, size = form.centre, form.error, ca.fabs(form.centre)
+        own, terms = {}, 2
+        for j, (centre, radius) in boxes.items():
+            slope = form.slopes.get(j)
+            if slope is None:
+                continue
+            terms += 1
+            middle = middle + slope * centre
+            size = size + ca.fabs(slope * centre) + ca.fabs(slope * radius)
+            if j in self.alone:
+                own[j] = slope * radius
+            else:
+                reach = reach + ca.fabs(slope * radius)
+        return middle, reach * _UP + (terms + 2) * STEP * size + TINY, own
+
+
+def middle_of(lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return a middle and a radius that hold an interval."""
+    middle = 0.5 * lower + 0.5 * upper
+    return middle, ca.fmax(upper - middle, middle - lower) * _UP
+
+
+def told_by_rate(contractor: Contractor) -> IntArray:
+    """Return the places of faults with a rate that says more than their range."""
+    box = contractor.plant.box("f").reshape(-1, 2)
+    rates = contractor.rates
+    return np.flatnonzero((rates < box[:, 1] - box[:, 0]) & np.isfinite(rates))

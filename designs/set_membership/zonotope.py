@@ -1,0 +1,176 @@
+"""Zonotopes of code: ``c + G xi`` with |xi| <= 1, and what rounding adds, a box beside.
+
+Every operation returns numbers c, G and a slack s such that the set that real arithmetic gives lies
+in ``{c + G xi + eta, |eta| <= s}``. A sum of k products is off by at most ``k STEP`` times the sum
+of their absolute values, `STEP` two units of rounding, which covers the rounding of that bound as
+well; `TINY` is above what underflow takes of such a sum.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.boxes import Ends
+from obsynth.symbolic.arrays import FloatArray
+
+STEP = 2.0**-51
+TINY = 1e-290
+FEW = 12
+"""Generators that a coordinate shares with a strip, up to which every breakpoint is tried."""
+_UP = 1.0 + 2.0**-40
+"""Above the rounding of sums of up to a thousand terms."""
+
+
+@dataclass(frozen=True, eq=False)
+class Zonotope:
+    """``c + G xi + eta``, |xi| <= 1, |eta| <= slack: (N,), (N, M), (N,)."""
+
+    centre: ca.SX
+    generators: ca.SX
+    slack: ca.SX
+
+    @classmethod
+    def of(cls, box: Ends, columns: int) -> "Zonotope":
+        """Return a box with its generators first and zeros up to a number of columns."""
+        N = box.lower.numel()
+        centre = 0.5 * box.lower + 0.5 * box.upper
+        radius = ca.fmax(box.upper - centre, centre - box.lower) * _UP + TINY
+        filling = ca.SX(N, columns - N)
+        return cls(centre, ca.horzcat(ca.diag(radius), filling), ca.SX(N, 1))
+
+    @property
+    def radius(self) -> ca.SX:
+        """How far the set reaches from c, rounded up, (N,)."""
+        return row_sums(self.generators) * _UP + self.slack
+
+    @property
+    def hull(self) -> Ends:
+        """The box around the set."""
+        reach = self.radius * _UP + STEP * ca.fabs(self.centre) + TINY
+        return Ends(self.centre - reach, self.centre + reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Readings ``y = H x + o + eta`` with ``|eta| <= sigma``: (m, N), (m,), (m,)."""
+
+    H: ca.SX
+    innovation: ca.SX
+    seen: ca.SX
+    sigma: ca.SX
+
+    @classmethod
+    def read(cls, z: Zonotope, H: ca.SX, rest: ca.SX, sigma: ca.SX, used: ca.SX) -> "Strips":
+        """Return what readings say of a zonotope; nothing where they are not used.
+
+        rest: ``y - o``, (m,). Computed are ``b = rest - H c`` and ``a = H G``; sigma takes what
+        rounding adds to either.
+        """
+        N = H.shape[1]
+        size = ca.fabs(H) @ (ca.fabs(z.centre) + z.radius) + ca.fabs(rest)
+        wide = sigma * _UP + (N + 4) * STEP * size + ca.fabs(H) @ z.slack * _UP + TINY
+        return cls(H, used * (rest - H @ z.centre), H @ z.generators, wide)
+
+    @property
+    def against(self) -> ca.SX:
+        """1 where a strip and the zonotope have nothing in common."""
+        reach = (row_sums(self.seen) + self.sigma) * _UP
+        return ca.sum1(ca.fabs(self.innovation) > reach) > 0.5
+
+
+def moved(
+    z: Zonotope, J: ca.SX, offset: ca.SX, columns: Sequence[ca.SX], spread: ca.SX
+) -> Zonotope:
+    """Return ``J z + offset + columns xi + diag(spread) xi``, the slack within the spread."""
+    N = J.shape[0]
+    size = ca.fabs(J) @ (ca.fabs(z.centre) + z.radius) + ca.fabs(offset)
+    wide = spread * _UP + (N + 4) * STEP * size + ca.fabs(J) @ z.slack * _UP + TINY
+    generators = ca.horzcat(*columns, ca.diag(wide), J @ z.generators)
+    return Zonotope(J @ z.centre + offset, generators, ca.SX(N, 1))
+
+
+def corrected(z: Zonotope, L: ca.SX, strips: Strips, used: ca.SX) -> Zonotope:
+    """Return ``z + L (y - H z - o - eta)``, which holds the state whatever L is, (N, m)."""
+    m = L.shape[1]
+    gain = L @ ca.diag(used)
+    b, a, sigma = strips.innovation, strips.seen, strips.sigma
+    size = ca.fabs(gain) @ (ca.fabs(b) + row_sums(a) + sigma)
+    slack = (m + 4) * STEP * (ca.fabs(z.centre) + z.radius + size) + z.slack * _UP + TINY
+    generators = ca.horzcat(gain @ ca.diag(sigma), z.generators - gain @ a)
+    return Zonotope(z.centre + gain @ b, generators, slack)
+
+
+def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
+    """Bound coordinates by one strip at a time and the zonotope together, (N,).
+
+    For any number lam: ``x_i <= c_i + lam b + sum_j |g_ij - lam a_j| + |lam| sigma``, which is
+    least where some ``g_ij = lam a_j`` or lam is zero. All of these are tried where they are few,
+    ``lam = g_i a' / (a a' + sigma^2)`` in any case.
+    """
+    hull = z.hull
+    lower, upper = ca.SX(hull.lower), ca.SX(hull.upper)
+    sums = row_sums(z.generators)
+    for q in range(strips.H.shape[0]):
+        a, sigma, b = strips.seen[q, :], strips.sigma[q], strips.innovation[q]
+        size = ca.sum2(a * a) + sigma * sigma + TINY
+        whole = ca.sum2(ca.fabs(a)) + sigma + ca.fabs(b)
+        for i in range(z.centre.numel()):
+            g = z.generators[i, :]
+            common = [j for _, j in zip(*(g * a).sparsity().get_triplet(), strict=True)]
+            if not common:
+                continue
+            gains = [ca.sum2(g * a) / size]
+            if len(common) <= FEW:
+                gains += [ca.if_else(ca.fabs(a[j]) > TINY, g[j] / a[j], 0.0) for j in common]
+            for gain in gains:
+                lam = used[q] * gain
+                reach = ca.sum2(ca.fabs(g - lam * a)) + ca.fabs(lam) * sigma
+                room = sums[i] + ca.fabs(lam) * whole + ca.fabs(z.centre[i])
+                room = (g.nnz() + a.nnz() + 8) * STEP * room + z.slack[i] * _UP + TINY
+                reach, middle = reach * _UP + room, z.centre[i] + lam * b
+                lower[i] = ca.if_else(middle - reach > lower[i], middle - reach, lower[i])
+                upper[i] = ca.if_else(middle + reach < upper[i], middle + reach, upper[i])
+    return Ends(lower, upper)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Coordinates in which columns become a box, and what proves it; all (N, N).
+
+    V, W: the coordinates and nearly their inverse
+    size, leak: at least ``|W| (I - |I - V W|)^-1``, and that times ``|I - V W|``
+    """
+
+    V: FloatArray
+    W: FloatArray
+    size: FloatArray
+    leak: FloatArray
+
+
+def reduced(z: Zonotope, keep: int, frame: Frame) -> Zonotope:
+    """Replace all but the first columns, and the slack, by a box in the coordinates of a frame.
+
+    ``D xi = V (W D xi) + (I - V W) D xi``, and whatever vector r is left, ``|V^-1 r| <= size |r|``.
+    """
+    N = len(frame.V)
+    kept, dropped = z.generators[:, :keep], z.generators[:, keep:]
+    W, wide = _sparse(frame.W), row_sums(dropped) * _UP
+    rounding = (N + 4) * STEP * np.abs(frame.W)
+    reach = row_sums(W @ dropped) * _UP + _sparse(frame.leak + rounding) @ wide * _UP
+    reach = reach + _sparse(frame.size) @ z.slack * _UP + TINY
+    # what rounding V diag(reach) leaves
+    again = np.eye(N) + 2.0 * STEP * (frame.size @ np.abs(frame.V))
+    reach = _sparse(again) @ reach * _UP
+    box = _sparse(frame.V) @ ca.diag(reach)
+    return Zonotope(z.centre, ca.horzcat(box, kept), ca.SX(N, 1))
+
+
+def row_sums(matrix: ca.SX) -> ca.SX:
+    """Return the sums of absolute values along rows, as a dense column."""
+    return ca.densify(ca.sum2(ca.fabs(matrix)))
+
+
+def _sparse(matrix: FloatArray) -> ca.DM:
+    return ca.sparsify(ca.DM(matrix))
