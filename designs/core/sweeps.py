@@ -95,7 +95,9 @@ class Sweeps:
             back, against = self._moved(before, now)
             before = back.where(have, before)
             empty = ca.logic_or(empty, ca.logic_or(wrong, ca.logic_and(have, against)))
-            image = now.states.meet(self.contractor.image(before)).where(have, now.states)
+            image = now.states
+            if "image" in self.contractor.cuts:
+                image = image.meet(self.contractor.image(before)).where(have, image)
             faults = now.faults.meet(self.contractor.drift(before.faults)).where(have, now.faults)
             now = Before(image, faults, now.known, self._still(before, now, have))
         return Pair(before, now, empty)

@@ -18,6 +18,7 @@ from obsynth.designs import (
     IntervalObserver,
     QPVObserver,
     SetAdaptiveObserver,
+    SetMembershipObserver,
 )
 from obsynth.designs.core.method import Method
 from obsynth.designs.detection.detector import core_of
@@ -34,6 +35,7 @@ METHODS: tuple[Method, ...] = (
     SetAdaptiveObserver(coordinates="auto"),
     FilterBank(),
     QPVObserver(),
+    SetMembershipObserver(),
 )
 """What is tried by default; a further method is a further line."""
 LONGEST = 120
