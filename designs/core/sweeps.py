@@ -4,7 +4,7 @@ With v = (x, f, rest) of the instant before and v' of this one, where rest are u
 disturbances, parameters and scheduling that is not measured: v' is cut with y = h(v'), v with
 x' = F(v), each operation of the equations inverted in turn (`backward`), and what is found of one
 instant is handed to the other. Unknown inputs without a range get one where a row shows them. What
-enters both h and F is remembered from one call to the next, as are parameters, which stand still.
+enters both h and F is remembered from one call to the next, as are parameters that stand still.
 """
 
 from collections.abc import Sequence
@@ -55,10 +55,10 @@ class Sweeps:
 
     @cached_property
     def constant(self) -> list[int]:
-        """Places of the parameters in the rest."""
+        """Places of the parameters in the rest that do not change."""
         plant = self.contractor.plant
         start = len(plant.d) + len(plant.w)
-        return [*range(start, start + len(plant.p))]
+        return [start + k for k, s in enumerate(plant.p) if s.constant]
 
     @cached_property
     def carried(self) -> list[int]:

@@ -117,9 +117,9 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         "set holds every trajectory that the assumptions allow; no gain, linearisation or "
         "prediction enters this",
     ]
-    where = ", ".join(
-        f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in (*plant.w, *plant.d) if s.bounded
-    )
+    still = ", ".join(s.name for s in plant.p if s.constant)
+    moving = (*plant.w, *plant.d, *(s for s in plant.p if not s.constant))
+    where = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in moving if s.bounded)
     rates = [
         f"|{s.name}(k+1) - {s.name}(k)| <= {rate:g}"
         for s, rate in zip(plant.f, _rates(design), strict=True)
@@ -130,7 +130,7 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         "the first state and fault lie in the boxes given to memory0",
         *([f"{where} [monitored in part: status bit 8]"] if where else []),
         *([f"{', '.join(rates)} [monitored in part: status bit 8]"] if rates else []),
-        *([f"{', '.join(plant.names('p'))} constant in their intervals"] if plant.p else []),
+        *([f"{still} constant in their intervals"] if still else []),
         "widths are not guaranteed: at the point of operation, with readings in the middle of "
         f"their noise, they are predicted to be {', '.join(listed)}; plants that leave it, or "
         "whose inputs do not show what has to be seen, may do worse",
