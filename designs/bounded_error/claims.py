@@ -17,8 +17,7 @@ from obsynth.designs.bounded_error.lmis import (
     lift,
 )
 from obsynth.designs.bounded_error.model import Derived, Limits, noise_box
-from obsynth.designs.bounded_error.peak.design import prove_peak_claims
-from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
@@ -36,10 +35,7 @@ def claims(design: UioDesign) -> Iterator[Claim]:
     yield _prove_boxes(design)
     yield _prove_decoupling(design)
     yield prove_rounding(design)
-    if isinstance(design.bound, EllipsoidBound):
-        yield from prove_ellipsoid(design)
-    else:
-        yield from prove_peak_claims(design)
+    yield from prove_ellipsoid(design)
 
 
 def _prove_boxes(design: UioDesign) -> Claim:
@@ -102,7 +98,7 @@ def recursion_block(
 
 def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
     """Prove every matrix inequality behind an `EllipsoidBound`."""
-    bound = ellipsoid_of(design)
+    bound = design.bound
     claims = [_prove_weights(bound), _prove_lmi(design, bound), _prove_half_widths(bound)]
     if bound.error == "shifted":
         kept = kept_coordinates(design.T)
@@ -254,9 +250,8 @@ def guarantee(design: UioDesign) -> Guarantee:
         f"|{name}(k+1) - {name}(k)| <= {rate:g}"
         for name, rate in zip(design.plant.names("f"), design.rate, strict=True)
     )
-    kind = "ellipsoidal" if isinstance(design.bound, EllipsoidBound) else "peak"
     claims = [
-        f"{', '.join(names)} lie inside the returned ({kind}) intervals while this holds",
+        f"{', '.join(names)} lie inside the returned (ellipsoidal) intervals while this holds",
     ]
     if design.plant.d:
         claims.append(f"whatever {', '.join(design.plant.names('d'))} does")
@@ -304,18 +299,14 @@ def _gains(design: UioDesign) -> dict[str, FloatArray]:
 
 
 def _performance(design: UioDesign, widths: FloatArray) -> dict[str, float]:
-    values = {"sum_half_widths": float(widths.sum())}
     bound = design.bound
-    if isinstance(bound, EllipsoidBound):
-        eigenvalues = np.linalg.eigvalsh(bound.P[0])
-        values |= {
-            "gamma": float(bound.gamma.min()),
-            "decay": float(1.0 - bound.gamma.min()),
-            "trace_P_inv": float((1.0 / eigenvalues).sum()),
-            "log_det_P": float(np.log(eigenvalues).sum()),
-            "lambda_min_P": float(eigenvalues[0]),
-            "trace_P": float(eigenvalues.sum()),
-        }
-    else:
-        values["decay"] = bound.fading.decay
-    return values
+    eigenvalues = np.linalg.eigvalsh(bound.P[0])
+    return {
+        "sum_half_widths": float(widths.sum()),
+        "gamma": float(bound.gamma.min()),
+        "decay": float(1.0 - bound.gamma.min()),
+        "trace_P_inv": float((1.0 / eigenvalues).sum()),
+        "log_det_P": float(np.log(eigenvalues).sum()),
+        "lambda_min_P": float(eigenvalues[0]),
+        "trace_P": float(eigenvalues.sum()),
+    }

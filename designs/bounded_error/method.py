@@ -24,7 +24,6 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
 )
 from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read, read_again
-from obsynth.designs.bounded_error.peak.design import bound_peak, design_peak
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
 from obsynth.designs.bounded_error.step import build_core, first_memory, memory_sizes, settling
@@ -69,7 +68,8 @@ class BoundedErrorUIO(Method):
     Parameters
     ----------
     gamma : float, optional
-        Contraction per step of V = e'Pe, in (0, 1); searched where not given.
+        Contraction per step of V = e'Pe, in (0, 1); searched where not given. Peak bounds have
+        no use for it.
     multipliers : {"equal", "per_component"}
         Whether the boxes of w_k, eps_k, w_{k+1} share the noise ellipsoid in
         equal parts (eq. (19)) or with weights that the LMI chooses.
@@ -80,14 +80,14 @@ class BoundedErrorUIO(Method):
         gain found.
     bounds : {"ellipsoid", "peak"}
         Intervals from the ellipsoid (eqs. (33)-(36)), or peak (l1) bounds with
-        an elementwise small-gain argument, several times narrower.
+        an elementwise small-gain argument, several times narrower, which are those of the general
+        class whatever the form.
     objective : {"trace_inverse", "log_det", "lambda_min", "trace"}
         What is optimised: min trace(P^-1), max log det P, max lambda_min(P),
         max trace(P) (the paper's (49), which does not make the bounds small).
     weights : sequence of float, optional
-        Of the components (states, then faults), for ``trace_inverse`` and peak
-        bounds; by default 1, in the general class 1 / half range (there of half widths,
-        for ellipsoids of their squares).
+        Of the components (states, then faults), for ``trace_inverse``; by default 1, in the
+        general class 1 / half range (there of half widths, for ellipsoids of their squares).
     form : {"general", "corrected", "printed", "repaired"}, optional
         "general": plants ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, in current form
         (the paper's observer predicts first), with one multiplier for every column of every
@@ -159,12 +159,13 @@ class BoundedErrorUIO(Method):
 
     def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer."""
-        if self.form == "general":
-            return self._as_general().design(model if isinstance(model, Plant) else model.model)
+        if self.form == "general" or self.bounds == "peak":
+            plant = model if isinstance(model, Plant) else model.model
+            if self.form == "corrected":
+                self.CLASS.check(plant)
+            return self._as_general().design(plant)
         if self.form is not None or not isinstance(model, Plant):
             return super()._design(model, bounds)
-        if self.bounds == "peak" and self.gamma is None:
-            return self._as_general().design(model)
         found = self._of_the_paper(model, bounds)
         if found is not None and (self.gamma is not None or self._named):
             return super()._design(*found)
@@ -184,7 +185,16 @@ class BoundedErrorUIO(Method):
         """Return what given gains guarantee: ``K`` and ``F``, or ``L``; see `Method.analyse`."""
         if self.form == "general" or (self.form is None and "L" in gains):
             return self._as_general().analyse(model, gains)
+        if self.bounds == "peak":
+            return self._peak_of(self._checked(model, bounds).design, gains)
         return super().analyse(model, gains, bounds)
+
+    def _peak_of(self, design: UioDesign, gains: Mapping[str, ArrayLike]) -> Observer:
+        """Bound the peaks of the paper's observer: -E reads first, and K, F what Pi leaves."""
+        given = read_gains(gains, {"K": design.K.shape, "F": design.F.shape})
+        L = np.vstack([-design.E, np.zeros_like(design.F)])
+        found = {"L": L, **{name: gain @ design.Pi for name, gain in given.items()}}
+        return self._as_general().analyse(design.plant, found)
 
     @property
     def _named(self) -> list[str]:
@@ -220,11 +230,9 @@ class BoundedErrorUIO(Method):
 
     def _as_general(self) -> GeneralUIO:
         refuse_idle(self, "the observer of the general class", *IDLE)
-        if self.bounds == "peak":
-            refuse_idle(self, "peak bounds", "gamma")
         return GeneralUIO(
             bounds=self.bounds,
-            gamma=self.gamma,
+            gamma=None if self.bounds == "peak" else self.gamma,
             weights=self.weights,
             horizon=self.horizon,
             recovery=self.recovery,
@@ -253,8 +261,6 @@ class BoundedErrorUIO(Method):
 
     def solve(self, model: UioModel) -> UioDesign:
         """Find gains and their bounds."""
-        if self.bounds == "peak":
-            return bound_peak(_settled(design_peak(model, self), model))
         return _settled(self._design_ellipsoid(model), model)
 
     def fix(self, model: UioModel, gains: Mapping[str, ArrayLike]) -> UioDesign:
@@ -263,8 +269,6 @@ class BoundedErrorUIO(Method):
         found = read_gains(gains, {"K": blank.K.shape, "F": blank.F.shape})
         given = replace(blank, K=found["K"], F=found["F"], options=self.options())
         given = _settled(given, model)
-        if self.bounds == "peak":
-            return bound_peak(given)
         system, noise, weights = self._setting(model)
         gain = np.vstack([given.K[self._kept(given)], given.F])
         if self.gamma is None:

@@ -9,11 +9,10 @@ from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
-from obsynth.designs.bounded_error.record import PeakData, UioDesign
+from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
-from obsynth.designs.general.record import Fading
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -152,7 +151,7 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
         bounds = jacobian_bounds(parts)
     detectability(parts, bounds)
     n, n_f, m = len(model.x), len(model.f), len(parts.C)
-    nothing = np.zeros((n + n_f, n + n_f))
+    p, nothing = n + n_f, np.zeros(0)
     if decoupling.residual > 0 and not np.isfinite(model.box("d")).all():
         names = ", ".join(model.names("d"))
         raise StructureError(
@@ -183,7 +182,7 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
         F=np.zeros((n_f, m)),
         # for the search; that of the gains replaces it
         rounding=rounding_allowance(model, decoupling.residual),
-        bound=PeakData(np.zeros(n + n_f), Fading(nothing, nothing, nothing, 0.0, None)),
+        bound=EllipsoidBound("plain", np.zeros((1, p, p)), np.zeros(1), nothing, nothing),
         options={},
     )
     return UioModel(parts, bounds, design)

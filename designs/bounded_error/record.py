@@ -13,7 +13,6 @@ from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
-from obsynth.designs.general.record import Fading
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -48,21 +47,6 @@ class EllipsoidBound(Record):
     def shape_of(self, component: int) -> int:
         """Return the number of the ellipsoid that bounds a component of xi."""
         return 0 if len(self.P) == 1 else component
-
-
-@dataclass(frozen=True, eq=False)
-class PeakData(Record):
-    """Guaranteed peak bounds as stored.
-
-    b: bounds of the errors (n + n_f of them), then of the combinations of errors that the
-        Jacobian sees, see `PeakSystem.outputs`
-    fading: what the first error adds to them
-    """
-
-    KIND = "peak"
-
-    b: Annotated[FloatArray, "n_o"]
-    fading: Fading
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +85,7 @@ class UioDesign(Record):
     K: Annotated[FloatArray, "n m"]
     F: Annotated[FloatArray, "n_f m"]
     rounding: Annotated[FloatArray, "n+n_f"]
-    bound: EllipsoidBound | PeakData
+    bound: EllipsoidBound
     options: Mapping[str, Any]
 
     @cached_property
@@ -143,10 +127,3 @@ def _enclosed_vertices(family: AffineFamily) -> Enclosure:
         rad = np.stack([step.rad for step in steps], axis=1).reshape(-1, *direction.shape)
         total = Enclosure(mid, rad)
     return total
-
-
-def ellipsoid_of(design: UioDesign) -> EllipsoidBound:
-    """Return the bound of a design by ellipsoids."""
-    if not isinstance(design.bound, EllipsoidBound):
-        raise TypeError("the design has no ellipsoidal bound")
-    return design.bound

@@ -6,13 +6,12 @@ from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.lmis import kept_coordinates
 from obsynth.designs.bounded_error.model import Limits
-from obsynth.designs.bounded_error.peak.design import peak_data
-from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign, ellipsoid_of
+from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.running import ROUND_UP, SETTLED, UP, Running, settle
+from obsynth.designs.core.running import SETTLED, UP, Running, settle
 from obsynth.designs.core.stepping import clip, inside, select
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -24,35 +23,35 @@ def noise_offset(design: UioDesign) -> FloatArray:
     return bound
 
 
-def _component_map(design: UioDesign, bound: EllipsoidBound) -> list[int | None]:
+def _component_map(design: UioDesign) -> list[int | None]:
     """For each of the n + n_f errors the component of xi that bounds it, or None."""
     n, n_f = design.A.shape[0], design.rate.size
-    if bound.error == "plain":
+    if design.bound.error == "plain":
         return list(range(n + n_f))
     kept = kept_coordinates(design.T)
     states: list[int | None] = [kept.index(i) if i in kept else None for i in range(n)]
     return states + [len(kept) + j for j in range(n_f)]
 
 
-def ellipsoid_runtime(design: UioDesign) -> Running:
+def running_bound(design: UioDesign) -> Running:
     """Return the recursion of eq. (36) for every component, rounding errors of the step included.
 
     An error of at most `UioDesign.rounding` per step is at most rho in the norm
     of P, so ``V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho + rho^2``.
     """
-    bound = ellipsoid_of(design)
+    bound, components = design.bound, _component_map(design)
     n, n_f = design.A.shape[0], design.rate.size
     size = n + n_f
     decay, offset, scale = np.zeros(size), np.zeros(size), np.zeros(size)
     add = design.rounding * UP
     if bound.error == "shifted":
         add[:n] += noise_offset(design)
-    for i, component in enumerate(_component_map(design, bound)):
+    for i, component in enumerate(components):
         if component is None:
             continue
         shape = bound.shape_of(component)
         gamma, P = float(bound.gamma[shape]), bound.P[shape]
-        kept = [j for j, c in enumerate(_component_map(design, bound)) if c is not None]
+        kept = [j for j, c in enumerate(components) if c is not None]
         tau = design.rounding[kept]
         rho = float(np.sqrt(tau @ np.abs(P) @ tau)) * UP
         decay[i] = (1.0 - gamma) * (1.0 + rho) * UP
@@ -61,36 +60,14 @@ def ellipsoid_runtime(design: UioDesign) -> Running:
     return Running(np.diag(decay), offset, np.diag(scale), add, True)
 
 
-def check_range_of_T(design: UioDesign, bound: EllipsoidBound, z: FloatArray) -> None:
+def check_range_of_T(design: UioDesign, z: FloatArray) -> None:
     """Refuse a first z that a recursion in the range of T would not keep."""
-    if bound.error == "shifted" and np.any(design.T @ z != z):
+    if design.bound.error == "shifted" and np.any(design.T @ z != z):
         raise ObsynthError(
             "z0 has to lie in the range of T (zero in the coordinates that the unknown input "
             'takes away) for error="shifted"; give the guess alone',
             z0=z,
         )
-
-
-def peak_runtime(design: UioDesign) -> Running:
-    """Return the recursion of what the first error adds to the peak bounds.
-
-    Underflow of its products is far below the rounding that `add` counts a second time.
-    """
-    bound = peak_data(design)
-    fading = bound.fading
-    return Running(
-        decay=fading.G * UP,
-        offset=np.zeros(len(fading.G)),
-        reach=fading.reach * UP,
-        add=(bound.b[: len(fading.reach)] + design.rounding) * ROUND_UP,
-        root=False,
-    )
-
-
-def running_bound(design: UioDesign) -> Running:
-    """Return how the half widths of a design evolve."""
-    ellipsoid = isinstance(design.bound, EllipsoidBound)
-    return ellipsoid_runtime(design) if ellipsoid else peak_runtime(design)
 
 
 def settling(
@@ -164,9 +141,7 @@ def memory_sizes(design: UioDesign) -> dict[str, int]:
     which stands for a reading that is missing).
     """
     n, n_f = len(design.A), len(design.rate)
-    ellipsoid = isinstance(design.bound, EllipsoidBound)
-    bound = n + n_f if ellipsoid else len(peak_data(design).fading.G)
-    return {"z": n, "fhat": n_f, "bound": bound, "prediction": n}
+    return {"z": n, "fhat": n_f, "bound": n + n_f, "prediction": n}
 
 
 def first_memory(
@@ -176,8 +151,7 @@ def first_memory(
     z = design.T @ start.guess
     if z0 is not None:
         z = read_vector(z0, "z0", design.plant.names("x"))
-        if isinstance(design.bound, EllipsoidBound):
-            check_range_of_T(design, design.bound, z)
+        check_range_of_T(design, z)
     return {"z": z, "fhat": start.f.mean(axis=1), "prediction": start.guess}
 
 
@@ -192,22 +166,19 @@ def shift(design: UioDesign, x: Ends) -> tuple[ca.SX, ca.SX]:
 def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
     """Return an s that holds for a state and a fault in boxes, around given z and fhat.
 
-    Peak bounds: one product, see `Fading`. Ellipsoids: the delta of (48), of which
-    ``reach' |P| reach`` is an upper bound.
+    It is the delta of (48), of which ``reach' |P| reach`` is an upper bound.
     """
     middle, radius = shift(design, x)
     z, fhat = kept["z"], kept["fhat"]
     zeta = ca.fabs(middle - z) * UP + radius + 2.0**-44 * ca.fabs(z)
     e_f = ca.fmax(f.upper - fhat, fhat - f.lower) * UP
-    if not isinstance(design.bound, EllipsoidBound):
-        return ca.DM(peak_data(design).fading.start * UP) @ ca.vertcat(zeta, e_f)
     bound = design.bound
     if bound.error == "plain":
         reach = ca.vertcat((zeta + ca.DM(noise_offset(design))) * UP, e_f)
     else:
         reach = ca.vertcat(*(zeta[i] for i in kept_coordinates(design.T)), e_f)
     levels = [ca.dot(reach, ca.DM(np.abs(P)) @ reach) * UP for P in bound.P]
-    components = _component_map(design, bound)
+    components = _component_map(design)
     return ca.vertcat(*(0.0 if c is None else levels[bound.shape_of(c)] for c in components))
 
 
@@ -261,7 +232,7 @@ def build_core(design: UioDesign) -> Core:
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         middle, radius = shift(design, x)
         z = Ends(middle - radius, middle + radius).nearest(kept["z"])
-        if isinstance(design.bound, EllipsoidBound) and design.bound.error == "shifted":
+        if design.bound.error == "shifted":
             # a part of the box need not lie in the range of T, its middle and what was kept do
             moved = ca.sum1(ca.fabs(z - kept["z"])) > 0.0
             z = select(moved, middle, kept["z"])

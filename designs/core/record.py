@@ -83,6 +83,11 @@ class Record:
         Raises CertificateError, which says what cannot be read.
         """
         with reading():
+            if cls.KIND is not None and stored["kind"] != cls.KIND:
+                raise CertificateError(
+                    f"the stored design has a part of kind {shown(repr(stored['kind']))} where "
+                    f"{cls.KIND!r} is due"
+                )
             found: Self = read_fields(cls, stored, Context() if context is None else context)
             found.check()
         return found

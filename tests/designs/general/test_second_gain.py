@@ -99,15 +99,6 @@ def skewed():
     return plant
 
 
-def analysed(plant, gains, **options):
-    """What the general class makes of -E, K Pi and F Pi."""
-    parts = ob.split(plant)
-    E = -parts.D @ np.linalg.pinv(parts.C @ parts.D)
-    found = {name: gain @ (np.eye(len(E)) + parts.C @ E) for name, gain in gains.items()}
-    L = np.vstack([-E, np.zeros_like(gains["F"])])
-    return ob.BoundedErrorUIO(bounds="peak", **options).analyse(plant, {"L": L, **found})
-
-
 SKEWED = {"K": 0.2 * np.eye(3), "F": np.array([[0.02, -0.01, 0.3]])}
 
 
@@ -120,7 +111,7 @@ def test_the_step_is_the_observer_of_the_paper():
     """
     plant = skewed()
     parts = ob.split(plant)
-    observer = analysed(plant, SKEWED)
+    observer = ob.BoundedErrorUIO(bounds="peak").analyse(parts, SKEWED)
     design = observer.certificate.design
     assert np.any(design.Z) and np.any(design.K)
     first, second, third = stages(design)
@@ -144,7 +135,7 @@ def test_the_step_is_the_observer_of_the_paper():
 
 def test_without_a_slope_that_varies_the_bounds_are_attained():
     """Mutant: what two outputs show of the unknown input's noise counted in full."""
-    design = analysed(skewed(), SKEWED).certificate.design
+    design = ob.BoundedErrorUIO(bounds="peak").analyse(skewed(), SKEWED).certificate.design
     ends = design.family.ranges.mean(axis=1)[:, None] * np.ones((1, 2))
     alone = bound_peak(design.changed(family=replace(design.family, ranges=ends)))
     assert alone.bound.b[4:] == pytest.approx(reached(design, ends[:, 0], SKEWED, 400), rel=1e-9)
@@ -152,7 +143,7 @@ def test_without_a_slope_that_varies_the_bounds_are_attained():
 
 def test_sets_hold_what_moves_under_the_gains_of_the_paper():
     """Bang-bang noise, faults at their rate, an unknown input of any size."""
-    observer = analysed(skewed(), SKEWED, cuts=())
+    observer = ob.BoundedErrorUIO(bounds="peak", cuts=()).analyse(skewed(), SKEWED)
     plant, rng = observer.model, np.random.default_rng(1)
     x, f, sign = np.zeros(3), np.zeros(1), 1.0
     memory = observer.memory0(x + 0.1, x_range=np.column_stack([x - 0.2, x + 0.2]))
