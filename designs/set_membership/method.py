@@ -13,6 +13,7 @@ from obsynth.designs.core.contractor import EVERY_CUT
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains
 from obsynth.designs.core.method import Contract, Method
+from obsynth.designs.core.step import Step
 from obsynth.designs.general import step as general
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.record import GeneralDesign
@@ -47,6 +48,7 @@ _SETTLE = 20
 COLUMNS = Number(at_least=1, at_most=MOST_COLUMNS, because=f"it has to be 1 to {MOST_COLUMNS}")
 COUNT = Number(at_least=0, at_most=10, because="it has to be a number from 0 to 10")
 ROUND = Number(at_least=1, at_most=MOST_RESTART, because="it has to be a number of calls")
+OPERATIONS = Number(at_least=1, because="it has to be a number of operations")
 SHARE = Number(above=0.0, because="it is a share of the noise: positive and finite")
 WEIGHTS = Number(at_least=0.0, because="they have to be finite and not negative, not all zero")
 
@@ -78,6 +80,8 @@ class SetMembershipObserver(Method):
         In which generators that are dropped become a box; by default what predicts the narrowest.
     weights : tuple of float, optional
         Of states and faults in what is compared, in units of half their ranges; by default 1.
+    operations : int, optional
+        The most operations of a step, for small targets: the narrowest bank that keeps to it.
 
     Raises
     ------
@@ -126,6 +130,7 @@ class SetMembershipObserver(Method):
     gain: Annotated[float | None, SHARE] = None
     coordinates: Literal["modal", "covariance", "states"] | None = None
     weights: Annotated[tuple[float, ...] | None, WEIGHTS] = None
+    operations: Annotated[int | None, OPERATIONS] = None
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""
@@ -191,13 +196,26 @@ class SetMembershipObserver(Method):
         size = len(model.plant.x) + len(model.plant.f)
         held = np.full(size, np.inf) if peak is None else general.steady(peak)
         wishes = Wishes(self.columns, self.zonotopes, self.restart, self._weights(model), held)
-        gain, bank, found = choose(model, gains, wishes)
-        if refuse:
-            refuse_wide(model, found)
-        options = dict(self.options())
-        if self.horizon is None and peak is None:
-            options["horizon"] = max(found.calls, _SETTLE) + bank.restart
-        return complete(model, gain, bank, found, peak, options)
+        counts = []
+        for chosen in choose(model, gains, wishes):
+            if refuse:
+                refuse_wide(model, chosen.found)
+            options = dict(self.options())
+            if self.horizon is None and peak is None:
+                options["horizon"] = max(chosen.found.calls, _SETTLE) + chosen.bank.restart
+            design = complete(model, chosen, peak, options)
+            if self.operations is None:
+                return design
+            step = Step(self.CONTRACT.guard(design), build_core(design)).build()
+            if step.n_instructions() <= self.operations:
+                return design
+            counts.append(step.n_instructions())
+        raise InfeasibleDesign(
+            f"a step of at most {self.operations} operations is asked for; the smallest of the "
+            f"banks that were tried takes {min(counts)}",
+            ["what helps: columns= of one call, zonotopes=0, or another method, see ob.choose"],
+            operations=min(counts),
+        )
 
     def _weights(self, model: SetMembershipModel) -> FloatArray:
         plant = model.plant

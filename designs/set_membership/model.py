@@ -112,6 +112,16 @@ class SetMembershipModel:
             half[j] = _PUSH / push if push > 0.0 else 0.0
         return half
 
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """What a unit of every variable beside z moves z in a call, about, (N, n_v)."""
+        found = np.zeros((len(self.half), len(self.beside)))
+        for j in self.enclosures.beside:
+            if self.beside[j] > 0.0:
+                unit = np.where(np.arange(len(self.beside)) == j, self.beside, 0.0)
+                found[:, j] = self.effects(unit) / self.beside[j]
+        return found
+
     def effects(self, radius: FloatArray) -> FloatArray:
         """Return what variables of half widths beside z add to z in a call, (N,)."""
         found, none = (self.around(np.zeros(len(self.half)), r) for r in (radius, 0.0 * radius))
@@ -125,12 +135,24 @@ class SetMembershipModel:
         for j, k in self.enclosures.place.items():
             radius[j] = max(z[k], _NEAR * self.half[k])
         lower, upper = (np.clip(v + side * radius, *self.box.T) for side in (-1.0, 1.0))
-        J, columns, spread, H, sigma = map(np.array, self._around(lower, upper, known))
-        return Around(J, columns, spread[:, 0], H, sigma[:, 0])
+        N, m = len(self.half), len(self.plant.output_names)
+        found = self._around(lower, upper, known).full()[:, 0]
+        sizes = (N * N, N * len(self.enclosures.alone), N, m * N, m)
+        J, columns, spread, H, sigma = np.split(found, np.cumsum(sizes)[:-1])
+        return Around(
+            J.reshape(N, N, order="F"),
+            columns.reshape(N, -1, order="F"),
+            spread,
+            H.reshape(m, N, order="F"),
+            sigma,
+        )
 
     @cached_property
     def _around(self) -> ca.Function:
-        """(lower, upper) of all variables and known signals -> J, columns, spread, H, sigma."""
+        """(lower, upper) of all variables and known signals -> J, columns, spread, H, sigma.
+
+        One behind the other, each by columns.
+        """
         sweeps = self.enclosures.sweeps
         n, n_f, n_v = sweeps.n, sweeps.n_f, sweeps.equations.n_v
         lower, upper = ca.SX.sym("lower", n_v), ca.SX.sym("upper", n_v)
@@ -141,7 +163,8 @@ class SetMembershipModel:
         rows, shown = self.enclosures.rows(here), self.enclosures.outputs(here)
         columns = ca.horzcat(*rows.columns) if rows.columns else ca.SX(self.enclosures.size, 0)
         outputs = [rows.J, columns, rows.spread, shown.H, shown.sigma]
-        return ca.Function("around", [lower, upper, known], [ca.densify(part) for part in outputs])
+        together = ca.vertcat(*(ca.vec(ca.densify(part)) for part in outputs))
+        return ca.Function("around", [lower, upper, known], [together])
 
 
 def read(plant: Plant) -> SetMembershipModel:

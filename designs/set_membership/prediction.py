@@ -12,8 +12,10 @@ import numpy as np
 from obsynth.designs.set_membership.model import Around, SetMembershipModel
 from obsynth.symbolic.arrays import FloatArray
 
-LONGEST = 400
+LONGEST = 300
 _STEADY = 1e-3
+_MOVED = 0.02
+"""Share of a box by which it changes before the equations are enclosed anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,11 @@ def predict(
     guessed = _guessed(model)
     history: list[FloatArray] = []
     period = max(bank.restart, 20) if bank.zonotopes else 20
+    seen = np.zeros(len(z) + len(beside))
     for call in range(calls):
-        around = model.around(z, beside)
+        boxes = np.append(z, beside)
+        if np.any(np.abs(boxes - seen) > _MOVED * seen):
+            around, seen = model.around(z, beside), boxes
         before, z = z, limit
         moved = [_moved(around, G) for G in found]
         for G in (*moved[1:], _moved(around, np.diag(before))):
@@ -101,12 +106,7 @@ def _inverted(
     z: FloatArray,
 ) -> float:
     """Return what the states say of a variable beside them, one call late."""
-    if j not in model.enclosures.alone:
-        unit = np.zeros_like(beside)
-        unit[j] = max(beside[j], 1e-300)
-        own = model.effects(unit)
-    else:
-        own = np.abs(around.columns[:, model.enclosures.alone.index(j)])
+    own = model.slopes[:, j] * beside[j]
     total = np.abs(around.columns).sum(axis=1) + around.spread - own
     rest = z + np.abs(around.J) @ before + np.maximum(total, 0.0)
     seen = own > 1e-12 * model.half

@@ -25,7 +25,7 @@ from obsynth.symbolic.errors import ObsynthError
 Coordinates = Literal["modal", "covariance", "states"]
 SHARES = (0.1, 0.3, 1.0, 3.0)
 """Of the readings' noise, for the filter's gain."""
-KEPT = (2, 3, 5, 8, 12)
+KEPT = (1, 2, 3, 5, 8, 12)
 """Calls for which generators are kept, as tried."""
 COMPARED = 8
 """Of these, with which gains are compared."""
@@ -217,29 +217,42 @@ class Wishes:
         return most // group
 
 
-def choose(
-    model: SetMembershipModel, gains: list[Gain], wishes: Wishes
-) -> tuple[Gain, Bank, Predicted]:
-    """Return the gain of the least predicted mean, and the smallest bank of nearly that mean."""
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A gain with a bank, what it predicts, and the weighted mean of that.
+
+    size: of the step, relative to others of the same plant
+    """
+
+    gain: Gain
+    bank: Bank
+    found: Predicted
+    mean: float
+    size: float
+
+
+def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list[Tried]:
+    """Return banks around the gain of the least predicted mean, the one to be preferred first.
+
+    These are the smallest of those that predict nearly the least mean; the others follow by it.
+    """
     most = wishes.kept(model)
 
-    def tried(gain: Gain, kept: int, zonotopes: int) -> tuple[float, float, Gain, Bank, Predicted]:
+    def tried(gain: Gain, kept: int, zonotopes: int) -> Tried:
         restart = max(kept, SHORTEST, zonotopes) if wishes.restart is None else wishes.restart
         W, columns = inverse(gain.V), kept * model.group
         bank = Bank(gain.L, gain.V, W, columns, zonotopes, restart)
         found = predict(model, bank, wishes.held)
-        return wishes.mean(model, found), kept * (1.0 + CUT * zonotopes), gain, bank, found
+        size = kept * (1.0 + CUT * zonotopes)
+        return Tried(gain, bank, found, wishes.mean(model, found), size)
 
     counts = (0, 1) if wishes.zonotopes is None else (wishes.zonotopes,)
-    gain = min(
-        (tried(g, min(COMPARED, most), counts[-1]) for g in gains), key=lambda found: found[0]
-    )[2]
-    lengths = [k for k in KEPT if k <= most] or [most]
-    if wishes.columns is not None:
-        lengths = [most]
+    compared = [tried(gain, min(COMPARED, most), counts[-1]) for gain in gains]
+    gain = min(compared, key=lambda one: one.mean).gain
+    lengths = [most] if wishes.columns is not None else [kept for kept in KEPT if kept <= most]
     banks = [tried(gain, kept, count) for kept in lengths for count in counts]
-    least = min(found[0] for found in banks)
-    return min((b for b in banks if b[0] <= WORTH * least), key=lambda found: found[1])[2:]
+    enough = WORTH * min(one.mean for one in banks)
+    return sorted(banks, key=lambda one: (max(one.mean, enough), one.size))
 
 
 def inverse(V: FloatArray) -> FloatArray:
@@ -286,14 +299,13 @@ def radius_bound(matrix: FloatArray) -> float:
 
 def complete(
     model: SetMembershipModel,
-    gain: Gain,
-    bank: Bank,
-    found: Predicted,
+    chosen: Tried,
     peak: GeneralDesign | None,
     options: Mapping[str, Any],
 ) -> SetMembershipDesign:
     """Return the design of a choice."""
-    names, held = model.plant.names("f"), frame(gain.V)
+    gain, bank, names = chosen.gain, chosen.bank, model.plant.names("f")
+    held = frame(gain.V)
     design = SetMembershipDesign(
         plant=model.plant,
         followed=tuple(names[j] for j in model.followed),
@@ -309,7 +321,7 @@ def complete(
         zonotopes=bank.zonotopes,
         restart=bank.restart,
         contraction=0.0,
-        predicted=found.widths,
+        predicted=chosen.found.widths,
         peak=peak,
         options=options,
     )
