@@ -131,9 +131,6 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         *([f"{where} [monitored in part: status bit 8]"] if where else []),
         *([f"{', '.join(rates)} [monitored in part: status bit 8]"] if rates else []),
         *([f"{still} constant in their intervals"] if still else []),
-        "widths are not guaranteed: at the point of operation, with readings in the middle of "
-        f"their noise, they are predicted to be {', '.join(listed)}; plants that leave it, or "
-        "whose inputs do not show what has to be seen, may do worse",
     ]
     return Guarantee(tuple(claims), tuple(assumptions))
 

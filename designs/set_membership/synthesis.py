@@ -333,16 +333,14 @@ def refuse_wide(model: SetMembershipModel, found: Predicted) -> None:
     """Refuse a plant of which nothing more is told than its declared ranges."""
     plant = model.plant
     box = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
-    half = 0.5 * np.diff(box, axis=1)[:, 0]
-    names = (*plant.names("x"), *plant.names("f"))
-    n = len(plant.x)
-    vain = [names[i] for i in range(n) if not found.widths[i] < half[i]]
-    if vain:
-        raise InfeasibleDesign(
-            f"the sets of {', '.join(vain)} are predicted to be as wide as the declared ranges",
-            [
-                "what helps: measure them or what they move, or declare smaller bounds of the "
-                "disturbances",
-            ],
-            states=tuple(vain),
-        )
+    if np.any(found.widths < 0.5 * np.diff(box, axis=1)[:, 0]):
+        return
+    names = ", ".join((*plant.names("x"), *plant.names("f")))
+    raise InfeasibleDesign(
+        f"the sets of {names} are all predicted to be as wide as the declared ranges",
+        [
+            f"the outputs {', '.join(plant.output_names)} say too little of them for the declared "
+            "disturbances: measure more, declare smaller bounds, or narrow the ranges",
+        ],
+        states=plant.names("x"),
+    )
