@@ -13,7 +13,7 @@ from obsynth.designs.general import claims as general
 from obsynth.designs.general.model import read_again as general_again
 from obsynth.designs.set_membership.model import SetMembershipModel, read
 from obsynth.designs.set_membership.record import SetMembershipDesign
-from obsynth.designs.set_membership.step import fault_delay, peak_widths
+from obsynth.designs.set_membership.step import fault_delay, peak_widths, rates_of
 from obsynth.designs.set_membership.synthesis import closed_loop, off_identity, radius_bound
 
 _RTOL = 1e-6
@@ -111,18 +111,22 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         f"{name} +-{width:.3g}" + (" (no more than is declared)" if width >= limit else "")
         for (name, width), limit in zip(pairs, half.tolist(), strict=True)
     ]
+    beyond = "beyond the half widths of the peak bounds, " if design.peak is not None else ""
     claims = [
         f"{names} lie inside the returned intervals{late}: the step evaluates the equations over "
         "the sets of the call before, every operation rounded outwards, so that by induction each "
         "set holds every trajectory that the assumptions allow; no gain, linearisation or "
         "prediction enters this",
+        f"predicted, {beyond}not promised: half widths of {', '.join(listed)} at the point of "
+        "operation, with readings in the middle of their noise; where the plant leaves it, or "
+        "inputs do not show what has to be seen, they may be wider",
     ]
     still = ", ".join(s.name for s in plant.p if s.constant)
     moving = (*plant.w, *plant.d, *(s for s in plant.p if not s.constant))
     where = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in moving if s.bounded)
     rates = [
         f"|{s.name}(k+1) - {s.name}(k)| <= {rate:g}"
-        for s, rate in zip(plant.f, _rates(design), strict=True)
+        for s, rate in zip(plant.f, rates_of(design).tolist(), strict=True)
         if np.isfinite(rate)
     ]
     assumptions = [
@@ -133,10 +137,3 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         *([f"{still} constant in their intervals"] if still else []),
     ]
     return Guarantee(tuple(claims), tuple(assumptions))
-
-
-def _rates(design: SetMembershipDesign) -> list[float]:
-    from obsynth.designs.set_membership.step import Bank
-
-    rates: list[float] = Bank(design).enclosures.sweeps.contractor.rates.tolist()
-    return rates

@@ -83,12 +83,17 @@ def peak_widths(design: SetMembershipDesign, peak: GeneralDesign) -> FloatArray:
     return late(design, general.steady(peak))
 
 
+def rates_of(design: SetMembershipDesign) -> FloatArray:
+    """Return what every fault moves at most in a call, (n_f,)."""
+    return Bank(design).enclosures.sweeps.contractor.rates
+
+
 def late(design: SetMembershipDesign, widths: FloatArray) -> FloatArray:
     """Add the rates of faults to half widths where they are told one call late."""
     found = widths.copy()
     n = len(design.plant.x)
     if fault_delay(design):
-        found[n:] += Bank(design).enclosures.sweeps.contractor.rates
+        found[n:] += rates_of(design)
     return found
 
 
