@@ -66,10 +66,10 @@ def first_memory(design: SetMembershipDesign, start: Start) -> dict[str, ArrayLi
 def settling(
     design: SetMembershipDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray] | None:
-    """Return how many calls the peak bounds take to settle, and what they are; None without any."""
+    """Return how many calls the sets take to settle, and the peak bounds then; None without any."""
     if design.peak is None:
         return None if np.isfinite(box).all() else (0, np.full(box.shape, np.inf))
-    own = max(LEAST_CALLS, design.restart) if calls is None else calls
+    own = max(LEAST_CALLS, design.restart + design.settles) if calls is None else calls
     found = general.settling(design.peak, box, calls)
     assert found is not None
     if calls is None and found[0] < own and np.isfinite(found[1]).any():

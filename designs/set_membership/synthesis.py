@@ -322,6 +322,7 @@ def complete(
         restart=bank.restart,
         contraction=0.0,
         predicted=chosen.found.widths,
+        settles=chosen.found.calls,
         peak=peak,
         options=options,
     )

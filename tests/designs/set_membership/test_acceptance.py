@@ -5,6 +5,7 @@ import pytest
 import sympy as sp
 
 import obsynth as ob
+from obsynth.designs.set_membership.step import settling
 
 # fmt: off
 Y = [
@@ -46,6 +47,10 @@ def test_the_exact_feasible_set_is_held_and_nearly_met():
     assert (low <= HULL[:, 0]).all() and (high >= HULL[:, 1]).all()
     # 1.132 and 1.193 for the prototype, 1.25 and 1.45 asked
     assert ((high - low) / np.diff(HULL)[:, 0] <= [1.11, 1.13]).all()
+    # mutant: sets are kept as long as peak bounds take to settle
+    design = observer.certificate.design
+    found = settling(design, np.array([3.0, 3.0]))
+    assert found is not None and found[0] >= design.settles + design.restart
 
 
 def wide_fault_example() -> ob.Plant:
