@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
-import numpy as np
 
 from obsynth.designs.core.backward import contract
 from obsynth.designs.core.boxes import Ends
@@ -142,8 +141,3 @@ class Sweeps:
         n, n_f, n_v = self.n, self.n_f, self.equations.n_v
         parts = [Ends(lower[a:b], upper[a:b]) for a, b in ((0, n), (n, n + n_f), (n + n_f, n_v))]
         return Before(parts[0], parts[1], given.known, parts[2])
-
-    def widest(self) -> FloatArray:
-        """Return half the ranges of the rest, infinite where there is none, (n_rest,)."""
-        half = 0.5 * np.diff(self.declared, axis=1)[:, 0]
-        return np.where(half < 0.5 * FAR, half, np.inf)
