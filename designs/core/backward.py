@@ -13,6 +13,7 @@ a choice it may be the branch that is not taken. Ends of `FAR` say nothing of an
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -25,7 +26,6 @@ from obsynth.derive.rigour.interval import UNIT
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding, combine, is_point, lift, needed
 
 _HALF, _PI = 0.5 * np.pi, np.pi  # below what they stand for
-_SMALL = 2.0**-1000
 _LOGARITHM = 745.0  # of any double, in size
 _OPEN = {"select": (1, 2), "if_else_zero": (1,), "meet": (0, 1)}
 
@@ -58,14 +58,10 @@ def contract(
                 if value is not None:
                     found[operand] = _meet(found[operand], value)
                     cut.add(operand)
-    result, empty = list(variables), ca.SX(0)
-    for index in sorted(cut):
-        node = program.nodes[index]
-        if index in told or node.op == "input":
-            empty = ca.logic_or(empty, found[index].lower > found[index].upper)
-        if node.op == "input":
-            result[node.number] = found[index]
-    return result, empty
+    inputs = {program.nodes[k].number: k for k in cut if program.nodes[k].op == "input"}
+    seen = [found[k] for k in sorted({*told, *inputs.values()})]
+    empty = reduce(ca.logic_or, [a.lower > a.upper for a in seen], ca.SX(0))
+    return [found[inputs[j]] if j in inputs else v for j, v in enumerate(variables)], empty
 
 
 def composed(op: str, args: Sequence[Lifted]) -> Program | None:
@@ -84,10 +80,8 @@ def composed(op: str, args: Sequence[Lifted]) -> Program | None:
 
 def _defined(node: Node, args: list[Lifted]) -> bool:
     """Whether an operation is defined all over the numbers of its operands."""
-    if node.op not in PARTIAL:
-        return True
-    if node.op == "divide":
-        return args[1].low > 0.0 or args[1].high < 0.0
+    if node.op not in PARTIAL or node.op == "divide":
+        return node.op != "divide" or args[1].low > 0.0 or args[1].high < 0.0
     with np.errstate(all="ignore"):
         ends = RULES[node.op](*((np.array([a.low]), np.array([a.high])) for a in args))
     return not np.isnan(ends).any()
@@ -161,8 +155,9 @@ class _Backward:
             return self.quotient(_negative(z), _negative(b))
         if b.low != 0.0:
             return self.do("divide", z, b)
-        size = Lifted(ca.fmax(b.lower, _SMALL), ca.fmax(b.upper, _SMALL), _SMALL, b.high)
-        found, apart = self.do("divide", z, size), b.lower >= _SMALL
+        least = self.rounding.tiny
+        size = Lifted(ca.fmax(b.lower, least), ca.fmax(b.upper, least), least, b.high)
+        found, apart = self.do("divide", z, size), b.lower >= least
         lower = found.lower - _unless(ca.logic_or(apart, z.lower > 0.0))
         return Lifted(lower, found.upper + _unless(ca.logic_or(apart, z.upper < 0.0)))
 

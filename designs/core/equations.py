@@ -15,8 +15,6 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 CELLS = 4096
 """Cells of the domain over which the signs of derivatives are proved."""
-SMALLEST = 2.0**-10
-"""Of the largest slope: what a fault is divided by where its slope passes zero in the box."""
 MOST_NODES = 4000
 """Operations of a row and its derivatives above which it is left alone."""
 
@@ -286,31 +284,7 @@ class Equations:
             local = lift(self.program, [node], whole, rounding)[0]
             slope = Lifted(ca.fmax(local.lower, low), ca.fmin(local.upper, high), low, high)
         moved = combine("subtract", now, rest, rounding=rounding)
-        if low <= 0.0 <= high:
-            return _either_side(moved, slope, rounding)
         return combine("divide", moved, slope, rounding=rounding)
-
-
-def _either_side(moved: Lifted, slope: Lifted, rounding: Rounding) -> Lifted:
-    """Divide where the slope over the sets is away from zero on one side; no bound elsewhere."""
-    lower, upper = ca.SX(-FAR), ca.SX(FAR)
-    sides = (
-        (moved, slope.lower, slope.upper, slope.high),
-        (
-            Lifted(-moved.upper, -moved.lower, -moved.high, -moved.low),
-            -slope.upper,
-            -slope.lower,
-            -slope.low,
-        ),
-    )
-    for part, least, most, limit in sides:
-        if limit > 0.0:
-            floor = SMALLEST * limit
-            size = Lifted(ca.fmax(least, floor), ca.fmax(most, floor), floor, limit)
-            told = combine("divide", part, size, rounding=rounding)
-            lower = ca.if_else(least >= floor, told.lower, lower)
-            upper = ca.if_else(least >= floor, told.upper, upper)
-    return Lifted(lower, upper)
 
 
 def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:

@@ -96,7 +96,11 @@ class Rounding:
         tiny: bool = True,
     ) -> Lifted:
         """Return the interval around rounded ends; ends below zero by rounding alone are zero."""
+        share, least = units * self.step, self.tiny if tiny else 0.0
         below, above = self.down(lower, units, tiny), self.up(upper, units, tiny)
+        if low >= 0.0 or high <= 0.0:  # one factor where the sign is known
+            sides = (1.0 - share, 1.0 + share)[:: 1 if low >= 0.0 else -1]
+            below, above = sides[0] * lower - least, sides[1] * upper + least
         if low == 0.0:
             below = ca.fmax(below, 0.0)
         if high == 0.0:

@@ -39,32 +39,38 @@ class Affine:
     error: ca.SX
 
 
-_Term = tuple[Lifted, Affine]
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """An affine enclosure on the way: the sum of the sizes of its terms, `depth` times rounded."""
+
+    slopes: dict[int, ca.SX]
+    centre: ca.SX
+    error: ca.SX
+    size: ca.SX
+    depth: int = 0
+
+
+_Term = tuple[Lifted, _Form]
+_NONE = ca.SX(0)
 
 
 def relax(
     program: Program, nodes: Sequence[int], variables: Sequence[Lifted], rounding: Rounding
 ) -> list[Affine]:
     """Return affine enclosures of nodes over a box; variables that are points are in the centre."""
-    relaxation = _Relaxation(rounding, [v.magnitude for v in variables])
-    start = [
-        relaxation.flat(v) if is_point(v) else Affine({j: ca.SX(1)}, ca.SX(0), ca.SX(0))
+    sizes = [v.magnitude for v in variables]
+    relaxation = _Relaxation(rounding, 16.0 * rounding.tiny * sum(sizes, ca.SX(1)))
+    given = [
+        (v, relaxation.flat(v) if is_point(v) else _Form({j: ca.SX(1)}, _NONE, _NONE, sizes[j]))
         for j, v in enumerate(variables)
     ]
-    given = list(zip(variables, start, strict=True))
-    return [_known(a) for _, a in relaxation.walk(program, nodes, given)]
+    return [relaxation.known(a) for _, a in relaxation.walk(program, nodes, given)]
 
 
-def _known(a: Affine) -> Affine:
-    """Say `FAR` where the error has no bound or is not a number."""
-    known = a.error < _LIMIT
-    slopes = {j: ca.if_else(known, s, 0.0) for j, s in a.slopes.items()}
-    return Affine(slopes, ca.if_else(known, a.centre, 0.0), ca.if_else(known, a.error, FAR))
-
-
-def _shifts(value: ca.SX) -> bool:
-    """Whether products with a number are not rounded: it is zero or a power of two."""
-    return bool(value.is_constant()) and np.frexp(abs(float(value)))[0] in (0.0, 0.5)
+def _whole(value: ca.SX) -> bool:
+    """Whether products with a number are not rounded and do not underflow."""
+    size = abs(float(value)) if value.is_constant() else 3.0
+    return size == 0.0 or (size >= 1.0 and np.frexp(size)[0] == 0.5)
 
 
 def _bend(op: str, n: int) -> Program | None:
@@ -96,7 +102,7 @@ def _bend(op: str, n: int) -> Program | None:
 @dataclass(frozen=True, eq=False)
 class _Relaxation:
     rounding: Rounding
-    sizes: Sequence[ca.SX]
+    underflow: ca.SX
     middles: dict[Lifted, tuple[ca.SX, ca.SX]] = field(default_factory=dict)
 
     def walk(self, program: Program, nodes: Sequence[int], given: Sequence[_Term]) -> list[_Term]:
@@ -114,7 +120,7 @@ class _Relaxation:
             found[index] = z, self.flat(z) if form is None else form
         return [found[index] for index in nodes]
 
-    def operation(self, op: str, number: int, z: Lifted, args: list[_Term]) -> Affine | None:
+    def operation(self, op: str, number: int, z: Lifted, args: list[_Term]) -> _Form | None:
         """Return one operation on affine forms, None where it has no form."""
         program = composed(op, [interval for interval, _ in args])
         if program is not None:
@@ -145,56 +151,60 @@ class _Relaxation:
             self.middles[z] = middle, (1.0 + 2.0 * self.rounding.step) * radius
         return self.middles[z]
 
-    def flat(self, z: Lifted) -> Affine:
+    def flat(self, z: Lifted) -> _Form:
         """Return an interval as a form without slopes."""
-        return Affine({}, *self.middle(z))
+        middle, radius = self.middle(z)
+        return _Form({}, middle, radius, ca.fabs(middle))
 
-    def total(self, errors: Sequence[ca.SX], lost: Sequence[ca.SX], small: bool) -> ca.SX:
-        """Add errors, two roundings of each of some numbers and what underflow takes, upwards."""
-        count, total, rounded = len(errors) + len(lost) + 6, sum1(errors), sum1(lost)
-        if small:
-            total += (16.0 * self.rounding.tiny) * (1.0 + sum1(self.sizes))
-        total += (2.0 * self.rounding.step) * rounded
-        only = sum(not e.is_zero() for e in [*errors, rounded]) + small < 2 and rounded.is_zero()
-        return total if only else (1.0 + count * self.rounding.step) * total
+    def known(self, a: _Form) -> Affine:
+        """Add what rounding has taken, and say `FAR` where there is no bound or no number.
+
+        A node with weights w of others has lost two roundings of its size T = sum |w_i| T_i + |q|
+        and |w_i| times what these have; T holds every slope times its variable, and the centre.
+        """
+        step = self.rounding.step
+        error = (1.0 + (8 + 12 * a.depth) * step) * (a.error + (2.0 * a.depth * step) * a.size)
+        error = error if a.depth else a.error
+        known = error < _LIMIT
+        slopes = {j: ca.if_else(known, s, 0.0) for j, s in a.slopes.items()}
+        return Affine(slopes, ca.if_else(known, a.centre, 0.0), ca.if_else(known, error, FAR))
+
+    def total(self, error: ca.SX, lost: ca.SX) -> ca.SX:
+        """Add two roundings of some numbers and what underflow takes to an error, upwards."""
+        step = self.rounding.step
+        return (1.0 + 8.0 * step) * (error + (2.0 * step) * lost + self.underflow)
 
     def sum(
         self,
-        terms: Sequence[tuple[ca.SX, Affine]],
-        centre: ca.SX | float = 0.0,
-        errors: Sequence[ca.SX] = (),
-        lost: Sequence[ca.SX] = (),
-    ) -> Affine:
-        """Return weights times forms plus a number."""
-        parts: dict[int, list[tuple[ca.SX, bool]]] = {-1: [(ca.SX(centre), True)]}
-        errors, lost, small = list(errors), list(lost), False
+        terms: Sequence[tuple[ca.SX, _Form]],
+        centre: ca.SX = _NONE,
+        error: ca.SX = _NONE,
+        small: bool = False,
+    ) -> _Form:
+        """Return weights times forms plus a number; it or the error may be products if `small`."""
+        sums, size, exact = {-1: centre}, ca.fabs(centre), True
         for weight, a in terms:
-            whole = _shifts(weight) and abs(float(weight)) >= 1.0
             for j, value in [(-1, a.centre), *a.slopes.items()]:
-                small |= not (whole or (value.is_constant() and _shifts(value)))
-                parts.setdefault(j, []).append((weight * value, _shifts(weight) or _shifts(value)))
-            small |= not (whole or a.error.is_zero())
-            errors.append(ca.fabs(weight) * a.error)
-        sums: dict[int, ca.SX] = {}
-        for j, values in parts.items():
-            values = [v for v in values if not v[0].is_zero()]
-            sums[j] = sum1([v for v, _ in values])
-            sizes = [ca.fabs(v) for v, exact in values if not exact or len(values) > 2]
-            if len(values) == 2 and len(sizes) < 2:
-                sizes.append(ca.fabs(sums[j]))
-            lost.append(sum1(sizes) * (self.sizes[j] if j >= 0 else 1.0))
-        return Affine(sums, sums.pop(-1), self.total(errors, lost, small))
+                before = sums.get(j, _NONE)
+                exact &= before.is_zero() or value.is_zero()
+                small |= not (_whole(weight) or _whole(value))
+                sums[j] = before + weight * value
+            exact &= error.is_zero() or a.error.is_zero()
+            small |= not (_whole(weight) or a.error.is_zero())
+            error, size = error + ca.fabs(weight) * a.error, size + ca.fabs(weight) * a.size
+        depth = max(a.depth for _, a in terms) + (small or not exact)
+        return _Form(sums, sums.pop(-1), error + self.underflow if small else error, size, depth)
 
     # -- operations ------------------------------------------------------------------------------
 
-    def line(self, z: Lifted, a: Affine, slope: ca.SX, rest: ca.SX, error: ca.SX) -> Affine:
+    def line(self, z: Lifted, a: _Form, slope: ca.SX, rest: ca.SX, error: ca.SX) -> _Form:
         """Return slope a + rest +- error where that is narrower than the interval of the result."""
         middle, radius = self.middle(z)
         better = error < radius
         slope, rest = ca.if_else(better, slope, 0.0), ca.if_else(better, rest, middle)
-        return self.sum([(slope, a)], rest, [ca.if_else(better, error, radius)])
+        return self.sum([(slope, a)], rest, ca.fmin(error, radius))
 
-    def chord(self, op: str, number: int, z: Lifted, arg: _Term, exponent: Lifted) -> Affine | None:
+    def chord(self, op: str, number: int, z: Lifted, arg: _Term, exponent: Lifted) -> _Form | None:
         """Return the chord of a function of one variable, on numbers all over its domain."""
         (a, form), program = arg, _bend(op, number)
         if program is None or (op not in _VALUES and z.lower.is_constant()):
@@ -210,22 +220,21 @@ class _Relaxation:
         start = slope * a.lower
         rest = (left - start) + 0.5 * (above - below)
         # values at both ends and the line through them; where a slope underflows, all of the width
-        lost = [(2.0 * units + 4.0) * (ca.fabs(left) + ca.fabs(right)), 2.0 * ca.fabs(start)]
-        small = self.rounding.tiny * width
-        error = self.total([0.5 * above, 0.5 * below, small], lost, True)
+        lost = (2.0 * units + 4.0) * (ca.fabs(left) + ca.fabs(right)) + 2.0 * ca.fabs(start)
+        error = self.total(0.5 * (above + below) + self.rounding.tiny * width, lost)
         return self.line(z, form, slope, rest, error)
 
-    def square(self, z: Lifted, args: list[_Term]) -> Affine:
+    def square(self, z: Lifted, args: list[_Term]) -> _Form:
         (a, form), slope = args[0], args[0][0].lower + args[0][0].upper
         width, rest = a.upper - a.lower, -0.5 * (0.25 * slope * slope + a.lower * a.upper)
-        error = self.total([0.125 * width * width], [4.0 * z.upper], True)
-        return self.sum([(slope, form)], rest, [error])
+        error = self.total(0.125 * width * width, 4.0 * z.upper)
+        return self.sum([(slope, form)], rest, error)
 
-    def sqrt(self, z: Lifted, args: list[_Term]) -> Affine:
+    def sqrt(self, z: Lifted, args: list[_Term]) -> _Form:
         both, apart = z.lower + z.upper, z.upper - z.lower
         slope = 1.0 / both
         rest = 0.5 * (z.lower * z.upper * slope + 0.25 * both)
-        error = self.total([0.125 * apart * apart * slope], [8.0 * both], True)
+        error = self.total(0.125 * apart * apart * slope, 8.0 * both)
         return self.line(z, args[0][1], slope, rest, error)
 
     def secant(self, a: Lifted) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -233,25 +242,25 @@ class _Relaxation:
         low, high = ca.fabs(a.lower), ca.fabs(a.upper)
         slope = ca.fmin(ca.fmax((high - low) / (a.upper - a.lower), -1.0), 1.0)
         rest = 0.5 * ca.fmax(ca.fmax(low - slope * a.lower, high - slope * a.upper), 0.0)
-        return slope, rest, self.total([rest], [4.0 * (low + high)], True)
+        return slope, rest, self.total(rest, 4.0 * (low + high))
 
-    def absolute(self, z: Lifted, args: list[_Term]) -> Affine:
+    def absolute(self, z: Lifted, args: list[_Term]) -> _Form:
         a, form = args[0]
         if a.low >= 0.0 or a.high <= 0.0:
             return self.sum([(ca.SX(1 if a.low >= 0.0 else -1), form)])
         return self.line(z, form, *self.secant(a))
 
-    def extreme(self, sign: float, args: list[_Term]) -> Affine:
+    def extreme(self, sign: float, args: list[_Term]) -> _Form:
         """Return the larger (1) or smaller (-1) of two: half their sum +- half their distance."""
         (a, first), (b, second) = args
         if a.low >= b.high or a.high <= b.low:
             return first if (a.low >= b.high) == (sign > 0.0) else second
         slope, rest, error = self.secant(self.do("subtract", a, b))
-        share, lost = 0.5 + (0.5 * sign) * slope, [a.magnitude + b.magnitude]
-        terms = [(share, first), (1.0 - share, second)]
-        return self.sum(terms, (0.5 * sign) * rest, [0.5 * error], lost)
+        share = 0.5 + (0.5 * sign) * slope
+        error = self.total(0.5 * error, a.magnitude + b.magnitude)
+        return self.sum([(share, first), (1.0 - share, second)], (0.5 * sign) * rest, error)
 
-    def select(self, args: list[_Term]) -> Affine:
+    def select(self, args: list[_Term]) -> _Form:
         """Return the branch that is taken, and while that is open the mean of both."""
         condition, (a, first), (b, second) = args[0][0], args[1], args[2]
         if condition.low > 0.0 or condition.high <= 0.0:
@@ -260,34 +269,28 @@ class _Relaxation:
         share = 0.5 * true + 0.5 * ca.logic_not(false)
         apart = 0.5 * self.do("subtract", a, b).magnitude
         error = ca.if_else(ca.logic_or(true, false), 0.0, apart)
-        return self.sum([(share, first), (1.0 - share, second)], 0.0, [error])
+        return self.sum([(share, first), (1.0 - share, second)], error=error)
 
-    def product(self, args: list[_Term]) -> Affine:
+    def product(self, args: list[_Term]) -> _Form:
         (a, first), (b, second) = args if args[0][1].slopes else args[::-1]
-        if not second.slopes:
-            return self.sum([(second.centre, first)], 0.0, [second.error * a.magnitude])
         (ac, ar), (bc, br) = self.middle(a), self.middle(b)
-        both = ac * bc
-        return self.sum([(bc, first), (ac, second)], -both, [ar * br], [ca.fabs(both)])
+        if not second.slopes:
+            return self.sum([(bc, first)], error=br * a.magnitude, small=not br.is_zero())
+        return self.sum([(bc, first), (ac, second)], -ac * bc, ar * br, small=True)
 
-    def divide(self, args: list[_Term]) -> Affine | None:
+    def divide(self, args: list[_Term]) -> _Form | None:
         """Multiply with the reciprocal."""
         one, (b, form) = Lifted.number(1.0), args[1]
         r = self.do("divide", one, b)
-        inverse: Affine | None = self.flat(r)
+        inverse: _Form | None = self.flat(r)
         if form.slopes:
             inverse = self.chord("inverse", 0, r, (between(b), form), one)
         return None if inverse is None else self.product([args[0], (r, inverse)])
 
 
-def sum1(values: Sequence[ca.SX]) -> ca.SX:
-    """Add up."""
-    return sum(values, ca.SX(0))
-
-
-_ZERO = Lifted.number(0.0), Affine({}, ca.SX(0), ca.SX(0))
+_ZERO = Lifted.number(0.0), _Form({}, _NONE, _NONE, _NONE)
 _LINEAR = {"add": (1, 1), "subtract": (1, -1), "negate": (-1,), "twice": (2,), "nonnegative": (1,)}
-_FORMS: Mapping[str, Callable[[_Relaxation, Lifted, list[_Term]], Affine | None]] = {
+_FORMS: Mapping[str, Callable[[_Relaxation, Lifted, list[_Term]], _Form | None]] = {
     "multiply": lambda self, z, args: self.product(args),
     "divide": lambda self, z, args: self.divide(args),
     "sqrt": _Relaxation.sqrt,

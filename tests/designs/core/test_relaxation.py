@@ -193,6 +193,11 @@ TIMES = ("multiply", (SHORT, SHORT))
         ([TIMES] * 3, (1e6, 1e6 + 1), lambda x: x * Fraction(SHORT) ** 3),
         ([TIMES] * 5, (1e6, 1e6 + 1), lambda x: x * Fraction(SHORT) ** 5),
         (
+            [*[TIMES] * 3, ("add", (1.0, 1.0))],
+            (1e6, 1e6 + 1),
+            lambda x: x * Fraction(SHORT) ** 3 + 1,
+        ),
+        (
             [("add", (2.0**20 + 1,) * 2), *[TIMES] * 3],
             (0.0, 2.0**-30),
             lambda x: (x + 2**20 + 1) * Fraction(SHORT) ** 3,
