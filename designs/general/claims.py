@@ -169,12 +169,13 @@ def _on_faults(design: GeneralDesign) -> Iterator[str]:
         if s.name in extended.followed:
             moves = "constant" if s.constant else f"by {s.rate:g} per sample at most"
             yield f"{s.name} is followed as a state, {moves}: the outputs tell it from the others"
-    if design.divided:
-        yield (
-            f"{', '.join(design.divided)} of the call before is what moved the states, divided by "
-            f"its gain: it lies inside the returned interval too; {reason or LOST}"
-        )
     moving = [s.name for s in plant.f if s.rate is not None or s.constant]
+    for name in design.divided:
+        why = LOST if name in moving else NO_RATE
+        yield (
+            f"{name} of the call before is what moved the states, divided by its gain: it lies "
+            f"inside the returned interval too; {reason or why}"
+        )
     again = [name for name in design.unfollowed if name in moving and not reason]
     told = untold(extended, design.middle, again) if again else {}
     for name in design.unfollowed:

@@ -90,25 +90,31 @@ class GeneralUIO(Method):
     def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer.
 
-        Where no gain is found that follows the faults, peak bounds divide them out, or hold them
-        for disturbances.
+        Faults of which none has a rate are divided out where that can be. Where no gain is found
+        that follows the faults, peak bounds divide them out, or hold them for disturbances.
         """
+        followed = self.faults == "followed" and bool(model.f)
+        loose = not any(s.rate is not None or s.constant for s in model.f)
+        if followed and loose and self.bounds != "l2":
+            with suppress(StructureError, SolverTrouble, InfeasibleDesign):
+                return self._otherwise(model, "divided")
         try:
             return super()._design(model, bounds)
         except SolverTrouble as trouble:
-            others = WAYS if self.bounds == "peak" and self.faults == "followed" else ()
-            for way in others if model.f else ():
+            for way in WAYS if followed and self.bounds == "peak" else ():
                 with suppress(StructureError, SolverTrouble, InfeasibleDesign):
-                    other = replace(self, faults=way)
-                    found = other.read(model)
-                    # what was asked for is stored: the guarantee says why it came otherwise
-                    design = other.solve(found).changed(options=self.options())
-                    return self._certified(design, found)
+                    return self._otherwise(model, way)
             where = hidden_somewhere(self.read(model).extended)
             if where is None:
                 raise trouble from None
             told = str(trouble).splitlines()[0].split(";")[0]
             raise SolverTrouble(f"{model.name}: {where}", [told]) from None
+
+    def _otherwise(self, model: Plant, way: Literal["divided", "bounded"]) -> Observer:
+        """Design with another way for the faults than was asked for, which is what is stored."""
+        other = replace(self, faults=way)
+        found = other.read(self.CLASS.check(model))
+        return self._certified(other.solve(found).changed(options=self.options()), found)
 
     def read(self, given: Plant, bounds: JacobianBounds | None = None) -> GeneralModel:
         """Extend the plant; faults that no output tells from the states are disturbances."""

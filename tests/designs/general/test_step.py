@@ -187,6 +187,23 @@ def test_what_is_made_of_a_fault_and_why_stands_in_the_guarantee():
         assert found[0].endswith(f'as faults="{way}" asks')
 
 
+@pytest.mark.parametrize("bounds", ["peak", "ellipsoid"])
+def test_faults_without_a_rate_are_divided_out_of_themselves(bounds):
+    """Held for disturbances nothing is known of them. Mutant: the first way that finds a gain."""
+    plant = ob.Plant("leak")
+    (x,) = plant.states("x", range=(1, 5), nominal=2)
+    plant.faults("f", range=(-1, 3))
+    w = plant.disturbances("w1 w2", bound=0.02)
+    plant.dynamics([x / 2 + x * plant.f[0].symbol / 9 + w[0]], Ts=1)
+    plant.outputs([x + w[1]])
+    observer = GeneralUIO(bounds=bounds).design(plant)
+    assert observer.fault_delay == 1 and observer.half_widths[1] < 1.0
+    assert said(observer)["f"][0].endswith("it has no rate")
+    assert observer.certificate.design.options["faults"] == "followed"
+    # another than the first is not mixed with faults that are followed
+    assert GeneralUIO(bounds="ellipsoid").design(alike()).fault_delay == 0
+
+
 def test_a_constant_fault_is_followed_by_peak_bounds():
     """Nothing drives it. Mutant: Riccati gains for the disturbances alone, which are none."""
     plant = ob.Plant("drifting")
