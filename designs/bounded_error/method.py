@@ -244,8 +244,7 @@ class BoundedErrorUIO(Method):
         if self.weights is not None and not any(self.weights):
             raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
         if self.bounds == "peak" and self.form in ("corrected", None):
-            idle = ("post", "objective", "multipliers", "error")
-            refuse_idle(self, 'bounds="peak", which has no ellipsoid', *idle)
+            refuse_idle(self, 'bounds="peak", which has no ellipsoid', *IDLE)
         if self.form in ("printed", "repaired") and (
             self.error != "plain" or self.multipliers != "equal" or self.bounds != "ellipsoid"
         ):

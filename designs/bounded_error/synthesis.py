@@ -194,12 +194,12 @@ def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:
     return float(np.abs(np.linalg.eigvals(X)).max())
 
 
-def largest_gamma(system: ErrorSystem, rtol: float = 1e-3, gain: FloatArray | None = None) -> float:
+def largest_gamma(system: ErrorSystem, gain: FloatArray | None = None) -> float:
     """Return the largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``.
 
     Bounds of the noise do not enter: they only scale P.
     """
-    return largest_feasible(lambda gamma: decay_problem(system, gamma, gain), rtol)
+    return largest_feasible(lambda gamma: decay_problem(system, gamma, gain))
 
 
 def decay_problem(

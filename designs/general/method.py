@@ -228,10 +228,13 @@ def peak_bounds(design: GeneralDesign) -> PeakBound:
     sums = error_sums(system, extra_inputs(system, design))
     rho = spectral_radius(sums.G)
     if not rho < 1.0:
+        names = design.extended.plant.names("x")
+        strongest = names[int(np.argmax(sums.G.max(axis=0))) % len(names)]
         raise InfeasibleDesign(
             f"peak bounds: the small-gain condition fails, spectral radius of G is {rho:.6g}",
             [
-                "the Jacobian varies too much for these gains",
+                "the Jacobian varies too much for these gains; the strongest feedback is through "
+                f"the error of {strongest}",
                 "use other gains, or a smaller domain",
             ],
             rho=rho,

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive.rigour import add_up
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
-from obsynth.designs.core.given import Start
+from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.running import (
     ROUND_UP,
@@ -239,12 +239,16 @@ def memory_sizes(design: GeneralDesign) -> dict[str, int]:
     return {**sizes, "bound": sum(parts)} if parts else sizes
 
 
-def first_memory(design: GeneralDesign, start: Start) -> dict[str, ArrayLike]:
-    """Start at the guess, and in the middle of the boxes of the followed faults."""
-    names = design.plant.names("f")
+def first_memory(
+    design: GeneralDesign, start: Start, z0: ArrayLike | None = None
+) -> dict[str, ArrayLike]:
+    """Start at the guess, or a paper's z_0, and in the middle of the followed faults' boxes."""
+    names, x = design.plant.names("f"), start.guess
+    if z0 is not None:
+        x = read_vector(z0, "z0", design.plant.names("x"))
     middle = start.f.mean(axis=1)
     faults = [middle[names.index(name)] for name in design.extended.followed]
-    return {"prediction": np.concatenate([start.guess, faults])}
+    return {"prediction": np.concatenate([x, faults])}
 
 
 def build_core(design: GeneralDesign) -> Core:

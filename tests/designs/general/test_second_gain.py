@@ -13,7 +13,7 @@ import sympy as sp
 
 import obsynth as ob
 from methods import PEAK_GAINS
-from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.general.method import GeneralUIO, bound_peak
 from obsynth.designs.general.model import read
 from obsynth.designs.general.peak import error_sums, spectral_radius
@@ -197,6 +197,26 @@ def test_gains_are_given_and_shown_by_the_letters_of_the_paper(tanks, tank):
         GeneralUIO().fix(model, {"L": tanks.L, "K": PEAK_GAINS["K"]})
     with pytest.raises(ObsynthError, match='or bounds="peak"'):
         GeneralUIO(bounds="l2").fix(model, {"L": tanks.L, **PEAK_GAINS})
+
+
+@pytest.mark.parametrize(("label", "more"), [("m22(h2)", 0.3), ("m44(h4)", 0.02)])
+def test_slopes_that_vary_too_much_are_refused_by_the_state_they_act_through(tanks, label, more):
+    """Mutant: the error that is moved most in place of the one that moves most."""
+    family = tanks.family
+    ranges = family.ranges.copy()
+    ranges[family.labels.index(label)] += [-more, more]
+    with pytest.raises(InfeasibleDesign, match=f"the error of {label[4:6]}") as caught:
+        bound_peak(tanks.changed(family=replace(family, ranges=ranges)))
+    assert caught.value.rho > 1
+
+
+def test_a_start_may_be_the_z_of_the_paper(given_peak):
+    """Mutant: the guess in its place."""
+    memory = given_peak.memory0([90, 90, 30, 30], z0=[100, 110, 0, 40])
+    first = memory[given_peak.memory_layout["prediction"]]
+    assert first.tolist() == [100, 110, 0, 40, 0, 0]
+    with pytest.raises(ObsynthError, match="z0 has to be 4"):
+        given_peak.memory0([90, 90, 30, 30], z0=[1.0])
 
 
 def test_a_stored_gain_of_predictions_goes_with_peak_bounds(tanks):
