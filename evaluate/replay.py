@@ -6,7 +6,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.evaluate.checked import scheduling_columns, step_function
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.run import Run
-from obsynth.evaluate.truth import Call, dense
+from obsynth.evaluate.truth import Call, dense, sample_time
 from obsynth.symbolic import Record
 from obsynth.symbolic.scenarios import gentle
 
@@ -21,12 +21,12 @@ def replay(observer: Observer, record: Record) -> Run:
                 f"{model.name} has {', '.join(names)}: give its channels in that order.",
                 field=kind,
             )
-    late = np.abs(np.diff(record.time) - float(model.Ts or 0.0))
-    if model.Ts is not None and late.max() > 0.05 * model.Ts:
-        k = int(late.argmax())
+    Ts, steps = sample_time(model), np.diff(record.time)
+    k = int(np.abs(steps - Ts).argmax())
+    if abs(steps[k] - Ts) > 0.05 * Ts:
         raise SimulationError(
-            f"the record {record.source!r} has {record.time[k + 1] - record.time[k]:g} s from "
-            f"t = {record.time[k]:g} on; {model.name} is sampled every {model.Ts:g} s.",
+            f"the record {record.source!r} has {steps[k]:g} s from t = {record.time[k]:g} on; "
+            f"{model.name} is sampled every {Ts:g} s.",
             instant=k,
         )
     if scheduling_columns(function, model, "step"):
@@ -40,10 +40,8 @@ def replay(observer: Observer, record: Record) -> Run:
         for log, result in zip(logs, step.results[1:], strict=True):
             log[k] = result
         step.args[0][:] = step.results[0]
-    unknown = {
-        kind: np.full((len(record), len(getattr(model, kind))), np.nan)
-        for kind in ("x", "d", "f", "w", "rho")
-    }
+    sizes = {kind: len(getattr(model, kind)) for kind in ("x", "d", "f", "w", "rho")}
+    unknown = {kind: np.full((len(record), size), np.nan) for kind, size in sizes.items()}
     return Run.collect(
         model=model,
         observer=observer,

@@ -8,8 +8,6 @@ import numpy as np
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
 
-GROUPS = ("u", "y", "reference")
-
 
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -29,12 +27,6 @@ class Record:
     ------
     PlantError
         If the arrays do not fit each other or the names, or the time does not increase.
-
-    Examples
-    --------
-    >>> from obsynth.symbolic.records import three_tank_leak
-    >>> three_tank_leak()["y2"].shape
-    (181,)
     """
 
     time: FloatArray
@@ -46,32 +38,30 @@ class Record:
     source: str
 
     def __post_init__(self) -> None:
-        for group in ("time", *GROUPS):
+        for group in ("time", *self.names):
             array = np.array(getattr(self, group), dtype=float)
             array.flags.writeable = False
             object.__setattr__(self, group, array)
-        if self.time.ndim != 1 or self.time.size < 2 or not np.all(np.diff(self.time) > 0):
-            raise PlantError(f"record {self.source!r}: the time has to increase", field="time")
-        for group in GROUPS:
-            given, shape = getattr(self, group).shape, (len(self), len(self.names[group]))
-            if given != shape or len(self.units[group]) != shape[1]:
+            shape = (len(self.time), len(self.names.get(group, ())))
+            if group != "time" and (array.shape != shape or len(self.units[group]) != shape[1]):
                 raise PlantError(
-                    f"record {self.source!r}: {group} has shape {given}; {shape} is needed, a row "
-                    "for each instant, and a name and a unit for each column",
+                    f"record {self.source!r}: {group} has shape {array.shape}; {shape} is needed, "
+                    "a row for each instant, and a name and a unit for each column",
                     field=group,
                 )
+        if self.time.ndim != 1 or len(self) < 2 or not np.all(np.diff(self.time) > 0):
+            raise PlantError(f"record {self.source!r}: the time has to increase", field="time")
 
     def __len__(self) -> int:
-        return int(self.time.size)
+        return len(self.time)
 
     def __getitem__(self, name: str) -> FloatArray:
         """Return a channel by its name, shape (N,)."""
-        names = [n for group in GROUPS for n in self.names[group]]
+        names = [n for group in self.names.values() for n in group]
         if name not in names:
-            raise PlantError(
-                f"no channel is called {name!r}; there are {', '.join(names)}", symbol=name
-            )
-        return np.hstack([self.u, self.y, self.reference])[:, names.index(name)]
+            known = ", ".join(names)
+            raise PlantError(f"no channel is called {name!r}; there are {known}", symbol=name)
+        return np.hstack([getattr(self, g) for g in self.names])[:, names.index(name)]
 
     def __repr__(self) -> str:
         u, y = (", ".join(self.names[group]) for group in ("u", "y"))

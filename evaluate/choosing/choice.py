@@ -20,7 +20,7 @@ EMPTY = 0.95
 """Of a half range: what is as wide says hardly anything."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Choice:
     """Every method on one plant, what it guarantees and what it showed in one common run.
 
@@ -46,12 +46,12 @@ class Choice:
     tries: tuple[Try, ...]
     kalman: Try
 
-    @property
+    @cached_property
     def made(self) -> tuple[Try, ...]:
         """The tries that gave an observer."""
         return tuple(one for one in self.tries if one.observer is not None)
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         """States, then faults."""
         return (*self.model.names("x"), *self.model.names("f"))
@@ -61,16 +61,12 @@ class Choice:
         return np.array([self.names.index(name) for name in self.criterion], dtype=np.int64)
 
     @cached_property
-    def _ranges(self) -> FloatArray:
-        """Half of the declared ranges, infinite where there is none."""
+    def _units(self) -> FloatArray:
+        """Half of the declared ranges; the narrowest that was found where there is none."""
         boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
         half: FloatArray = 0.5 * np.diff(boxes, axis=1)[:, 0]
-        return np.where(half > 0, half, np.inf)
-
-    @cached_property
-    def _units(self) -> FloatArray:
         least = np.min([_settled(one) for one in (*self.made, self.kalman)], axis=0)
-        half = np.where(np.isfinite(self._ranges), self._ranges, least)
+        half = np.where(np.isfinite(half) & (half > 0), half, least)
         return np.where(np.isfinite(half) & (half > 0), half, 1.0)
 
     def online(self, one: Try) -> FloatArray:
@@ -92,6 +88,12 @@ class Choice:
         wide = ~(half <= 1.1 * half[len(half) // 2 :].max(axis=0)).all(axis=1)
         return int(np.flatnonzero(wide)[-1]) + 1 if wide.any() else 0
 
+    def says_nothing(self, one: Try) -> bool:
+        """Whether no counted interval is narrower than its declared range, or hardly."""
+        boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
+        known = np.isfinite(boxes).all(axis=1) & (self.online(one) >= EMPTY)
+        return bool(known[self._counted].all())
+
     @cached_property
     def _allowed(self) -> list[Try]:
         """What may be recommended: finite intervals that missed nothing, within the budget."""
@@ -106,7 +108,7 @@ class Choice:
         Where these say nothing of what counts, of those narrowest over all states and faults.
         """
         near = _nearest(self._allowed, self.score)
-        if all(map(self._says_nothing, near)):
+        if all(map(self.says_nothing, near)):
             near = _nearest(near, lambda one: float(np.mean(self.online(one))))
         return min(near, key=_operations, default=None)
 
@@ -115,40 +117,34 @@ class Choice:
         """The recommended observer, or None."""
         return None if self.best is None else self.best.observer
 
-    @cached_property
+    @property
     def reason(self) -> str:
         """Why this one, or why none."""
         best, spoken = self.best, ", ".join(self.criterion)
+        if not self.made:
+            return "Nothing is recommended: no method gives a certified observer."
         if best is None:
-            if not self.made:
-                return "Nothing is recommended: no method gives a certified observer."
             least = min(self.made, key=_operations)
             return (
                 f"Nothing is recommended: no observer has finite intervals of {spoken} within the "
                 f"budget; {least.name} has the fewest operations, {least.operations}."
             )
-        narrowest = min(self._allowed, key=self.score)
-        if best is narrowest:
-            why = "the narrowest of what was tried"
-        else:
-            share = text(self.score(narrowest), 3)
-            why = f"within 5 % of {narrowest.name} ({share}, {narrowest.operations} operations)"
+        first = min(self._allowed, key=self.score)
+        why = "the narrowest" + ("" if self.budget is None else " within the budget")
+        if best is not first:
+            narrow = text(self.score(first), 3)
+            why = f"within 5 % of {first.name} ({narrow}, {first.operations} operations)"
         said = (
-            f"{best.name} is recommended: its intervals of {spoken} are "
+            f"{best.name} is recommended: half widths of {spoken} are "
             f"{text(self.score(best), 3)} of the half range in the mean, {why}, at "
             f"{best.operations} operations a step."
         )
-        if self._says_nothing(best):
+        said += " Its intervals of faults hold means over time." if best.means else ""
+        if self.says_nothing(best):
             said += " They say hardly more than the declared ranges."
-        others = [o.name for o in self.made if o is not best and self._says_nothing(o)]
-        if others:
-            said += f" Hardly more than is declared is told by {', '.join(others)}."
-        return said
-
-    def _says_nothing(self, one: Try) -> bool:
-        """Whether no counted interval is narrower than its declared range, or hardly."""
-        known = np.isfinite(self._ranges)[self._counted]
-        return bool(np.all(known & (self.online(one)[self._counted] >= EMPTY)))
+        others = [o.name for o in self.made if o is not best and self.says_nothing(o)]
+        told = f" Hardly more than is declared is told by {', '.join(others)}."
+        return said + (told if others else "")
 
     def _row(self, one: Try) -> list[Any]:
         """Return the row of a try in the table."""
@@ -156,8 +152,8 @@ class Choice:
             return [one.name, False, None, None, None, None, one.seconds, one.reason]
         said = ["recommended"] if one is self.best else []
         said += ["its faults are means over time"] if one.means else []
-        missed = one.missed or (one.missed == 0 and one is self.kalman)
-        said += [f"misses {100 * (one.missed or 0):.3g} % of the instants"] if missed else []
+        if one.missed or (one.missed == 0 and one is self.kalman):
+            said.append(f"misses {100 * one.missed:.3g} % of the instants")
         voids = sum(void.count for void in one.run.domain.voids)
         said += [f"void at {voids} calls, which contradicts the assumptions"] if voids else []
         counted = float(self.guaranteed(one)[self._counted].mean())
@@ -181,19 +177,16 @@ class Choice:
     @property
     def widths(self) -> Table:
         """The shares of every state and fault: in the run, and guaranteed in brackets."""
-        shown = [*zip(*map(self._cells, (*self.made, self.kalman)), strict=True)]
-        rows = [[name, *cells] for name, cells in zip(self.names, shown, strict=True)]
-        columns = ["signal", *(one.name for one in self.made), "Kalman, no guarantee"]
-        note = "Half width / half range: mean of the second half of the run (guaranteed)"
-        note += "" if np.isfinite(self._ranges).all() else "; without a range, / the narrowest"
-        return Table("Every state and fault", columns, rows, note)
 
-    def _cells(self, one: Try) -> list[str]:
-        pairs = zip(self.online(one), self.guaranteed(one), strict=True)
-        return [
-            text(float(a), 3) + (f" ({text(float(b), 3)})" if np.isfinite(b) else "")
-            for a, b in pairs
-        ]
+        def cell(now: float, ever: float) -> str:
+            return text(now, 3) + (f" ({text(ever, 3)})" if np.isfinite(ever) else "")
+
+        shown = (*self.made, self.kalman)
+        cells = [map(cell, self.online(one), self.guaranteed(one)) for one in shown]
+        rows = [[*row] for row in zip(self.names, *cells, strict=True)]
+        columns = ["signal", *(one.name for one in self.made), "Kalman, no guarantee"]
+        note = "Mean of the second half of the run (guaranteed); without a range, / the narrowest."
+        return Table("Half width / half range of every state and fault", columns, rows, note)
 
     @property
     def assumptions(self) -> Table:
@@ -210,6 +203,9 @@ class Choice:
         from obsynth.evaluate.plotting.choice import plot_choice
 
         return plot_choice(self, ax)
+
+    def __repr__(self) -> str:
+        return f"<Choice for {self.model.name!r}: {self.reason}>"
 
     def __str__(self) -> str:
         return f"{self.table}\n\n{self.widths}"

@@ -51,18 +51,17 @@ class ExtendedKalman:
         pairs = zip(plant.f, self.half[n : n + m], strict=True)
         walk = [0.0 if s.constant else 1.0 if s.rate is None else s.rate / h for s, h in pairs]
         self.walk = np.diag([0.0] * n + [step**2 for step in walk] + [0.0] * m)
-        self.step = self._step(middles[len(plant.u) :])
+        self.step = self._step()
 
-    def _step(self, scheduled: list[float]) -> ca.Function:
+    def _step(self) -> ca.Function:
         """Return the step: readings one by one, as noise is estimated and leaves none to invert."""
         plant, kept, half, box = self.model, self.kept, ca.DM(self.half), self.model.box("x")
         n, wide = len(plant.x), self.half.size
         memory, u = ca.SX.sym("memory", kept + kept * kept), ca.SX.sym("u", len(plant.u))
-        y, measured = ca.SX.sym("y", len(plant.output_names)), [s.measured for s in plant.rho]
-        theta, taken = ca.SX.sym("theta", sum(measured)), np.cumsum(measured) - 1
-        rho = ca.vertcat(
-            *(theta[int(i)] if m else v for m, i, v in zip(measured, taken, scheduled, strict=True))
-        )
+        y = ca.SX.sym("y", len(plant.output_names))
+        known = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
+        theta = iter(ca.vertsplit(known))
+        rho = ca.vertcat(*(next(theta) if s.measured else s.nominal or 0.0 for s in plant.rho))
         mean = start = ca.vertcat(memory[:kept], self.middle[kept:])
         P = ca.diagcat(ca.reshape(memory[kept:], kept, kept), ca.SX.eye(wide - kept) / 3.0)
         _, shown, _, C = self.both(mean, u, rho)
@@ -82,8 +81,8 @@ class ExtendedKalman:
             outputs[f"{letter}hat"] = mean[part]
             outputs[f"{letter}_lower"] = mean[part] - reach[part]
             outputs[f"{letter}_upper"] = mean[part] + reach[part]
-        inputs = {"memory": memory, "u": u, "y": y, **({"theta": theta} if any(measured) else {})}
-        return make_step(inputs, outputs)
+        inputs = {"memory": memory, "u": u, "y": y}
+        return make_step({**inputs, "theta": known} if known.numel() else inputs, outputs)
 
     def memory0(self, guess: Any, **_: Any) -> FloatArray:
         """Return the memory for a first state, with the variances of the declared ranges."""

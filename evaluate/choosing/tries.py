@@ -38,8 +38,6 @@ METHODS: tuple[Method, ...] = (
     SetMembershipObserver(),
 )
 """What is tried by default; a further method is a further line."""
-LONGEST = 120
-"""Characters of a reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +84,9 @@ def named(method: Method) -> str:
 
 
 def first_sentence(text: str) -> str:
-    """Return the beginning of a refusal, in one line."""
+    """Return the beginning of a refusal, in one line of at most 120 characters."""
     line = re.split(r"(?<=[a-z)\]0-9])[.;] ", " ".join(text.split()), maxsplit=1)[0]
-    return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]} …"
+    return line if len(line) <= 120 else f"{line[:118]} …"
 
 
 def attempt(method: Method, model: Plant, run: Callable[[Any], Run]) -> Try:
@@ -114,8 +112,7 @@ def in_time(name: str, job: Callable[[], Try], limit: float | None) -> Try:
     """
     if limit is None or "fork" not in multiprocessing.get_all_start_methods():
         return job()
-    context = multiprocessing.get_context("fork")
-    receive, send = context.Pipe(duplex=False)
+    receive, send = multiprocessing.Pipe(duplex=False)
 
     def child() -> None:
         # its own bars would show among those of this process, of notebooks too
@@ -124,7 +121,7 @@ def in_time(name: str, job: Callable[[], Try], limit: float | None) -> Try:
             os.dup2(quiet.fileno(), 2)
             send.send(job())
 
-    process = context.Process(target=child, daemon=True)
+    process = multiprocessing.get_context("fork").Process(target=child, daemon=True)
     process.start()
     send.close()
     try:

@@ -144,9 +144,9 @@ def _plant(given: str) -> Plant:
     if given in plants.__all__:
         try:
             found: Plant = getattr(plants, given)()
+            return found
         except TypeError as error:
             _refuse(f"{given} is made in Python ({error}); give a file of what to_dict returns.")
-        return found
     if not Path(given).is_file():
         _refuse(f"there is no plant and no file {given!r}; plants are {', '.join(plants.__all__)}.")
     try:

@@ -35,7 +35,7 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
     Notes
     -----
     Nothing is known of the plant but its ranges: a state or fault without one begins, and stays, at
-    its nominal value or zero.
+    its nominal value or zero, a disturbance at zero.
 
     Examples
     --------
@@ -55,6 +55,8 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
     f_half = np.minimum(f_half, still / speed) if plant.Ts is not None else f_half
     u_phase, f_phase = (rng.uniform(0.0, 2.0 * np.pi, len(v)) for v in (u_half, f_half))
     k = np.arange(steps + 1)[:, None]
+    w_box = plant.box("w").reshape(-1, 2)
+    w_low, w_high = np.where(np.isfinite(w_box).all(axis=1, keepdims=True), w_box, 0.0).T
     return Scenario(
         name=f"gentle {seed}",
         steps=steps,
@@ -63,6 +65,7 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
         inputs=u_middle + u_half * np.sin(3.0 * speed * k + u_phase),
         faults=f_middle + f_half * np.sin(speed * k + f_phase),
         x_range=None,
+        disturbances=lambda rng, k: rng.uniform(w_low, w_high),
         f_range=_first_faults(plant, f_middle, f_half),
     )
 

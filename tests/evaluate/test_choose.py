@@ -113,6 +113,8 @@ def test_everything_is_shown():
     assert table.rows[3][1] == "no guarantee" and "misses 25 %" in table.rows[3][7]
     assert table.rows[3][2:4] == [pytest.approx(0.2), None]
     assert table.marked == [0]
+    assert "hold means over time" in found.reason and "means" not in choice(entry("o", 1, 1)).reason
+    assert repr(found) == f"<Choice for 'leaking tanks': {found.reason}>"
     assert found.widths.rows[3][:2] == ["leak", "0.4 (0.8)"]
     assert found.assumptions.rows[0] == ["bounded", "one, <two>"]
     page = found._repr_html_()

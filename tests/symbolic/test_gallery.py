@@ -129,6 +129,18 @@ def test_any_number_of_tanks(n):
     assert plant.rhs[n - 1].has(sp.sqrt(plant.x[n - 1].symbol))
 
 
+def test_a_gentle_scenario_leaves_unbounded_disturbances_at_zero():
+    """Mutants: bounded ones at zero too; another order of what is drawn."""
+    plant = ob.plants.hinf_example()
+    drawn = ob.scenarios.gentle(plant, steps=9).arrays(plant)["w"]
+    assert not np.isfinite(plant.box("w")).any() and not drawn.any()
+    plant = ob.plants.battery()
+    box = plant.box("w")
+    expected = np.random.default_rng(0).uniform(box[:, 0], box[:, 1], (10, len(box)))
+    scenario = ob.scenarios.gentle(plant, steps=9)
+    assert np.array_equal(scenario.arrays(plant, 0)["w"], expected)
+
+
 @pytest.mark.parametrize("name", [*POINTS, "klatt_engell_reactor"])
 def test_a_gentle_scenario_begins_and_moves_within_ranges_and_rates(name):
     """Mutants: the rate left out; a wave about the middle of a range that has a nominal value."""
