@@ -1,5 +1,6 @@
 """`choose`: which observer for this plant?"""
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +29,7 @@ def choose(
     methods: Sequence[Method] = METHODS,
     scenario: Scenario | None = None,
     seed: int = 0,
-    limit: float | None = 30.0,
+    limit: float | None = 270.0,
 ) -> Choice:
     """Try every method on a plant and recommend one.
 
@@ -55,8 +56,8 @@ def choose(
     seed : int
         Of the scenario and of the disturbances, the same for all.
     limit : float or None
-        Seconds after which a method is ended and counts as refused, where processes can be forked.
-        None: as long as it takes, in this process.
+        Seconds for all methods. One that takes about twice its share of what is left is ended and
+        counts as refused, where processes can be forked. None: as long as it takes, in this one.
 
     Returns
     -------
@@ -73,9 +74,9 @@ def choose(
     "BoundedErrorUIO(bounds='peak')"
     """
     if (model.Ts is None) == (Ts is None):
-        time = "a continuous plant" if Ts is None else f"sampled every {model.Ts:g} s"
+        what = "a continuous plant" if Ts is None else f"sampled every {model.Ts:g} s"
         mend = "give Ts=, the sample time of the observers" if Ts is None else "leave Ts out"
-        raise SimulationError(f"{model.name} is {time}: {mend}.")
+        raise SimulationError(f"{model.name} is {what}: {mend}.")
     model = model if Ts is None else model.discretise("euler", Ts=Ts)
     counted, kalman = _signals(model, criterion), ExtendedKalman(model)
     run: Callable[[Any], Run]
@@ -88,10 +89,13 @@ def choose(
         chosen = replace(chosen, disturbances=None if noise is None else noise[:, :own])
         run = partial(_simulated, scenario=chosen, seed=seed)
     tries, yardstick = [], Try(kalman.method, 0.0, kalman, run(kalman))
+    start = time.perf_counter()
     with bar() as say:
         for i, method in enumerate(methods):
             say(named(method), i / len(methods))
-            tries.append(in_time(named(method), partial(attempt, method, model, run), limit))
+            left = None if limit is None else max(limit - (time.perf_counter() - start), 0.0)
+            share = None if left is None else 2.0 * left / (len(methods) - i + 1)
+            tries.append(in_time(named(method), partial(attempt, method, model, run), share))
     return Choice(model, counted, budget, tuple(tries), yardstick)
 
 
@@ -102,7 +106,7 @@ def _simulated(observer: Any, scenario: Scenario, seed: int) -> Run:
 
 def _gentle(model: Plant, kalman: Any, seed: int) -> Scenario:
     """Return the longest gentle scenario that keeps the state in its box, then the least gentle."""
-    for steps in (200, 100, 50, 25):
+    for steps in (1000, 300, 100, 50, 25):
         for share in (0.05, 0.02, 0.005):
             scenario = gentle(model, steps, seed, share)
             try:

@@ -128,7 +128,7 @@ def in_time(name: str, job: Callable[[], Try], limit: float | None) -> Try:
         if receive.poll(limit):
             told: Try = receive.recv()
             return told
-        return Try(name, limit, reason=f"no design within {limit:g} s")
+        return Try(name, limit, reason=f"no design within {limit:.3g} s")
     except EOFError:
         process.join()
         return Try(name, 0.0, reason=f"its process ended with exit code {process.exitcode}")

@@ -143,6 +143,20 @@ def test_a_method_is_ended_when_its_time_is_up(capfd):
     assert in_time("works", works, None).seconds == 0.0
 
 
+def test_one_method_cannot_take_the_time_of_the_others(monkeypatch):
+    """Mutants: all that is left for the first; the limit for each of them."""
+    monkeypatch.setattr(ob.HinfUIO, "design", lambda *_: time.sleep(60))
+    few, start = [ob.HinfUIO(), ob.HinfUIO(horizon=9), ob.FilterBank()], time.perf_counter()
+    found = ob.choose(PLANT, ob.records.three_tank_leak(), methods=few, limit=1.0)
+    assert time.perf_counter() - start < 5
+    first, second, third = (one.reason for one in found.tries)
+    taken = [
+        float(said.removeprefix("no design within ").removesuffix(" s")) for said in (first, second)
+    ]
+    assert 0 < taken[1] < taken[0] <= 0.5 and sum(taken) < 0.9
+    assert "does not work in discrete time" in third
+
+
 def test_names_and_reasons_are_short():
     assert named(ob.IntervalObserver(gains="search")) == "IntervalObserver(gains='search')"
     assert named(ob.QPVObserver()) == "QPVObserver"
