@@ -173,7 +173,7 @@ def test_every_observer_sees_the_same_noise_and_the_model_that_is_its_own():
     few = [ob.IntervalObserver(), ob.HinfUIO(), ob.FilterBank()]
     plant = ob.plants.tanks_in_a_row(2)
     kept = plant.discretise("euler", Ts=0.5, remainder=True)
-    found = ob.choose(kept, methods=few, limit=None)
+    found = ob.choose(kept, methods=few, limit=None, scenario=ob.scenarios.gentle(kept, 60))
     assert found.criterion == ("f",) and len(found.made) == 3
     runs = [one.run for one in (*found.tries, found.kalman)]
     assert {one.missed for one in found.tries} == {0.0}
