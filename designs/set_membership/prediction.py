@@ -5,6 +5,7 @@ as the sets have become, readings in the middle of their strips, columns dropped
 Nothing that is proved rests on it; it chooses among gains, coordinates and numbers of columns.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from obsynth.designs.set_membership.model import Around, SetMembershipModel
 from obsynth.symbolic.arrays import FloatArray
 
 LONGEST = 300
-_STEADY = 1e-3
+_STEADY, _SLOWEST = 1e-3, 1.0 - 1e-4
 _MOVED = 0.02
 """Share of a box by which it changes before the equations are enclosed anew."""
 
@@ -32,7 +33,7 @@ class Bank:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Mean half widths over the last round, states then faults, and the calls until then."""
+    """Mean half widths over the last round, states then faults, and the calls to settle."""
 
     widths: FloatArray
     calls: int
@@ -86,6 +87,12 @@ def predict(
             new, old = (np.mean(history[-k * period :][:period], axis=0) for k in (1, 2))
             if not np.all(np.isfinite(new)) or np.all(np.abs(new - old) <= _STEADY * old):
                 break
+    else:
+        # what the slowest mode needs
+        closed = (np.eye(len(z)) - bank.L @ around.H) @ around.J
+        rho = min(float(np.abs(np.linalg.eigvals(closed)).max()), _SLOWEST)
+        calls = max(calls, math.ceil(math.log(_STEADY) / math.log(rho))) if rho > 0.0 else calls
+        return Predicted(np.mean(history[-period:], axis=0), calls)
     return Predicted(np.mean(history[-period:], axis=0), len(history))
 
 
