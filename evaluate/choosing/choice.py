@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.designs.core.observer import Observer
 from obsynth.evaluate.choosing.tries import Try
+from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, new_figure, style
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
@@ -199,10 +200,26 @@ class Choice:
         return Table("Assumptions", ["what is assumed", "by"], rows)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw half width / half range of every signal and observer; returns the axes."""
-        from obsynth.evaluate.plotting.choice import plot_choice
+        """Draw a row for every signal: dots in the run, rings guaranteed, crosses for the filter.
 
-        return plot_choice(self, ax)
+        Returns the axes, those given or of a new figure.
+        """
+        rows, share = np.arange(len(self.names)), 0.5 / (len(self.made) + 1)
+        with style():
+            ax = new_figure((7.2, 1.2 + 0.4 * len(rows))).subplots() if ax is None else ax
+            for i, one in enumerate(self.made):
+                at, color = rows + share * (i + 1) - 0.25, BARS[i % len(BARS)]
+                label = f"{one.name} (recommended)" if one is self.best else one.name
+                ax.plot(self.online(one), at, "o", color=color, markersize=4, label=label)
+                ax.plot(self.guaranteed(one), at, "o", color=color, fillstyle="none")
+            ax.plot(self.online(self.kalman), rows, "x", color=INK, label="Kalman, no guarantee")
+            ax.axvline(1.0, color=SOFT, linewidth=0.8)
+            ax.set_xscale("log")
+            ax.set_yticks(rows, self.names)
+            ax.invert_yaxis()
+            ax.set_xlabel("half width / half range; dots: in the run, rings: guaranteed")
+            ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return ax
 
     def __repr__(self) -> str:
         return f"<Choice for {self.model.name!r}: {self.reason}>"

@@ -1,7 +1,7 @@
 """`choose`: which observer for this plant?"""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -79,15 +79,18 @@ def choose(
         raise SimulationError(f"{model.name} is {what}: {mend}.")
     model = model if Ts is None else model.discretise("euler", Ts=Ts)
     counted, kalman = _signals(model, criterion), ExtendedKalman(model)
-    run: Callable[[Any], Run]
-    if record is not None:
-        run = partial(replay, record=record)
-    else:
+    if record is None:
         chosen = _gentle(model, kalman, seed) if scenario is None else scenario
         # what a discretisation leaves out is nobody's to draw, and its noise is that of the others
         own, noise = len(model.w) - len(model.remainder or ()), chosen.arrays(model, seed)["w"]
-        chosen = replace(chosen, disturbances=None if noise is None else noise[:, :own])
-        run = partial(_simulated, scenario=chosen, seed=seed)
+        assert noise is not None
+        chosen = replace(chosen, disturbances=noise[:, :own])
+
+    def run(observer: Any) -> Run:
+        if record is not None:
+            return replay(observer, record)
+        return simulate(observer.model, observer, chosen, seed)
+
     tries, yardstick = [], Try(kalman.method, 0.0, kalman, run(kalman))
     start = time.perf_counter()
     with bar() as say:
@@ -99,18 +102,13 @@ def choose(
     return Choice(model, counted, budget, tuple(tries), yardstick)
 
 
-def _simulated(observer: Any, scenario: Scenario, seed: int) -> Run:
-    """Let an observer's own model move in a scenario."""
-    return simulate(observer.model, observer, scenario, seed)
-
-
 def _gentle(model: Plant, kalman: Any, seed: int) -> Scenario:
     """Return the longest gentle scenario that keeps the state in its box, then the least gentle."""
     for steps in (1000, 300, 100, 50, 25):
         for share in (0.05, 0.02, 0.005):
             scenario = gentle(model, steps, seed, share)
             try:
-                if _simulated(kalman, scenario, seed).domain.x_inside.all():
+                if simulate(model, kalman, scenario, seed).domain.x_inside.all():
                     return scenario
             except SimulationError:
                 continue
