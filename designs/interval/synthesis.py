@@ -223,7 +223,8 @@ def search_design(design: IntervalDesign) -> IntervalDesign:
     programme = _programme(data, identity)
     if programme is not None:
         starts.append((identity, programme))
-    starts.sort(key=lambda gains: predicted_size(data, *gains))
+    if len(identity):  # else the faults take every state, and there is nothing to search
+        starts.sort(key=lambda gains: predicted_size(data, *gains))
     tried = [*starts, *((identity, L) for _, L in starts)]
     if len(identity):
         tried += [refined(data, *gains) for gains in starts[:STARTS]]

@@ -551,3 +551,12 @@ def test_a_form_that_is_only_true_to_many_digits_is_not_taken(monkeypatch):
     with pytest.raises(ob.CertificateError) as refusal:
         observer.certificate.check()
     assert {claim.name for claim in refusal.value.failed} == {"derivation"}
+
+
+def test_a_search_where_the_faults_take_every_state_is_the_design_without_one():
+    """Fault and unknown load enter both equations, so that no gain is left to search. Mutant: the
+    starts sorted by what they predict, of an empty P."""
+    plant = ob.plants.dc_motor().discretise("euler", Ts=0.01)
+    searched, plain = (ob.IntervalObserver(gains=g).design(plant) for g in ("search", "lp"))
+    assert searched.gains["P"].shape == (0, 0)
+    np.testing.assert_array_equal(searched.half_widths, plain.half_widths)
