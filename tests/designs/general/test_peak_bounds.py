@@ -111,6 +111,22 @@ def test_channels_reach_both_ends_of_every_range():
             assert all(abs(sp.Rational(end) - middle) <= sp.Rational(radius) for end in ends[k])
 
 
+def test_what_rounding_the_middle_moves_counts():
+    """Against exact rationals. Mutant: the family's radius alone, which here is none."""
+    design = read(motor()).design
+    family = replace(design.family, radius=0.0 * design.family.radius)
+    design = design.changed(family=family)
+    exact = sp.Matrix(family.constant).applyfunc(sp.Rational)
+    for (low, high), direction in zip(family.ranges.tolist(), family.directions, strict=True):
+        step = sp.Matrix(direction).applyfunc(sp.Rational)
+        exact += sp.Rational((low + high) / 2) * step
+    apart = (exact - sp.Matrix(design.middle).applyfunc(sp.Rational)).applyfunc(abs)
+    rest = error_system(design).rest
+    assert any(apart) and all(
+        sp.Rational(have) >= a for have, a in zip(rest.flat, apart, strict=True)
+    )
+
+
 def rotated(design, seed, kind):
     """The worst errors of a constant member of the family, the middle or one at random corners.
 
