@@ -99,7 +99,7 @@ class Choice:
     def _allowed(self) -> list[Try]:
         """What may be recommended: finite intervals that missed nothing, within the budget."""
         most = np.inf if self.budget is None else self.budget
-        kept = [one for one in self.made if _operations(one) <= most and not one.missed]
+        kept = [one for one in self.made if one.operations <= most and not one.missed]
         return [one for one in kept if np.isfinite(self.score(one))]
 
     @cached_property
@@ -111,7 +111,7 @@ class Choice:
         near = _nearest(self._allowed, self.score)
         if all(map(self.says_nothing, near)):
             near = _nearest(near, lambda one: float(np.mean(self.online(one))))
-        return min(near, key=_operations, default=None)
+        return min(near, key=lambda one: one.operations, default=None)
 
     @property
     def recommended(self) -> Observer | None:
@@ -125,7 +125,7 @@ class Choice:
         if not self.made:
             return "Nothing is recommended: no method gives a certified observer."
         if best is None:
-            least = min(self.made, key=_operations)
+            least = min(self.made, key=lambda one: one.operations)
             return (
                 f"Nothing is recommended: no observer has finite intervals of {spoken} within the "
                 f"budget; {least.name} has the fewest operations, {least.operations}."
@@ -143,9 +143,8 @@ class Choice:
         said += " Its intervals of faults hold means over time." if best.means else ""
         if self.says_nothing(best):
             said += " They say hardly more than the declared ranges."
-        others = [o.name for o in self.made if o is not best and self.says_nothing(o)]
-        told = f" Hardly more than is declared is told by {', '.join(others)}."
-        return said + (told if others else "")
+        others = ", ".join(o.name for o in self.made if o is not best and self.says_nothing(o))
+        return said + (f" Hardly more than is declared is told by {others}." if others else "")
 
     def _row(self, one: Try) -> list[Any]:
         """Return the row of a try in the table."""
@@ -169,9 +168,9 @@ class Choice:
         rows.append([name, "no guarantee", score, None, call, count, None, said])
         columns = ["observer", "certified", "in the run", "guaranteed", "settled at call"]
         columns += ["operations", "design [s]", "remark"]
-        run = self.kalman.run
-        where = "" if run is None else f", {run.scenario}, {len(run.t)} instants"
-        title = f"Half width / half range of {', '.join(self.criterion)}{where}"
+        run: Any = self.kalman.run
+        title = f"Half width / half range of {', '.join(self.criterion)}, {run.scenario}, "
+        title += f"{len(run.t)} instants"
         marked = [i for i, one in enumerate(self.tries) if one is self.best]
         return Table(title, columns, rows, self.reason, marked)
 
@@ -239,10 +238,6 @@ def _settled(one: Try) -> FloatArray:
     half = one.half_widths
     settled: FloatArray = half[len(half) // 2 :].mean(axis=0)
     return settled
-
-
-def _operations(one: Try) -> float:
-    return one.operations or 0
 
 
 def _nearest(tries: Sequence[Try], score: Callable[[Try], float]) -> list[Try]:

@@ -56,15 +56,15 @@ class Try:
     means: bool = False
 
     @property
-    def operations(self) -> int | None:
-        """How many operations a step takes."""
+    def operations(self) -> Any:
+        """How many operations a step takes; None without an observer."""
         return None if self.observer is None else int(self.observer.step.n_instructions())
 
     @property
     def half_widths(self) -> FloatArray:
         """Of states and faults at every instant that is known of, (N, n + n_f)."""
-        assert self.run is not None
-        rows = [self.run.widths[name] for name in self.run.estimated]
+        run: Any = self.run
+        rows = [run.widths[name] for name in run.estimated]
         return np.column_stack([row[: min(map(len, rows))] for row in rows])
 
     @property

@@ -109,6 +109,7 @@ def test_everything_is_shown():
     table = found.table
     assert table.rows[0][:7] == ["one", True, pytest.approx(0.4), pytest.approx(0.8), 3, 900, 1.5]
     assert table.rows[0][7] == "recommended; its faults are means over time"
+    assert [one.operations for one in found.tries] == [900, 500, None]
     assert table.rows[2][1] is False and table.rows[2][7] == "no <b>rank</b>"
     assert table.rows[3][1] == "no guarantee" and "misses 25 %" in table.rows[3][7]
     assert table.rows[3][2:4] == [pytest.approx(0.2), None]
