@@ -89,8 +89,9 @@ class SetAdaptiveObserver(Method):
         cannot be made Metzler in their own, or whose states may be negative. Their bounds are
         carried back by the exact inverse, rounded outwards; what S leaves of D, and what A varies
         by, is added to the drive between bounds of x. With a matrix the cap holds for S L. By
-        default x itself; ``"auto"``: x where that has a design, else real modal coordinates of
-        A - L C, for the middle of the bounds of A, with the smallest predicted widths.
+        default x itself where no state may be negative; ``"auto"``: x where that has a design, else
+        real modal coordinates of A - L C, for the middle of the bounds of A, with the smallest
+        predicted widths, which are also taken where a state may be negative.
 
     Raises
     ------
@@ -204,7 +205,7 @@ class SetAdaptiveObserver(Method):
 
     def read(self, given: Plant | Split) -> SetModel:
         """Bring the plant into the form (3) and bound its matrices elementwise."""
-        found = read(given, self.noise, own=self.coordinates is None)
+        found = read(given, self.noise, own=self.form == "printed")
         if isinstance(self.coordinates, tuple):
             read_coordinates(self.coordinates, found.plant.names("x"))
         return found
@@ -243,7 +244,7 @@ class SetAdaptiveObserver(Method):
         found: Gain | Choice
         if isinstance(self.coordinates, tuple):
             found = given(np.array(self.coordinates))
-        elif self.coordinates == "auto" and model.plant.box("x").min() < 0.0:
+        elif model.plant.box("x").min() < 0.0:
             found = modal()
         else:
             try:
@@ -269,7 +270,8 @@ class SetAdaptiveObserver(Method):
                 "the program is that of the plant's own coordinates: leave coordinates out",
                 option="coordinates",
             )
-        found: SetModel = self._checked(model)
+        self._checked(model)
+        found = read(model, self.noise)
         return gain_problem(found.A_lower_box, found.A_span[1], found.C, self.gain_cap, alpha)
 
     def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:

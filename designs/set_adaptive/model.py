@@ -81,7 +81,7 @@ def read(given: Plant | Split, noise: bool = True, own: bool = True) -> SetModel
             raise StructureError(
                 f"the state {signal.name} may be negative ({signal.lower:g}); A_m x <= A x <= A_M "
                 f"x needs states that are not: use {signal.name} - ({signal.lower:g}) as state, or "
-                'coordinates="auto"',
+                "design in other coordinates, as the form that is not printed does",
                 symbol=signal.name,
                 condition="nonnegative states",
             )

@@ -63,8 +63,14 @@ def test_in_its_own_coordinates_it_is_refused_by_name():
         method.design(oscillator())
     assert refusal.value.entry == (1, 0)
     assert 'coordinates="auto"' in str(refusal.value)
-    with pytest.raises(ob.StructureError, match='or coordinates="auto"'):
-        method.design(unstable())
+    with pytest.raises(ob.StructureError, match="may be negative"):
+        method.problem(unstable(), 0.1)
+
+
+def test_states_of_any_sign_need_no_option():
+    """Mutant: their own coordinates, in which bounds of A x say nothing."""
+    plain, told = (made_of("growing", coordinates=c)[0] for c in (None, "auto"))
+    assert plain.record["coordinates"]["S"] == told.record["coordinates"]["S"]
 
 
 # -- the drive, point by point ---------------------------------------------------------

@@ -249,7 +249,7 @@ def test_plants_outside_of_the_class_are_refused_by_name(change, words):
 
 def test_more_refusals(tanks):
     with pytest.raises(ob.StructureError, match=r"state a may be negative \(-1\)"):
-        SetAdaptiveObserver().design(plant_with(low=-1.0))
+        SetAdaptiveObserver(form="printed").design(plant_with(low=-1.0))
     with pytest.raises(ob.InfeasibleDesign, match="unmeasured states \\(b\\)"):
         SetAdaptiveObserver().design(plant_with("unstable"))
     with pytest.raises(ob.ObsynthError, match="Gamma has 3 numbers"):
