@@ -32,11 +32,12 @@ def claims(design: SetMembershipDesign) -> Iterator[Claim]:
     grown = size @ exact_off
     room = least(size - grown - ExactMatrix.of(np.abs(design.W)))
     leak = least(ExactMatrix.of(design.leak) - grown)
+    regular = off.sum(axis=1).max() < 1.0 and 4.5 * len(off) * design.frame.rounding.max() < 1.0
     yield Claim(
         "frame",
         "size >= |W| (I - |I - V W|)^-1 and leak >= size |I - V W|: columns that are dropped lie "
         "in the box that takes their place",
-        bool(room >= 0.0 and leak >= 0.0 and off.sum(axis=1).max() < 1.0),
+        bool(room >= 0.0 and leak >= 0.0 and regular),
         min(room, leak),
         "exact rational arithmetic for an enclosed I - V W",
     )

@@ -148,6 +148,17 @@ class Frame:
     size: FloatArray
     leak: FloatArray
 
+    @property
+    def rounding(self) -> FloatArray:
+        """Eight times what rounding V changes, in its own coordinates; 4 N times it is below 1."""
+        return np.asarray(2.0 * STEP * (self.size @ np.abs(self.V)))
+
+    @property
+    def again(self) -> FloatArray:
+        """What covers rounding V diag(reach), and itself: at least I + rounding / 8 times it."""
+        powers = (np.linalg.matrix_power(self.rounding, k) for k in range(len(self.V) + 1))
+        return np.asarray(sum(powers))
+
 
 def reduced(z: Zonotope, keep: int, frame: Frame) -> Zonotope:
     """Replace all but the first columns, and the slack, by a box in the coordinates of a frame.
@@ -160,9 +171,7 @@ def reduced(z: Zonotope, keep: int, frame: Frame) -> Zonotope:
     rounding = (N + 4) * STEP * np.abs(frame.W)
     reach = row_sums(W @ dropped) * _UP + _sparse(frame.leak + rounding) @ wide * _UP
     reach = reach + _sparse(frame.size) @ z.slack * _UP + TINY
-    # what rounding V diag(reach) leaves
-    again = np.eye(N) + 2.0 * STEP * (frame.size @ np.abs(frame.V))
-    reach = _sparse(again) @ reach * _UP
+    reach = _sparse(frame.again) @ reach * _UP
     box = _sparse(frame.V) @ ca.diag(reach)
     return Zonotope(z.centre, ca.horzcat(box, kept), ca.SX(N, 1))
 
