@@ -210,12 +210,28 @@ class _Arithmetic:
     def multiply(self, args: list[Lifted], low: float, high: float) -> Lifted:
         if any(map(_zero, args)):
             return Lifted.number(0.0)
+        for a, b in (args, args[::-1]):
+            if _factor(a):
+                return self.scaled(b, a, low, high)
         return self.rounding.interval(*_product(*args), low, high)
+
+    def scaled(self, a: Lifted, by: Lifted, low: float, high: float, power: int = 1) -> Lifted:
+        """Multiply with, or divide by (power -1), a number that is known to some units."""
+        number, unit = (0.5 * by.low + 0.5 * by.high) ** power, UNIT[self.rounding.precision]
+        units = 1.0 if power == 1 else 2.0
+        if by.low != by.high:
+            units += 0.5 + 0.3 * (by.high - by.low) / (abs(by.low) * unit)
+        elif abs(np.frexp(number)[0]) == 0.5:
+            units = 0.0
+        lower, upper = (a.lower, a.upper) if number > 0.0 else (a.upper, a.lower)
+        return self.rounding.interval(number * lower, number * upper, low, high, units)
 
     def divide(self, args: list[Lifted], low: float, high: float) -> Lifted | None:
         a, b = args
         if not (b.low > 0.0 or b.high < 0.0):
             return self._divide_open(a, b)
+        if _factor(b):
+            return self.scaled(a, b, low, high, -1)
         pairs = [(p, q) for p in _ends(a) for q in _ends(b)]
         if a.low >= 0.0 or a.high <= 0.0:
             # signs known: the ends that make the quotient smallest and largest
@@ -411,6 +427,12 @@ def _product(a: Lifted, b: Lifted) -> tuple[ca.SX, ca.SX]:
         )
     products = [p * q for p in _ends(a) for q in _ends(b)]
     return reduce(ca.fmin, products), reduce(ca.fmax, products)
+
+
+def _factor(a: Lifted) -> bool:
+    """Whether an interval is a constant that is known to some units."""
+    size = min(abs(a.low), abs(a.high)) if a.low * a.high > 0.0 else 0.0
+    return a.lower.is_constant() and a.upper.is_constant() and a.high - a.low < 2.0**-46 * size
 
 
 def _zero(a: Lifted) -> bool:

@@ -1,5 +1,7 @@
 """Lifted intervals never miss an exact value, and are as narrow as the rules of the derivations."""
 
+from fractions import Fraction
+
 import casadi as ca
 import mpmath as mp
 import numpy as np
@@ -8,7 +10,7 @@ from operations import CASES, NEAR, PRECISION, TRUTHS, UP, drawn, points, writte
 from tapes import NUMPY, tape
 
 from obsynth.derive.intervals.graph import Node
-from obsynth.derive.intervals.program import Program, evaluate
+from obsynth.derive.intervals.program import Program, constant_interval, evaluate
 from obsynth.derive.intervals.rules import RULES
 from obsynth.designs.core import lifted
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding, lift
@@ -232,6 +234,40 @@ def test_single_precision_steps_over_its_own_rounding(case, precision):
             exact = CASES[case][1](*(mp.mpf(float(v[k])) for v in given))
             outside += not low[k] <= exact <= high[k]
     assert (outside == 0) == (precision == "single")
+
+
+NUMBERS = [
+    (0.5, 0.5),
+    (-4.0, -4.0),
+    (3.0, 3.0),
+    (-0.1, -0.1),
+    *map(constant_interval, (0.3, -1e-3)),
+]
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("numbers", NUMBERS)
+@pytest.mark.parametrize("op", ["multiply", "divide"])
+def test_a_factor_that_is_known_to_some_units_is_one_number(op, numbers, precision):
+    """No exact product or quotient with an end of it is outside; powers of two are not rounded.
+
+    Mutants: the step over one rounding alone; ends not exchanged by a negative number.
+    """
+    rng, kind = np.random.default_rng(11), np.float32 if precision == "single" else np.float64
+    ends = [ca.SX.sym("l"), ca.SX.sym("h")]
+    args = [Lifted(*ends, *NEAR), Lifted.number(*numbers)]
+    found = lifted.combine(op, *args, rounding=Rounding(precision))
+    function = ca.Function("f", ends, [found.lower, found.upper])
+    box = np.sort(rng.uniform(*NEAR, (2, 200)).astype(kind), axis=0).astype(float)
+    low, high = in_single(function, [box]) if precision == "single" else run(function, [box])
+    for k in range(200):
+        corners = [(Fraction(z), Fraction(c)) for z in box[:, k] for c in numbers]
+        exact = [z * c if op == "multiply" else z / c for z, c in corners]
+        gaps = min(exact) - Fraction(low[k]), Fraction(high[k]) - max(exact)
+        assert min(gaps) >= 0
+        unit = 2.0**-24 if precision == "single" else 2.0**-53
+        most = 1e-30 if numbers[0] in (0.5, -4.0) else 20 * unit * float(max(map(abs, exact)))
+        assert max(gaps) <= most
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
