@@ -26,7 +26,9 @@ from obsynth.derive.rigour.interval import UNIT
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding, combine, is_point, lift, needed
 
 _HALF, _PI = 0.5 * np.pi, np.pi  # below what they stand for
+_UNITS = 2.0 * ULPS
 _LOGARITHM = 745.0  # of any double, in size
+_Map = Callable[[ca.SX], ca.SX]
 _OPEN = {"select": (1, 2), "if_else_zero": (1,), "meet": (0, 1)}
 
 
@@ -161,25 +163,18 @@ class _Backward:
         lower = found.lower - _unless(ca.logic_or(apart, z.lower > 0.0))
         return Lifted(lower, found.upper + _unless(ca.logic_or(apart, z.upper < 0.0)))
 
-    def monotone(
-        self,
-        function: Callable[[ca.SX], ca.SX],
-        z: Lifted,
-        units: float = 2.0 * ULPS,
-        sign: int = 1,
-    ) -> Lifted:
+    def monotone(self, function: _Map, z: Lifted, units: float = _UNITS, sign: int = 1) -> Lifted:
         """Return what an inverse makes of both ends; it falls if the sign is -1."""
         lower = z.lower - ca.if_else(z.lower <= -FAR, np.inf, 0.0) if z.low <= -FAR else z.lower
         upper = z.upper + ca.if_else(z.upper >= FAR, np.inf, 0.0) if z.high >= FAR else z.upper
         ends = [function(lower), function(upper)][::sign]
-        down, up = self.rounding.down, self.rounding.up
-        return Lifted(down(ends[0], units, tiny=True), up(ends[1], units, tiny=True))
+        return self.rounding.interval(ends[0], ends[1], -FAR, FAR, units)
 
     def root(self, z: Lifted, least: float, most: float, sign: int = 1) -> Lifted:
         """Take powers of ends, signs kept; the size of the exponent is between positive numbers."""
         exponent = 0.5 * least + 0.5 * most
         unknown = (most - least) / (UNIT[self.rounding.precision] * exponent) + 1.0
-        units = 2.0 * ULPS + 0.6 * _LOGARITHM * exponent * unknown if exponent != 0.5 else 1.0
+        units = _UNITS + 0.6 * _LOGARITHM * exponent * unknown if exponent != 0.5 else 1.0
 
         def power(end: ca.SX) -> ca.SX:
             size = (ca.fabs(end) if z.low < 0.0 else end) ** (sign * exponent)
@@ -206,10 +201,10 @@ class _Backward:
         return _negative(self.least(k, _negative(z), [_negative(a) for a in args], n))
 
     def select(self, k: int, z: Lifted, args: list[Lifted], n: int) -> Lifted | None:
-        condition = args[0]
-        if k == 0 or condition.low > 0.0 or condition.high <= 0.0:
-            return z if k == (1 if condition.low > 0.0 else 2) else None
-        return _where(condition.lower > 0.0 if k == 1 else condition.upper <= 0.0, z)
+        c = args[0]
+        if k == 0 or c.low > 0.0 or c.high <= 0.0:
+            return z if k == (1 if c.low > 0.0 else 2) else None
+        return _where(c.lower > 0.0 if k == 1 else c.upper <= 0.0, z)
 
     def cosine(self, k: int, z: Lifted, args: list[Lifted], n: int) -> Lifted:
         size = self.monotone(ca.acos, z, sign=-1)
@@ -222,14 +217,12 @@ class _Backward:
 _Form = Callable[[_Backward, int, Lifted, list[Lifted], int], Lifted | None]
 
 
-def _through(
-    inverse: Callable[[ca.SX], ca.SX], low: float = -FAR, high: float = FAR, sign: int = 1
-) -> _Form:
+def _through(inverse: _Map, low: float = -FAR, high: float = FAR, sign: int = 1) -> _Form:
     """Return the form of a monotone operation with values between two numbers."""
     return lambda self, k, z, *_: self.monotone(inverse, _clipped(z, low, high), sign=sign)
 
 
-def _branch(inverse: Callable[[ca.SX], ca.SX]) -> _Form:
+def _branch(inverse: _Map) -> _Form:
     """Return the form of a circular function that increases up to a quarter of a period."""
     return lambda self, k, z, args, n: _where(_inside(args[0], _HALF), self.monotone(inverse, z))
 

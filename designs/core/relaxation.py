@@ -40,17 +40,15 @@ class Affine:
 
 
 @dataclass(frozen=True, eq=False)
-class _Form:
+class _Form(Affine):
     """An affine enclosure on the way: the sum of the sizes of its terms, `depth` times rounded."""
 
-    slopes: dict[int, ca.SX]
-    centre: ca.SX
-    error: ca.SX
     size: ca.SX
     depth: int = 0
 
 
 _Term = tuple[Lifted, _Form]
+_Weighted = Sequence[tuple[ca.SX, _Form]]
 _NONE = ca.SX(0)
 
 
@@ -144,7 +142,7 @@ class _Relaxation:
     def middle(self, z: Lifted) -> tuple[ca.SX, ca.SX]:
         """Return a number near the middle, and a radius around it that holds the interval."""
         if is_point(z):
-            return z.lower, ca.SX(0)
+            return z.lower, _NONE
         if z not in self.middles:
             middle = 0.5 * (z.lower + z.upper)
             radius = ca.fmax(z.upper - middle, middle - z.lower)
@@ -175,11 +173,7 @@ class _Relaxation:
         return (1.0 + 8.0 * step) * (error + (2.0 * step) * lost + self.underflow)
 
     def sum(
-        self,
-        terms: Sequence[tuple[ca.SX, _Form]],
-        centre: ca.SX = _NONE,
-        error: ca.SX = _NONE,
-        small: bool = False,
+        self, terms: _Weighted, centre: ca.SX = _NONE, error: ca.SX = _NONE, small: bool = False
     ) -> _Form:
         """Return weights times forms plus a number; it or the error may be products if `small`."""
         sums, size, exact = {-1: centre}, ca.fabs(centre), True
@@ -206,21 +200,20 @@ class _Relaxation:
 
     def chord(self, op: str, number: int, z: Lifted, arg: _Term, exponent: Lifted) -> _Form | None:
         """Return the chord of a function of one variable, on numbers all over its domain."""
-        (a, form), program = arg, _bend(op, number)
-        if program is None or (op not in _VALUES and z.lower.is_constant()):
+        (a, form), program, value = arg, _bend(op, number), _VALUES.get(op)
+        if program is None or (value is None and z.lower.is_constant()):
             return None
         (bend,) = lift(program, program.outputs, [a, z, exponent], self.rounding)
-        width, units, value = a.upper - a.lower, 2.0 * ULPS, _VALUES.get(op)
-        left, right = z.lower, z.upper
+        left, right, width = z.lower, z.upper, a.upper - a.lower
         if value is not None:
             left, right = (value(end, number, exponent.low) for end in (a.lower, a.upper))
         slope, eighth = (right - left) / width, 0.125 * width * width
-        above = ca.SX(0) if bend.low >= 0.0 else ca.fmax(-bend.lower, 0.0) * eighth
-        below = ca.SX(0) if bend.high <= 0.0 else ca.fmax(bend.upper, 0.0) * eighth
+        above = _NONE if bend.low >= 0.0 else ca.fmax(-bend.lower, 0.0) * eighth
+        below = _NONE if bend.high <= 0.0 else ca.fmax(bend.upper, 0.0) * eighth
         start = slope * a.lower
         rest = (left - start) + 0.5 * (above - below)
         # values at both ends and the line through them; where a slope underflows, all of the width
-        lost = (2.0 * units + 4.0) * (ca.fabs(left) + ca.fabs(right)) + 2.0 * ca.fabs(start)
+        lost = (4.0 * ULPS + 4.0) * (ca.fabs(left) + ca.fabs(right)) + 2.0 * ca.fabs(start)
         error = self.total(0.5 * (above + below) + self.rounding.tiny * width, lost)
         return self.line(z, form, slope, rest, error)
 
@@ -241,7 +234,7 @@ class _Relaxation:
         """Return slope, rest and error of |a|; the slope between -1 and 1."""
         low, high = ca.fabs(a.lower), ca.fabs(a.upper)
         slope = ca.fmin(ca.fmax((high - low) / (a.upper - a.lower), -1.0), 1.0)
-        rest = 0.5 * ca.fmax(ca.fmax(low - slope * a.lower, high - slope * a.upper), 0.0)
+        rest = 0.5 * ca.fmax(low - slope * a.lower, 0.0)  # the same at the other end
         return slope, rest, self.total(rest, 4.0 * (low + high))
 
     def absolute(self, z: Lifted, args: list[_Term]) -> _Form:
