@@ -146,18 +146,6 @@ def needed(program: Program, nodes: Sequence[int]) -> list[int]:
     return sorted(found)
 
 
-def varying(program: Program, nodes: Sequence[int], variables: Sequence[Lifted]) -> set[int]:
-    """Return those of some nodes, operands first, that depend on a variable that is no point."""
-    found: set[int] = set()
-    for index in nodes:
-        node = program.nodes[index]
-        if index in program.constants:
-            continue
-        if not is_point(variables[node.number]) if node.op == "input" else found & {*node.args}:
-            found.add(index)
-    return found
-
-
 def is_point(a: Lifted) -> bool:
     """Whether both ends are one number."""
     return bool(ca.is_equal(a.lower, a.upper, 2))
