@@ -179,7 +179,7 @@ class Step:
             late = contractor.invert(before, X).where(have, late)
         if known.f is not None and delay:
             late = late.meet(known.f).where(told, late)
-        now = contractor.drift(late).meet(self.ranges[1]).where(have, before.faults)
+        now = now.meet(contractor.drift(late)).where(have, now)
         shown = late if delay else now
         if known.f is not None and not delay:
             shown = now.meet(known.f).where(told, now)

@@ -87,7 +87,7 @@ class Sweeps:
 
         have: 1 where there was an instant before
         """
-        now = replace(now, rest=self._still(before, now, have))
+        now = replace(now, rest=self._still(before, now))
         empty = ca.SX(0)
         for _ in range(SWEEPS):
             now, wrong = self._shown(now, y, used)
@@ -98,13 +98,13 @@ class Sweeps:
             if "image" in self.contractor.cuts:
                 image = image.meet(self.contractor.image(before)).where(have, image)
             faults = now.faults.meet(self.contractor.drift(before.faults)).where(have, now.faults)
-            now = Before(image, faults, now.known, self._still(before, now, have))
+            now = Before(image, faults, now.known, self._still(before, now))
         return Pair(before, now, empty)
 
-    def _still(self, before: Before, now: Before, have: ca.SX) -> Ends:
-        """Return the rest of this instant, parameters cut with what they were."""
+    def _still(self, before: Before, now: Before) -> Ends:
+        """Return the rest of this instant, parameters cut with what is remembered of them."""
         low, high = ca.SX(now.rest.lower), ca.SX(now.rest.upper)
-        met = now.rest.meet(before.rest).where(have, now.rest)
+        met = now.rest.meet(before.rest)
         for j in self.constant:
             low[j], high[j] = met.lower[j], met.upper[j]
         return Ends(low, high)

@@ -308,5 +308,5 @@ class Bank:
 def build_core(design: SetMembershipDesign) -> Core:
     """Build the bank."""
     bank = Bank(design)
-    place = None if design.peak is None else bank.place
-    return Core(bank.run, bank.begin, place, bridges=True, advance=bank.advance)
+    place, domain = (None, None) if bank.inner is None else (bank.place, bank.inner.domain)
+    return Core(bank.run, bank.begin, place, domain, bridges=True, advance=bank.advance)

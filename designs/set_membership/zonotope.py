@@ -36,7 +36,7 @@ class Zonotope:
         """Return a box with its generators first and zeros up to a number of columns."""
         N = box.lower.numel()
         centre = 0.5 * box.lower + 0.5 * box.upper
-        radius = ca.fmax(box.upper - centre, centre - box.lower) * _UP + TINY
+        radius = ca.fmax(box.upper - centre, centre - box.lower) * _UP
         filling = ca.SX(N, columns - N)
         return cls(centre, ca.horzcat(ca.diag(radius), filling), ca.SX(N, 1))
 
@@ -48,7 +48,7 @@ class Zonotope:
     @property
     def hull(self) -> Ends:
         """The box around the set."""
-        reach = self.radius * _UP + STEP * ca.fabs(self.centre) + TINY
+        reach = self.radius * _UP + STEP * ca.fabs(self.centre)
         return Ends(self.centre - reach, self.centre + reach)
 
 
@@ -107,15 +107,15 @@ def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
 
     For any number lam: ``x_i <= c_i + lam b + sum_j |g_ij - lam a_j| + |lam| sigma``, which is
     least where some ``g_ij = lam a_j`` or lam is zero. All of these are tried where they are few,
-    ``lam = g_i a' / (a a' + sigma^2)`` in any case.
+    ``lam = g_i a' / (a a' + sigma^2)`` in any case. Where a strip and the set have a point in
+    common, neither |lam b| nor ``|lam| sum_j |a_j|`` is above ``sum_j |g_ij|`` and the reach.
     """
     hull = z.hull
     lower, upper = ca.SX(hull.lower), ca.SX(hull.upper)
-    sums = row_sums(z.generators)
+    rooms = 8.0 * STEP * (row_sums(z.generators) + ca.fabs(z.centre)) + z.slack * _UP + TINY
     for q in range(strips.H.shape[0]):
         a, sigma, b = strips.seen[q, :], strips.sigma[q], strips.innovation[q]
         size = ca.sum2(a * a) + sigma * sigma + TINY
-        whole = ca.sum2(ca.fabs(a)) + sigma + ca.fabs(b)
         for i in range(z.centre.numel()):
             g = z.generators[i, :]
             common = [j for _, j in zip(*(g * a).sparsity().get_triplet(), strict=True)]
@@ -127,9 +127,7 @@ def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
             for gain in gains:
                 lam = used[q] * gain
                 reach = ca.sum2(ca.fabs(g - lam * a)) + ca.fabs(lam) * sigma
-                room = sums[i] + ca.fabs(lam) * whole + ca.fabs(z.centre[i])
-                room = (g.nnz() + a.nnz() + 8) * STEP * room + z.slack[i] * _UP + TINY
-                reach, middle = reach * _UP + room, z.centre[i] + lam * b
+                reach, middle = reach * _UP + rooms[i], z.centre[i] + lam * b
                 lower[i] = ca.if_else(middle - reach > lower[i], middle - reach, lower[i])
                 upper[i] = ca.if_else(middle + reach < upper[i], middle + reach, upper[i])
     return Ends(lower, upper)
