@@ -14,7 +14,12 @@ from obsynth.designs.general.model import read_again as general_again
 from obsynth.designs.set_membership.model import SetMembershipModel, read
 from obsynth.designs.set_membership.record import SetMembershipDesign
 from obsynth.designs.set_membership.step import fault_delay, peak_widths, rates_of
-from obsynth.designs.set_membership.synthesis import closed_loop, off_identity, radius_bound
+from obsynth.designs.set_membership.synthesis import (
+    closed_loop,
+    declared,
+    off_identity,
+    radius_bound,
+)
 
 _RTOL = 1e-6
 
@@ -105,13 +110,14 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
     plant = design.plant
     names = ", ".join((*plant.names("x"), *plant.names("f")))
     late = " (faults those of the call before)" if fault_delay(design) else ""
-    box = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
-    half = 0.5 * np.diff(box, axis=1)[:, 0]
+    half = declared(plant)
     pairs = zip((*plant.names("x"), *plant.names("f")), design.predicted.tolist(), strict=True)
     listed = [
         f"{name} +-{width:.3g}" + (" (no more than is declared)" if width >= limit else "")
         for (name, width), limit in zip(pairs, half.tolist(), strict=True)
     ]
+    once = f", once the sets are narrower than {design.share:g} of the declared ranges"
+    begun = once if design.share < 1.0 else ""
     beyond = "beyond the half widths of the peak bounds, " if design.peak is not None else ""
     claims = [
         f"{names} lie inside the returned intervals{late}: the step evaluates the equations over "
@@ -119,8 +125,8 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
         "set holds every trajectory that the assumptions allow; no gain, linearisation or "
         "prediction enters this",
         f"predicted, {beyond}not promised: half widths of {', '.join(listed)} at the point of "
-        "operation, with readings in the middle of their noise; where the plant leaves it, or "
-        "inputs do not show what has to be seen, they may be wider",
+        f"operation{begun}, with readings in the middle of their noise; where the plant leaves "
+        "it, or inputs do not show what has to be seen, they may be wider",
     ]
     still = ", ".join(s.name for s in plant.p if s.constant)
     moving = (*plant.w, *plant.d, *(s for s in plant.p if not s.constant))

@@ -40,9 +40,13 @@ class Predicted:
 
 
 def predict(
-    model: SetMembershipModel, bank: Bank, held: FloatArray, calls: int = LONGEST
+    model: SetMembershipModel,
+    bank: Bank,
+    held: FloatArray,
+    share: float = 1.0,
+    calls: int = LONGEST,
 ) -> Predicted:
-    """Follow the half widths from the declared ranges until they stand still.
+    """Follow the half widths from a share of the declared ranges until they stand still.
 
     held: half widths that are guaranteed in any case, states then faults, infinite where none is
     """
@@ -51,7 +55,7 @@ def predict(
     declared = 0.5 * np.diff(model.box[: n + n_f], axis=1)[:, 0]
     declared = np.minimum(declared, held)
     limit = np.concatenate([declared[:n], declared[n:][model.followed]])
-    z = np.minimum(limit, 1e6 * model.half)
+    z = share * np.minimum(limit, 1e6 * model.half)
     found = [_filled(np.diag(z), bank.columns) for _ in range(1 + bank.zonotopes)]
     beside, late = model.beside.copy(), declared[n:].copy()
     guessed = _guessed(model)

@@ -30,6 +30,7 @@ class SetMembershipDesign(Record):
     zonotopes, restart: how many zonotopes begin anew every so many calls
     contraction: bound of the spectral radius of ``|V^-1 ((I - L C) A)^kept V|``
     predicted: half widths at the point of operation, states then faults
+    share: of the declared ranges that the prediction begins from
     settles: calls that they take to stand still, from the declared ranges
     peak: an observer of the general class with peak bounds, whose sets are met with the others
     """
@@ -49,6 +50,7 @@ class SetMembershipDesign(Record):
     restart: int
     contraction: float
     predicted: Annotated[FloatArray, "n+n_f"]
+    share: float
     settles: int
     peak: GeneralDesign | None
     options: Mapping[str, Any]

@@ -16,9 +16,10 @@ from obsynth.derive.rigour import Enclosure, product_up
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.general.record import GeneralDesign
 from obsynth.designs.set_membership.model import Around, SetMembershipModel
-from obsynth.designs.set_membership.prediction import Bank, Predicted, predict
+from obsynth.designs.set_membership.prediction import LONGEST, Bank, Predicted, predict
 from obsynth.designs.set_membership.record import MOST_COLUMNS, SetMembershipDesign
 from obsynth.designs.set_membership.zonotope import Frame
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
@@ -29,6 +30,8 @@ KEPT = (1, 2, 3, 5, 8, 12)
 """Calls for which generators are kept, as tried."""
 COMPARED = 8
 """Of these, with which gains are compared."""
+NARROW = 0.1
+"""Share of the ranges that predictions begin from where these themselves say nothing."""
 WORTH = 1.1
 """What a bank may predict, relative to the best, to be taken as it is smaller."""
 CUT = 1.5
@@ -199,9 +202,7 @@ class Wishes:
 
     def mean(self, model: SetMembershipModel, found: Predicted) -> float:
         """Return the weighted mean of half widths over half ranges."""
-        plant = model.plant
-        boxes = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
-        half = 0.5 * np.diff(boxes, axis=1)[:, 0]
+        half = declared(model.plant)
         unit = np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
         return float(self.weights @ (found.widths / unit)) / float(self.weights.sum())
 
@@ -222,6 +223,7 @@ class Tried:
     """A gain with a bank, what it predicts, and the weighted mean of that.
 
     size: of the step, relative to others of the same plant
+    share: of the declared ranges that the prediction begins from
     """
 
     gain: Gain
@@ -229,6 +231,7 @@ class Tried:
     found: Predicted
     mean: float
     size: float
+    share: float
 
 
 def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list[Tried]:
@@ -238,21 +241,33 @@ def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list
     """
     most = wishes.kept(model)
 
-    def tried(gain: Gain, kept: int, zonotopes: int) -> Tried:
+    def tried(gain: Gain, kept: int, zonotopes: int, share: float) -> Tried:
         restart = max(kept, SHORTEST, zonotopes) if wishes.restart is None else wishes.restart
         W, columns = inverse(gain.V), kept * model.group
         bank = Bank(gain.L, gain.V, W, columns, zonotopes, restart)
-        found = predict(model, bank, wishes.held)
+        found = predict(model, bank, wishes.held, share)
+        if share < 1.0:  # how long the sets take to become as narrow is not known
+            found = replace(found, calls=max(found.calls, LONGEST))
         size = kept * (1.0 + CUT * zonotopes)
-        return Tried(gain, bank, found, wishes.mean(model, found), size)
+        return Tried(gain, bank, found, wishes.mean(model, found), size, share)
 
     counts = (0, 1) if wishes.zonotopes is None else (wishes.zonotopes,)
-    compared = [tried(gain, min(COMPARED, most), counts[-1]) for gain in gains]
-    gain = min(compared, key=lambda one: one.mean).gain
+    # over ranges that are wide the equations may say nothing, whatever the gain is
+    for share in (1.0, NARROW):
+        compared = [tried(gain, min(COMPARED, most), counts[-1], share) for gain in gains]
+        best = min(compared, key=lambda one: one.mean)
+        if np.all((best.found.widths < declared(model.plant))[: len(model.plant.x)]):
+            break
     lengths = [most] if wishes.columns is not None else [kept for kept in KEPT if kept <= most]
-    banks = [tried(gain, kept, count) for kept in lengths for count in counts]
+    banks = [tried(best.gain, kept, count, share) for kept in lengths for count in counts]
     enough = WORTH * min(one.mean for one in banks)
     return sorted(banks, key=lambda one: (max(one.mean, enough), one.size))
+
+
+def declared(plant: Plant) -> FloatArray:
+    """Return half the declared ranges, states then faults, (n + n_f,)."""
+    box = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
+    return np.asarray(0.5 * np.diff(box, axis=1)[:, 0])
 
 
 def inverse(V: FloatArray) -> FloatArray:
@@ -322,6 +337,7 @@ def complete(
         restart=bank.restart,
         contraction=0.0,
         predicted=chosen.found.widths,
+        share=chosen.share,
         settles=chosen.found.calls,
         peak=peak,
         options=options,
@@ -333,8 +349,7 @@ def complete(
 def refuse_wide(model: SetMembershipModel, found: Predicted) -> None:
     """Refuse a plant of which nothing more is told than its declared ranges."""
     plant = model.plant
-    box = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
-    if np.any(found.widths < 0.5 * np.diff(box, axis=1)[:, 0]):
+    if np.any(found.widths < declared(plant)):
         return
     names = ", ".join((*plant.names("x"), *plant.names("f")))
     raise InfeasibleDesign(
