@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -116,29 +117,22 @@ def hidden_somewhere(extended: Extended) -> str | None:
 
     Looked for at lower ends, upper ends and nominal values or middles; None where none is found.
     """
-    plant = extended.plant
-    sx, signals = plant.sx(), (*plant.x, *plant.u, *plant.w)
-    v, known = ca.vertcat(sx.x, sx.w), ca.vertcat(sx.x, sx.u, sx.w)
-    J = ca.densify(ca.jacobian(ca.vertcat(sx.rhs, sx.y), v))
-    matters = np.array(ca.which_depends(ca.vec(J), known, 1, False), dtype=bool)
-    matters &= [s.bounded for s in signals]
-    ends = [(0.0,) * 3 if not s.bounded else (_middle(s), s.lower, s.upper) for s in signals]
-    free = np.flatnonzero(matters)
-    picks = np.indices((3,) * min(len(free), MOST_FREE)).reshape(min(len(free), MOST_FREE), -1)
-    function = ca.Function("J", [known], [J])
-    for pick in picks.T:
-        point = np.array([end[0] for end in ends])
-        for place, k in zip(free, pick, strict=False):
-            point[place] = ends[place][k]
-        found = np.array(function(point))
+    plant, sx = extended.plant, extended.plant.sx()
+    signals, v = (*plant.x, *plant.u, *plant.w), ca.vertcat(sx.x, sx.u, sx.w)
+    J = ca.densify(ca.jacobian(ca.vertcat(sx.rhs, sx.y), ca.vertcat(sx.x, sx.w)))
+    function, matters = ca.Function("J", [v], [J]), ca.which_depends(ca.vec(J), v, 1, False)
+    ends = [(_middle(s), s.lower, s.upper) if s.bounded else (0.0,) * 3 for s in signals]
+    free = [k for k, s in enumerate(signals) if s.bounded and matters[k]]
+    for pick in product(range(3), repeat=min(len(free), MOST_FREE)):
+        at = {k: ends[k][place] for k, place in zip(free, pick, strict=False)}
+        found = np.array(function([at.get(k, end[0]) for k, end in enumerate(ends)]))
         lost = _hidden(*_pair(extended, found)[:2]) if np.isfinite(found).all() else None
         if lost is not None:
-            value, vector = lost
-            names = [n for n, size in zip(plant.names("x"), vector, strict=True) if size > 1e-6]
-            at = ", ".join(f"{signals[k].name} = {point[k]:g}" for k in free)
+            names = [n for n, size in zip(plant.names("x"), lost[1], strict=True) if size > 1e-6]
+            where = ", ".join(f"{signals[k].name} = {value:g}" for k, value in at.items())
             return (
-                f"where {at}, the error of {', '.join(names)} does not decay (a mode "
-                f"{abs(value):.6g}) and no output shows it ({', '.join(plant.output_names)}): no "
+                f"where {where}, the error of {', '.join(names)} does not decay (a mode "
+                f"{abs(lost[0]):.6g}) and no output shows it ({', '.join(plant.output_names)}): no "
                 f"gain serves there; measure {names[0]}, or narrow a range that this point is in"
             )
     return None

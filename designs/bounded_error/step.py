@@ -11,7 +11,7 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.running import SETTLED, UP, Running, settle
+from obsynth.designs.core.running import SETTLED, UP, Running, all_around, settle
 from obsynth.designs.core.stepping import clip, inside, select
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -200,7 +200,7 @@ def build_core(design: UioDesign) -> Core:
         z, fhat, s, prediction = (seen.memory[part] for part in memory_sizes(design))
         y = seen.readings(C @ prediction + offset) - offset
         xhat, innovation, next_state, z_next, fhat_next = move(z, fhat, seen.u, y)
-        half, moved = bound.around(s, ca.vertcat(xhat, fhat))
+        half, moved = all_around([bound], s, ca.vertcat(xhat, fhat))
         x = Ends(xhat - half[:n], xhat + half[:n])
         f = Ends(fhat - half[n:], fhat + half[n:])
         allowed = ca.fabs(C) @ half[:n] + noise

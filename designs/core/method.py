@@ -122,10 +122,10 @@ class Contract(Generic[D]):
         performance = dict(numbers.performance)
         if numbers.half_widths is not None:
             performance["core_half_widths"] = numbers.half_widths
-        searched = numbers.searched
-        if guard.delay and guard.discrete:
-            performance["predicted_half_widths"] = guard.widths(numbers.half_widths, nominal=True)
-            searched = (*searched, "predicted_half_widths")
+        told, searched = "predicted_half_widths", numbers.searched
+        if guard.delay and guard.discrete and told not in performance:
+            performance[told] = guard.widths(numbers.half_widths, nominal=True)
+            searched = (*searched, told)
         ode = None if self.ode is None else self.ode(design)
         return Observer(
             method=self.name,

@@ -126,11 +126,9 @@ class Observer:
             name: f"+-{width:.4g}" + (", no more than is declared" if name in self.vacuous else "")
             for name, width in zip(names, self.half_widths, strict=True)
         }
-        nominal = self.performance.get("predicted_half_widths")
-        rows = () if nominal is None else zip(names, self.half_widths, nominal, strict=True)
-        for name, width, near in rows:
-            if near < 0.99 * width:
-                found[name] += f" (predicted at the nominal point: +-{near:.4g})"
+        near: Any = self.performance.get("predicted_half_widths")
+        for k in () if near is None else np.flatnonzero(near < 0.99 * self.half_widths).tolist():
+            found[names[k]] += f" (predicted at the nominal point: +-{near[k]:.4g})"
         return found
 
     @property

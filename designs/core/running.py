@@ -6,6 +6,7 @@ from an s that it maps below itself nothing that follows exceeds what that s say
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -56,26 +57,17 @@ class Running:
         """Whether s is mapped below itself, however that is rounded; underflow does not count."""
         return bool(np.all((self.decay @ s + self.offset) * UP <= s + UNDERFLOW))
 
-    def around(self, s: ca.SX, estimate: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return half widths around an estimate, and the next s."""
-        reach, decay = (ca.sparsify(ca.DM(part)) for part in (self.reach, self.decay))
-        inner = reach @ s
-        half = (ca.sqrt(inner) if self.root else inner) * ROUND_UP + ca.DM(self.add)
-        moved = decay @ s
-        if self.offset.any():
-            moved = moved + ca.DM(self.offset)
-        return half + ULPS * ca.fabs(estimate), moved
-
 
 def all_around(bounds: Sequence[Running], s: ca.SX, estimate: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the smallest half widths of bounds that all hold, and their next s, stacked."""
     ends = np.cumsum([0, *(len(bound.offset) for bound in bounds)]).tolist()
-    pairs = zip(bounds, ca.vertsplit(s, ends), strict=True)
-    halves, moved = zip(*(bound.around(part, estimate) for bound, part in pairs), strict=True)
-    half = halves[0]
-    for other in halves[1:]:
-        half = ca.fmin(half, other)
-    return half, ca.vertcat(*moved)
+    halves, moved = [], []
+    for bound, part in zip(bounds, ca.vertsplit(s, ends), strict=True):
+        reach, decay = (ca.sparsify(ca.DM(matrix)) for matrix in (bound.reach, bound.decay))
+        inner = reach @ part
+        halves.append((ca.sqrt(inner) if bound.root else inner) * ROUND_UP + ca.DM(bound.add))
+        moved.append(decay @ part + ca.DM(bound.offset) if bound.offset.any() else decay @ part)
+    return reduce(ca.fmin, halves) + ULPS * ca.fabs(estimate), ca.vertcat(*moved)
 
 
 def all_steady(bounds: Sequence[Running]) -> FloatArray:

@@ -159,3 +159,8 @@ def test_a_prediction_at_the_nominal_point_stands_beside_what_is_promised():
     assert observer.widths["f"].endswith(f"(predicted at the nominal point: +-{told[1]:.4g})")
     assert "predicted" not in observer.widths["x"]
     assert "predicted_half_widths" in observer.searched
+    # a method that predicts for itself knows better
+    other = ob.SetMembershipObserver().design(given)
+    assert other.fault_delay == 1
+    own = other.certificate.design.predicted
+    assert other.performance["predicted_half_widths"].tolist() == own.tolist()
