@@ -39,6 +39,7 @@ GALLERY = {
     "heat_exchanger": plants.heat_exchanger,
     "kinematic_bicycle": plants.kinematic_bicycle,
     "klatt_engell_reactor": plants.klatt_engell_reactor,
+    "leaking_tanks": plants.leaking_tanks,
     "pvtol": plants.pvtol,
     "surface_pmsm": plants.surface_pmsm,
     "tanks_in_a_row": plants.tanks_in_a_row,
