@@ -8,6 +8,7 @@ import sympy as sp
 from exactly import FAULT_OPEN, LEFT_OUT, RECOVERING, VOID, Exactly, follow
 
 import obsynth as ob
+from obsynth.codegen import find_compiler
 
 R = sp.Rational
 
@@ -200,3 +201,12 @@ def test_a_zonotope_begins_anew_from_what_is_left():
     reach = np.abs(own[1].reshape(-1, len(own[0]))).sum(axis=0)
     left = 0.5 * np.concatenate([high - low, above - below])
     assert reach == pytest.approx(left, rel=1e-9)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("exactly", [tank, learnt])
+def test_c_is_equal_to_the_last_bit(exactly, tmp_path):
+    """Another plant stands in the contract's tests, the whole gallery in the long ones."""
+    method = ob.SetMembershipObserver(gain=1.0, zonotopes=0, columns=8)
+    project = ob.generate_c(method.design(exactly().plant), tmp_path / "project", vectors=100)
+    assert project.comparison.vectors == 100
