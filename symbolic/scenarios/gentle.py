@@ -25,7 +25,7 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
     Returns
     -------
     Scenario
-        Waves of inputs and faults, unknown inputs of zero, disturbances uniform in their box.
+        Waves of inputs and faults, unknown inputs in the middle of their ranges or zero, disturbances uniform in their box.
 
     Raises
     ------
@@ -64,6 +64,7 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
         guess=x_middle,
         inputs=u_middle + u_half * np.sin(3.0 * speed * k + u_phase),
         faults=f_middle + f_half * np.sin(speed * k + f_phase),
+        unknown_inputs=_about(plant, "d", share)[0] + 0.0 * k if plant.d else None,
         x_range=None,
         disturbances=lambda rng, k: rng.uniform(w_low, w_high),
         f_range=_first_faults(plant, f_middle, f_half),
