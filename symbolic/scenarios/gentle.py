@@ -25,7 +25,8 @@ def gentle(plant: Plant, steps: int = 200, seed: int = 0, share: float = 0.05) -
     Returns
     -------
     Scenario
-        Waves of inputs and faults, unknown inputs in the middle of their ranges or zero, disturbances uniform in their box.
+        Waves of inputs and faults, unknown inputs in the middle of their ranges or zero,
+        disturbances uniform in their box.
 
     Raises
     ------
