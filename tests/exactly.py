@@ -98,10 +98,11 @@ def follow(exactly, observer, rng, calls, start, edges=False, gaps=0.0, broken=(
             shares = [mp.mpf(int(s > 0.5)) for s in shares]
         x = [low + (high - low) * s for s, (low, high) in zip(shares, ends, strict=True)]
         f = exactly.drawn(rng, plant.f, edges) if n_f else []
-        f = [v if rate is None else mp.mpf(0) for v, rate in zip(f, exactly.rates, strict=True)]
+        # a rate that is not zero begins at zero, known; others anywhere in their range
+        f = [mp.mpf(0) if rate else v for v, rate in zip(f, exactly.rates, strict=True)]
         p = exactly.drawn(rng, plant.p, edges)
         f_range = [
-            (0.0, 0.0) if rate is not None else (s.lower, s.upper)
+            (0.0, 0.0) if rate else (s.lower, s.upper)
             for s, rate in zip(plant.f, exactly.rates, strict=True)
         ]
         memory = observer.memory0(

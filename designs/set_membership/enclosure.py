@@ -158,4 +158,4 @@ def told_by_rate(contractor: Contractor) -> IntArray:
     """Return the places of faults with a rate that says more than their range."""
     box = contractor.plant.box("f").reshape(-1, 2)
     rates = contractor.rates
-    return np.flatnonzero((rates < box[:, 1] - box[:, 0]) & np.isfinite(rates))
+    return np.flatnonzero(rates < box[:, 1] - box[:, 0])

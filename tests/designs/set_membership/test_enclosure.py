@@ -83,6 +83,8 @@ def test_equations_lie_in_their_enclosures(size):
             exact(np.array(ca.DM(v)).ravel()) for v in middle_of(*map(ca.DM, ends[:, own]))
         )
         assert (middles - radii <= low[own]).all() and (middles + radii >= high[own]).all()
+        slack = np.abs(ends[:, own]).max() * Q(1e-11)
+        assert (2 * radii <= high[own] - low[own] + slack).all()
         for _ in range(40):
             v = np.where(rng.random(n_v) < 0.5, low, high)
             z, xi = v[[0, 1, 3]], (v[own] - middles) / np.where(radii > 0, radii, Q(1))
