@@ -107,6 +107,10 @@ def vessel_moving() -> ob.Scenario:
     )
 
 
+def oscillator() -> ob.Plant:
+    return ob.plants.forced_oscillator().discretise("euler", Ts=sp.Rational(1, 100))
+
+
 def motor() -> ob.Plant:
     """A motor outside of the papers' class.
 
@@ -215,8 +219,8 @@ METHODS = {
     ),
     "set_membership": Entry(
         ob.SetMembershipObserver(),
-        motor,
-        motor_turning,
+        oscillator,
+        lambda: ob.scenarios.gentle(oscillator(), steps=150),
         outside=ob.plants.quadruple_tank,
         spoilt=(("size", 1, 1), 0.5, "frame"),
         option={"columns": 0},
