@@ -47,6 +47,7 @@ def study(quick, tmp_path_factory):
     return found
 
 
+@pytest.mark.long
 def test_the_study_leaves_a_complete_folder(study):
     folder = study.folder
     present = {path.name for path in folder.iterdir()}
@@ -62,6 +63,7 @@ def test_the_study_leaves_a_complete_folder(study):
         assert ob.load(folder / name).certificate.valid
 
 
+@pytest.mark.long
 def test_tables_and_page_say_what_the_paper_prints_and_what_holds(study):
     text = "\n".join(str(table) for table in study.tables())
     page = (study.folder / "report.html").read_text(encoding="utf-8")
@@ -98,6 +100,7 @@ def test_bounds_that_are_too_narrow_are_told_from_rounded_ones(tank_bounds):
     assert [row[1] for row in vertices.rows] == [64, 16]
 
 
+@pytest.mark.long
 def test_highlights_come_from_the_results(study):
     shown = study.highlights()
     assert shown["vertices in place of 64"] == "16"

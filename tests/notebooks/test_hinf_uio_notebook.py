@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 QUESTION = """{
     "levels": {
         f"{form}, {name}": design.performance["least_mu"]

@@ -2,6 +2,8 @@
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 QUESTION = """
 {
     "radius": refusal.radius,

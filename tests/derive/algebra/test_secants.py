@@ -53,7 +53,14 @@ FUNCTIONS = [
 ]
 
 
-@pytest.mark.parametrize("function", FUNCTIONS, ids=str)
+SLOW = (sp.acosh(z + x + 3), sp.atanh(z / 9 + x / 30))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [pytest.param(f, marks=pytest.mark.long if f in SLOW else ()) for f in FUNCTIONS],
+    ids=str,
+)
 def test_a_secant_times_its_variable_is_the_difference(function):
     slope = secant(function, z)
     assert slope is not None

@@ -122,7 +122,7 @@ def test_never_exceeded_from_thousands_of_points(name, method):
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
-@pytest.mark.parametrize("name", ["van der Pol", "CSTR"])
+@pytest.mark.parametrize("name", ["van der Pol", pytest.param("CSTR", marks=pytest.mark.long)])
 def test_attained_values_are_what_integration_finds(name, method):
     found = certified(name, method)
     errors, noise = local_errors(found, 3000, seed=1)

@@ -117,13 +117,16 @@ def test_a_measured_leak_is_followed(scale, half, voids):
     assert set(void) == ({84, 99, 183} if voids else set())
 
 
-def test_four_tanks_are_known_better_than_any_bound_in_advance_says():
+@pytest.mark.parametrize(
+    ("scenario", "most"),
+    [("FS1", 1.87), pytest.param("FS2", 1.93, marks=pytest.mark.long)],
+)
+def test_four_tanks_are_known_better_than_any_bound_in_advance_says(scenario, most):
     """Summed half widths: 2.415 for the prototype, 3.274 guaranteed by the paper's peak bounds."""
     plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
     observer = ob.SetMembershipObserver().design(plant)
     assert observer.half_widths.sum() <= 2.95
-    for scenario, most in (("FS1", 1.87), ("FS2", 1.93)):
-        run = ob.simulate(plant, observer, ob.scenarios.quadruple_tank(scenario))
-        assert min(run.coverage.values()) == 1.0
-        half = 0.5 * np.hstack([run.x_upper - run.x_lower, run.f_upper - run.f_lower])
-        assert half[1500:].sum(axis=1).mean() <= most
+    run = ob.simulate(plant, observer, ob.scenarios.quadruple_tank(scenario))
+    assert min(run.coverage.values()) == 1.0
+    half = 0.5 * np.hstack([run.x_upper - run.x_lower, run.f_upper - run.f_lower])
+    assert half[1500:].sum(axis=1).mean() <= most
