@@ -65,8 +65,8 @@ class SetMembershipObserver(Method):
     Parameters
     ----------
     columns : int, optional
-        The most generators of a zonotope; by default as few as predict widths within 10 % of the
-        narrowest. Fewer make a smaller step and wider sets.
+        The most generators of a zonotope; by default as many as pay in the predicted widths for
+        the operations that they take. Fewer make a smaller step and wider sets.
     zonotopes : int, optional
         How many zonotopes begin anew from the box of states and faults, uncorrected but cut,
         beside the one that the gain corrects; by default none or one, chosen alike.
@@ -195,7 +195,8 @@ class SetMembershipObserver(Method):
     ) -> SetMembershipDesign:
         size = len(model.plant.x) + len(model.plant.f)
         held = np.full(size, np.inf) if peak is None else general.steady(peak)
-        wishes = Wishes(self.columns, self.zonotopes, self.restart, self._weights(model), held)
+        weights, fitting = self._weights(model), self.operations is not None
+        wishes = Wishes(self.columns, self.zonotopes, self.restart, weights, held, fitting)
         counts = []
         for chosen in choose(model, gains, wishes):
             if refuse:

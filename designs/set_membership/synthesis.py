@@ -32,8 +32,8 @@ COMPARED = 8
 """Of these, with which gains are compared."""
 NARROW = 0.1
 """Share of the ranges that predictions begin from where these themselves say nothing."""
-WORTH = 1.1
-"""What a bank may predict, relative to the best, to be taken as it is smaller."""
+LARGE = 8000
+"""Size of a bank, about a ninth of its operations, that has to halve the predicted mean to pay."""
 CUT = 1.5
 """Operations of a zonotope that is cut, relative to those of the one that is corrected."""
 SHORTEST = 4
@@ -192,6 +192,7 @@ class Wishes:
     columns: the most that a zonotope may have
     weights: of states and faults in the mean of half widths, in units of half their ranges
     held: half widths that are guaranteed whatever the bank is, infinite where none is
+    fitting: whether a number of operations has to be kept to
     """
 
     columns: int | None
@@ -199,6 +200,7 @@ class Wishes:
     restart: int | None
     weights: FloatArray
     held: FloatArray
+    fitting: bool
 
     def mean(self, model: SetMembershipModel, found: Predicted) -> float:
         """Return the weighted mean of half widths over half ranges."""
@@ -237,7 +239,8 @@ class Tried:
 def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list[Tried]:
     """Return banks around the gain of the least predicted mean, the one to be preferred first.
 
-    These are the smallest of those that predict nearly the least mean; the others follow by it.
+    A larger bank is preferred where what it predicts pays for its size, and the narrowest where
+    there is a number of operations to keep to.
     """
     most = wishes.kept(model)
 
@@ -248,7 +251,7 @@ def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list
         found = predict(model, bank, wishes.held, share)
         if share < 1.0:  # how long the sets take to become as narrow is not known
             found = replace(found, calls=max(found.calls, LONGEST))
-        size = kept * (1.0 + CUT * zonotopes)
+        size = columns * (1.0 + CUT * zonotopes) * len(gain.V) * (len(gain.C) + 6)
         return Tried(gain, bank, found, wishes.mean(model, found), size, share)
 
     counts = (0, 1) if wishes.zonotopes is None else (wishes.zonotopes,)
@@ -260,8 +263,9 @@ def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list
             break
     lengths = [most] if wishes.columns is not None else [kept for kept in KEPT if kept <= most]
     banks = [tried(best.gain, kept, count, share) for kept in lengths for count in counts]
-    enough = WORTH * min(one.mean for one in banks)
-    return sorted(banks, key=lambda one: (max(one.mean, enough), one.size))
+    if wishes.fitting:
+        return sorted(banks, key=lambda one: one.mean)
+    return sorted(banks, key=lambda one: one.mean * (1.0 + one.size / LARGE))
 
 
 def declared(plant: Plant) -> FloatArray:
