@@ -477,6 +477,7 @@ def test_equations_outside_the_class_are_no_certificate(designs):
     assert "y = C x + W2 w" in certificate["derivation"].proof
 
 
+@pytest.mark.long
 def test_searched_gains(example, designs, two_faults):
     searched = ob.IntervalObserver(gains="search").design(example)
     # nothing is better than P = I on the example

@@ -274,6 +274,7 @@ def test_a_form_serves_as_well_as_a_plant():
         small().design(ob.qpv(varying(process=False)))
 
 
+@pytest.mark.long
 def test_outputs_that_vary_off_the_diagonal():
     """Expressions round differently on either side of the diagonal, which is no asymmetry.
 

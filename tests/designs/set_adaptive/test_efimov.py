@@ -223,6 +223,7 @@ def test_delays_of_the_first_fault(together, printed, numbers):
     assert found["s2"] is None
 
 
+@pytest.mark.long
 def test_the_printed_delays_cannot_be_reached(tanks, integrate, printed, paper_gain, numbers):
     cases = numbers["gold_noisefree"]
     for Gamma in (0.003, 0.03):
