@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gallery import TIMES
 
 import obsynth as ob
 from obsynth.evaluate.choosing.choice import Choice
@@ -235,27 +236,11 @@ def test_a_bug_in_one_method_is_told_and_the_others_go_on(monkeypatch):
     assert found.tries[0].reason == "ZeroDivisionError: float division"
 
 
-GALLERY = {
-    "cruise_control": 0.1,
-    "pvtol": 0.02,
-    "cart_pole": 0.01,
-    "flexible_joint": 0.01,
-    "dc_motor": 0.01,
-    "battery": 1.0,
-    "kinematic_bicycle": 0.05,
-    "heat_exchanger": 0.2,
-    "surface_pmsm": 1e-4,
-    "klatt_engell_reactor": 0.001,
-    "forced_oscillator": 0.01,
-    "tanks_in_a_row": 0.5,
-}
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("name", GALLERY)
+@pytest.mark.parametrize("name", TIMES)
 def test_the_gallery_has_a_table_in_under_five_minutes(name):
     start = time.perf_counter()
-    found = ob.choose(getattr(ob.plants, name)(), Ts=GALLERY[name])
+    found = ob.choose(getattr(ob.plants, name)(), Ts=TIMES[name])
     assert time.perf_counter() - start < 300
     made = found.made
     assert made and all(one.missed == 0.0 and not one.run.domain.voids for one in made)

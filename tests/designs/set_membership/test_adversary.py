@@ -3,24 +3,11 @@
 import casadi as ca
 import numpy as np
 import pytest
+from gallery import TIMES
 
 import obsynth as ob
 from obsynth.codegen import find_compiler
 
-TIMES = {
-    "cruise_control": 0.1,
-    "pvtol": 0.02,
-    "cart_pole": 0.01,
-    "flexible_joint": 0.01,
-    "dc_motor": 0.01,
-    "battery": 1.0,
-    "kinematic_bicycle": 0.05,
-    "heat_exchanger": 0.2,
-    "surface_pmsm": 1e-4,
-    "klatt_engell_reactor": 0.001,
-    "forced_oscillator": 0.01,
-    "tanks_in_a_row": 0.5,
-}
 KINDS = ("uniform", "bang-bang", "held", "seeking")
 WITHIN = 1.0 - 1e-9
 """Of ranges and rates: at the very ends a simulated reading rounds out of them."""
