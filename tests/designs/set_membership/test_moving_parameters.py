@@ -1,4 +1,4 @@
-"""A parameter that is declared to move is not held to what it was."""
+"""Parameters: held to what they were only if they stand still, and contradicted by readings."""
 
 import numpy as np
 import pytest
@@ -29,3 +29,19 @@ def test_only_constant_parameters_are_remembered(constant):
         assert constant or float(low) <= truth <= float(high)
         truth = 0.5 * truth + (1.5 if k // 7 % 2 else 0.5)
     assert bool(np.array(seen).any()) == constant
+
+
+def test_a_reading_that_contradicts_a_parameter_alone_is_void():
+    """Mutant: what readings say of anything but states and faults does not count as empty."""
+    plant = ob.Plant("drifting gauge")
+    (x,) = plant.states("x", range=(-1, 1))
+    (p,) = plant.params("p", range=(1, 2))
+    w, v, n = plant.disturbances("w v n", bound=[0.01, 0.01, 0.1])
+    plant.dynamics([x / 2 + w], Ts=1)
+    plant.outputs([x + v, p + n])
+    observer = ob.SetMembershipObserver().design(plant)
+    memory, words = observer.memory0([0.0]), []
+    for y in ([0.0, 1.5], [0.0, 1.5], [0.0, 5.0], [0.0, 1.5]):
+        memory, *_, status = observer.step(memory, [], y)
+        words.append(int(status) & 8)
+    assert words == [0, 0, 8, 0]
