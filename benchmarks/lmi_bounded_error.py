@@ -14,18 +14,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.lmi import (
-    Problem,
-    full,
-    he,
-    prove_family,
-    relax_sum,
-    scalar,
-    split_common,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.designs.lmi.expression import full, scalar, symmetric, trace
+from obsynth.designs.lmi.problem import Problem, he, symmetric_block
+from obsynth.designs.lmi.proof import prove_family
+from obsynth.designs.lmi.reductions import split_common
+from obsynth.designs.lmi.relaxation import relax_sum
 
 __all__ = ["ROWS"]
 

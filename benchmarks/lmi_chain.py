@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import Enclosure, prove_positive_definite
-from obsynth.designs.lmi import (
-    Problem,
+from obsynth.designs.lmi.expression import full, symmetric
+from obsynth.designs.lmi.margin import solve_with_margin
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.designs.lmi.proof import prove_family
+from obsynth.designs.lmi.reductions import split_common
+from obsynth.designs.lmi.relaxation import (
     RowMultipliers,
     UncertainRow,
     corner_block,
-    full,
-    prove_family,
     row_multipliers,
-    solve_with_margin,
-    split_common,
-    symmetric,
-    symmetric_block,
 )
 
 __all__ = ["WAYS", "run"]

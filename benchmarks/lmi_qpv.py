@@ -14,18 +14,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.lmi import (
-    Problem,
-    extreme_points,
-    full,
-    he,
-    prove_family,
-    scalar,
-    solve_with_margin,
-    split_common,
-    symmetric,
-    symmetric_block,
-)
+from obsynth.designs.lmi.expression import full, scalar, symmetric
+from obsynth.designs.lmi.margin import solve_with_margin
+from obsynth.designs.lmi.problem import Problem, he, symmetric_block
+from obsynth.designs.lmi.proof import prove_family
+from obsynth.designs.lmi.reductions import extreme_points, split_common
 
 __all__ = ["ROWS"]
 

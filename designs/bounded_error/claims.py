@@ -23,7 +23,7 @@ from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.lmi import symmetric_block
+from obsynth.designs.lmi.problem import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"

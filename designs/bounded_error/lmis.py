@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.lmi import block, he, symmetric_block
+from obsynth.designs.lmi.problem import block, he, symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 ErrorKind = Literal["plain", "shifted"]

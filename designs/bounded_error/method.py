@@ -42,7 +42,7 @@ from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.lmi import Problem
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

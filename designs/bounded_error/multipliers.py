@@ -19,7 +19,9 @@ from obsynth.designs.bounded_error.synthesis import (
     set_objective,
 )
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.lmi import Affine, Problem, diagonal, full, scalar, solve_reliably, symmetric
+from obsynth.designs.lmi.expression import Affine, diagonal, full, scalar, symmetric
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.solve import solve_reliably
 from obsynth.symbolic.arrays import FloatArray
 
 MOST_ENTRIES = 12

@@ -8,21 +8,11 @@ import numpy as np
 
 from obsynth.designs.bounded_error.lmis import ErrorSystem, direct_block, fixed_gain_block
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.lmi import (
-    Affine,
-    Margin,
-    Problem,
-    bisect_feasible,
-    diagonal,
-    full,
-    largest_margin,
-    search_line,
-    search_log_convex,
-    solve_reliably,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.designs.lmi.expression import Affine, diagonal, full, symmetric, trace
+from obsynth.designs.lmi.margin import Margin, largest_margin
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.designs.lmi.search import bisect_feasible, search_line, search_log_convex
+from obsynth.designs.lmi.solve import solve_reliably
 from obsynth.symbolic.arrays import FloatArray
 
 Objective = Literal["trace_inverse", "log_det", "lambda_min", "trace"]

@@ -13,7 +13,7 @@ from obsynth.designs.general.lmis import Loop, closed_rows, error_loop, storage_
 from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign
 from obsynth.designs.general.synthesis import Found
 from obsynth.designs.general.system import error_system
-from obsynth.designs.lmi import symmetric_block
+from obsynth.designs.lmi.problem import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 RUMP = "floating-point Cholesky after Rump, formation of the block enclosed"

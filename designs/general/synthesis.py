@@ -16,17 +16,10 @@ from obsynth.designs.general.lmis import Loop, error_loop, storage_block
 from obsynth.designs.general.peak import spectral_radius
 from obsynth.designs.general.record import GeneralDesign
 from obsynth.designs.general.system import error_system
-from obsynth.designs.lmi import (
-    Affine,
-    Problem,
-    diagonal,
-    full,
-    scalar,
-    solve_with_retries,
-    symmetric,
-    trace,
-)
 from obsynth.designs.lmi.conic import Solution
+from obsynth.designs.lmi.expression import Affine, diagonal, full, scalar, symmetric, trace
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.solve import solve_with_retries
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
 # Room between the solver's answer and the boundary, relative to blocks scaled to about one.

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.designs.hinf.sector import Sector
 from obsynth.designs.hinf.system import Arithmetic, Filter, FilterData, lift
-from obsynth.designs.lmi import symmetric_block
+from obsynth.designs.lmi.problem import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 

@@ -39,7 +39,7 @@ from obsynth.designs.hinf.synthesis import (
     unstable_vertex,
 )
 from obsynth.designs.hinf.system import Filter
-from obsynth.designs.lmi import Problem
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
 

@@ -23,18 +23,12 @@ from obsynth.designs.hinf.lmis import (
     printed_bound,
 )
 from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units
-from obsynth.designs.lmi import (
-    Margin,
-    Problem,
-    Solution,
-    bisect_feasible,
-    full,
-    largest_margin,
-    scalar,
-    solve_reliably,
-    symmetric,
-    trace,
-)
+from obsynth.designs.lmi.conic import Solution
+from obsynth.designs.lmi.expression import full, scalar, symmetric, trace
+from obsynth.designs.lmi.margin import Margin, largest_margin
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.search import bisect_feasible
+from obsynth.designs.lmi.solve import solve_reliably
 from obsynth.symbolic.arrays import FloatArray
 
 Structure = Literal["standard", "general", "printed"]

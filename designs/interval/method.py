@@ -39,7 +39,7 @@ from obsynth.designs.interval.synthesis import (
     sylvester_design,
     with_gains,
 )
-from obsynth.designs.lmi import Problem
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -282,7 +282,7 @@ class IntervalObserver(Method):
 
         See Also
         --------
-        obsynth.designs.lmi.Problem.to_cvxpy
+        obsynth.designs.lmi.problem.Problem.to_cvxpy
         """
         data = self._start(self._checked(model_or_form)).reduced
         P = np.eye(data.A.shape[1]) if isinstance(self.gains, str) else np.array(self.gains[0])

@@ -15,7 +15,8 @@ from obsynth.designs.interval.decoupling import MODE, Reduced, shaped
 from obsynth.designs.interval.printed import divergence
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.widths import steady, steady_holds
-from obsynth.designs.lmi import Problem, diagonal, full
+from obsynth.designs.lmi.expression import diagonal, full
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import ObsynthError
 from obsynth.symbolic.arrays import FloatArray
 

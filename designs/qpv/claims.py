@@ -13,7 +13,8 @@ import numpy as np
 from obsynth.derive.rigour import Enclosure, ExactMatrix, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.signals import about_centre, at_centre, noise_centre
-from obsynth.designs.lmi import FamilyProof, prove_family, symmetric_block
+from obsynth.designs.lmi.problem import symmetric_block
+from obsynth.designs.lmi.proof import FamilyProof, prove_family
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (
     PolyaTerm,

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.lmi import he, symmetric_block
+from obsynth.designs.lmi.problem import he, symmetric_block
 from obsynth.symbolic.errors import ObsynthError
 
 

@@ -13,7 +13,7 @@ from obsynth.derive import QPV
 from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.lmi import Problem
+from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.qpv.claims import claims, covers
 from obsynth.designs.qpv.defaults import default_sets, takes_rate
 from obsynth.designs.qpv.guarantee import guarantee, numbers

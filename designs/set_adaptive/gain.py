@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import Problem, diagonal, full, scalar, trace
+from obsynth.designs.lmi.expression import diagonal, full, scalar, trace
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic.arrays import FloatArray
 
 _ITERATIONS = 40

@@ -13,7 +13,7 @@ from obsynth.designs.core.given import POSITIVE, read_gains, read_rows, refuse_i
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
-from obsynth.designs.lmi import Problem
+from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
 from obsynth.designs.set_adaptive.coordinates import Coordinates, build_frame, read_coordinates
 from obsynth.designs.set_adaptive.equations import MONITORS, memory_sizes

@@ -12,7 +12,8 @@ from luenberger.model import LuenbergerModel
 from luenberger.record import Comparison, LuenbergerDesign
 from obsynth.derive.rigour import Enclosure
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.lmi import Problem, full, scalar
+from obsynth.designs.lmi.expression import full, scalar
+from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic.arrays import FloatArray
 
 ROOM = 1.0 + 1e-9

@@ -11,7 +11,7 @@ import sympy as sp
 import obsynth as ob
 from obsynth.designs.hinf.lmis import dissipation_block, loop_of_filter
 from obsynth.designs.hinf.synthesis import find_level, state_problem
-from obsynth.designs.lmi import Affine
+from obsynth.designs.lmi.expression import Affine
 
 TIGHT = 2e-5
 """Slack of the second stage below the tolerances of the table, so that what is proved counts."""

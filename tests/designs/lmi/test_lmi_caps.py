@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from obsynth.designs.lmi import Problem, cap_gain, full, symmetric, symmetric_block
+from obsynth.designs.lmi.expression import full, symmetric
+from obsynth.designs.lmi.problem import Problem, cap_gain, symmetric_block
 
 
 def design(cap):

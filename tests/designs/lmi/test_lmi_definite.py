@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
-from obsynth.designs.lmi import Problem, full, symmetric, symmetric_block, trace
+from obsynth.designs.lmi.expression import full, symmetric, trace
+from obsynth.designs.lmi.problem import Problem, symmetric_block
 from obsynth.designs.lmi.proof import _definite, _multipliers
 
 

@@ -8,19 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.lmi import (
+from obsynth.designs.lmi.expression import (
     ExpressionError,
-    Problem,
-    block,
     constant,
     diagonal,
     full,
-    he,
     scalar,
     symmetric,
-    symmetric_block,
     trace,
 )
+from obsynth.designs.lmi.problem import Problem, block, he, symmetric_block
 
 PROPERTY = settings(derandomize=True, max_examples=25, deadline=None)
 

@@ -10,19 +10,12 @@ from obsynth.derive.rigour import (
     prove_positive_definite,
 )
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import (
-    Problem,
-    full,
-    largest_margin,
-    margin,
-    prove_family,
-    solve,
-    solve_lazily,
-    solve_with_margin,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.designs.lmi import margin, solve
+from obsynth.designs.lmi.expression import full, symmetric, trace
+from obsynth.designs.lmi.margin import largest_margin, solve_with_margin
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.designs.lmi.proof import prove_family
+from obsynth.designs.lmi.solve import solve_lazily
 
 N, FAULTS = 4, 2
 C = np.eye(3, N)

@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import (
-    ExpressionError,
-    Problem,
-    block,
-    full,
-    he,
-    scalar,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.designs.lmi.expression import ExpressionError, full, scalar, symmetric, trace
+from obsynth.designs.lmi.problem import Problem, block, he, symmetric_block
 
 
 def scherer_gahinet_chilali() -> Problem:

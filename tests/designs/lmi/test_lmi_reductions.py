@@ -9,18 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.rigour import Enclosure
-from obsynth.designs.lmi import (
-    Problem,
+from obsynth.designs.lmi.expression import full, symmetric
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.designs.lmi.reductions import extreme_points, split_common
+from obsynth.designs.lmi.relaxation import (
     RowMultipliers,
     UncertainRow,
     corner_block,
-    extreme_points,
-    full,
     relax_sum,
     row_multipliers,
-    split_common,
-    symmetric,
-    symmetric_block,
 )
 from obsynth.symbolic.errors import ObsynthError
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import (
+from obsynth.designs.lmi import search
+from obsynth.designs.lmi.search import (
     Knob,
     bisect_feasible,
-    search,
     search_line,
     search_log_convex,
     smallest_changes,

@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.lmi import (
-    Problem,
-    conic,
-    solve,
-    solve_reliably,
-    solve_with_retries,
-    symmetric,
-    trace,
-)
+from obsynth.designs.lmi import conic, solve
 from obsynth.designs.lmi.cvxpy_backend import solve_with_cvxpy
+from obsynth.designs.lmi.expression import symmetric, trace
+from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.solve import solve_reliably, solve_with_retries
 
 
 def problem():

@@ -9,18 +9,10 @@ import pytest
 
 from obsynth.derive.rigour import Enclosure, prove_positive_definite
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.lmi import (
-    Knob,
-    Problem,
-    bisect_feasible,
-    full,
-    largest_margin,
-    smallest_changes,
-    solve_with_margin,
-    symmetric,
-    symmetric_block,
-    trace,
-)
+from obsynth.designs.lmi.expression import full, symmetric, trace
+from obsynth.designs.lmi.margin import largest_margin, solve_with_margin
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.designs.lmi.search import Knob, bisect_feasible, smallest_changes
 
 REFERENCE = json.loads(
     (Path(__file__).parents[2] / "reference" / "bounded_error_uio.json").read_text("utf-8")
