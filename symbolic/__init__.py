@@ -8,9 +8,11 @@ from obsynth.symbolic.convert import to_sx as to_sx
 from obsynth.symbolic.errors import ObsynthError as ObsynthError
 from obsynth.symbolic.errors import ObsynthWarning as ObsynthWarning
 from obsynth.symbolic.errors import PlantError as PlantError
+from obsynth.symbolic.errors import RecordError as RecordError
 from obsynth.symbolic.functions import phi1 as phi1
 from obsynth.symbolic.functions import tanhc as tanhc
 from obsynth.symbolic.plant import Plant as Plant
+from obsynth.symbolic.reading import read_record as read_record
 from obsynth.symbolic.record import Record as Record
 from obsynth.symbolic.scenario import Scenario as Scenario
 from obsynth.symbolic.signals import Role as Role

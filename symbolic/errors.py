@@ -37,3 +37,7 @@ class ObsynthError(ValueError):
 
 class PlantError(ObsynthError):
     """A plant, scenario or expression that cannot be accepted as typed."""
+
+
+class RecordError(PlantError):
+    """A record that does not hold what its plant needs, or not on the plant's grid."""

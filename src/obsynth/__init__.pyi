@@ -50,8 +50,10 @@ from .symbolic import ObsynthError as ObsynthError
 from .symbolic import Plant as Plant
 from .symbolic import PlantError as PlantError
 from .symbolic import Record as Record
+from .symbolic import RecordError as RecordError
 from .symbolic import Scenario as Scenario
 from .symbolic import plants as plants
+from .symbolic import read_record as read_record
 from .symbolic import records as records
 from .symbolic import scenarios as scenarios
 
