@@ -1,10 +1,13 @@
 """What it is worth: simulation, coverage, plots, report."""
 
+from obsynth.evaluate.bounds.least_bounds import LeastBounds as LeastBounds
+from obsynth.evaluate.bounds.least_bounds import least_bounds as least_bounds
 from obsynth.evaluate.choosing.choice import Choice as Choice
 from obsynth.evaluate.choosing.choose import choose as choose
 from obsynth.evaluate.coverage import coverage_table as coverage_table
 from obsynth.evaluate.domain import Domain as Domain
 from obsynth.evaluate.domain import StatusCount as StatusCount
+from obsynth.evaluate.errors import BoundsError as BoundsError
 from obsynth.evaluate.errors import ReportError as ReportError
 from obsynth.evaluate.errors import SimulationError as SimulationError
 from obsynth.evaluate.plotting.alarms import plot_alarms as plot_alarms

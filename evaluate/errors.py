@@ -9,3 +9,7 @@ class SimulationError(ObsynthError):
 
 class ReportError(ObsynthError):
     """A table, plot or page that cannot be made from what was given."""
+
+
+class BoundsError(ObsynthError):
+    """A record that cannot be asked for bounds, or that no trajectory of the plant explains."""

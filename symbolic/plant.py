@@ -8,7 +8,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.symbolic import declarations
+from obsynth.symbolic import altered, declarations
 from obsynth.symbolic.declarations import Names, Symbols
 from obsynth.symbolic.discretise import PREFIX, Step, discretised, next_values, sampling_time
 from obsynth.symbolic.display import plant_html, plant_latex
@@ -89,6 +89,7 @@ class Plant:
     sensor_faults = declarations.sensor_faults
     process_faults = declarations.process_faults
     faults = declarations.process_faults
+    with_ranges = altered.with_ranges
 
     def declare(self, role: Role, names: Names, **keywords: Any) -> Symbols:
         """Declare signals of a role; the methods above say which keywords it takes."""

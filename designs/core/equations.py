@@ -56,7 +56,7 @@ class Equations:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         n, n_f = len(plant.x), len(plant.f)
-        v, known, rows, _, rest = _symbols(plant)
+        v, known, rows, _, rest = symbols(plant)
         self.curved = curved = curved_states(plant)
         self.n, self.n_f, self.n_v = n, n_f, int(v.numel())
         faults = plant.box("f") + 0.0
@@ -115,7 +115,7 @@ class Equations:
     @cached_property
     def outputs(self) -> Program:
         """The outputs over the same variables."""
-        v, known, _, outputs, _ = _symbols(self.plant)
+        v, known, _, outputs, _ = symbols(self.plant)
         return Program.from_casadi(ca.Function("outputs", [v, known], [outputs]))
 
     @cached_property
@@ -132,7 +132,7 @@ class Equations:
         which = [(i, n + j) for j, i in self.invertible]
         if not which:
             return {}
-        v, known, rows, _, _ = _symbols(self.plant)
+        v, known, rows, _, _ = symbols(self.plant)
         slopes = ca.vertcat(*(ca.jacobian(rows[i], v)[j] for i, j in which))
         second = ca.densify(ca.jacobian(slopes, ca.vertcat(v, known)))
         program = Program.from_casadi(ca.Function("bends", [v, known], [second]))
@@ -287,7 +287,7 @@ class Equations:
         return combine("divide", moved, slope, rounding=rounding)
 
 
-def _symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
+def symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
     """Return (x, f, rest), (u, theta), the rows, the outputs and the ranges of rest."""
     sizes = {kind: len(plant.names(kind)) for kind in ("x", "u", "d", "f", "w", "p", "rho")}
     s = {kind: ca.SX.sym(kind, size) for kind, size in sizes.items()}
@@ -307,7 +307,7 @@ def curved_states(plant: Plant) -> BoolArray:
 
     What multiplies a disturbance or a parameter does so whatever the size of the state.
     """
-    v, _, rows, outputs, _ = _symbols(plant)
+    v, _, rows, outputs, _ = symbols(plant)
     n, n_f = len(plant.x), len(plant.f)
     slopes = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : n + n_f]
     found = ca.which_depends(ca.vec(slopes), v[:n], 1, False)
@@ -316,7 +316,7 @@ def curved_states(plant: Plant) -> BoolArray:
 
 def covered_inputs(plant: Plant) -> BoolArray:
     """Return which inputs have to stay in their range: those that enter in no constant way."""
-    v, known, rows, outputs, _ = _symbols(plant)
+    v, known, rows, outputs, _ = symbols(plant)
     n_u = len(plant.u)
     slopes = ca.jacobian(ca.vertcat(rows, outputs), known[:n_u])
     everything = ca.vertcat(v, known)

@@ -1,0 +1,1 @@
+"""Bounds and parameters that explain a record."""

@@ -1,0 +1,86 @@
+"""What bounds that were fitted to a record are worth for the next one."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import comb
+
+import numpy as np
+from scipy.optimize import brentq
+
+from obsynth.evaluate.bounds.certified import least
+from obsynth.evaluate.bounds.problem import Problem
+from obsynth.evaluate.table import Table
+from obsynth.symbolic.arrays import FloatArray
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Factors of the bounds that single windows of the record need.
+
+    Parameters
+    ----------
+    factors : array (n,)
+        Attained, by window.
+    certified : array (n,)
+        No window needs less.
+    free : int
+        Number of bounds that were fitted.
+    """
+
+    factors: FloatArray
+    certified: FloatArray
+    free: int
+
+    @property
+    def exceeded(self) -> float:
+        """Probability that a window like these needs more than all of them: 1 / (n + 1)."""
+        return 1.0 / (len(self.factors) + 1)
+
+    @property
+    def violation(self) -> float:
+        """Share of windows to come that may violate the bounds, with 95 per cent confidence.
+
+        The root in eps of ``sum_{i < d} C(n, i) eps^i (1 - eps)^(n - i) = .05`` for d bounds
+        (Campi, Garatti 2008), for exchangeable windows.
+        """
+        n, d = len(self.factors), min(self.free, len(self.factors))
+
+        def tail(eps: float) -> float:
+            return sum(comb(n, i) * eps**i * (1.0 - eps) ** (n - i) for i in range(d))
+
+        return float(brentq(lambda eps: tail(eps) - (1.0 - CONFIDENCE), 0.0, 1.0))
+
+    @property
+    def safety(self) -> float:
+        """Factor that holds with 95 per cent confidence if the tail is uniform up to its bound."""
+        return float((1.0 - CONFIDENCE) ** (-1.0 / len(self.factors)))
+
+    def __repr__(self) -> str:
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        return self.table()._repr_html_()
+
+    def table(self) -> Table:
+        """Factors by window, with what they mean."""
+        pairs = enumerate(zip(self.factors.tolist(), self.certified.tolist(), strict=True), 1)
+        return Table(
+            "Windows of the record",
+            ["window", "factor attained", "certified"],
+            [[k, *pair] for k, pair in pairs],
+            note=f"If windows are exchangeable, the next needs more than all of these with "
+            f"probability {self.exceeded:.3g}; with 95 % confidence at most {self.violation:.3g} "
+            f"of all windows violate the bounds. If what is needed is uniform up to its bound, "
+            f"{self.safety:.3g} times the bounds hold with the same confidence.",
+        )
+
+
+def validate(problem: Problem, bounds: FloatArray, windows: int) -> Validation:
+    """Return the factors of bounds that equal windows of the record need."""
+    edges = np.linspace(0, len(problem), windows + 1).round().astype(int)
+    scaled = problem.scaled(bounds)
+    found = [least(scaled.window(a, b), np.ones(1)) for a, b in pairwise(edges.tolist())]
+    factors = np.array([one.upper for one in found])
+    return Validation(factors, np.array([one.lower for one in found]), len(bounds))
