@@ -5,6 +5,8 @@ from obsynth.evaluate.bounds.least_bounds import least_bounds as least_bounds
 from obsynth.evaluate.choosing.choice import Choice as Choice
 from obsynth.evaluate.choosing.choose import choose as choose
 from obsynth.evaluate.coverage import coverage_table as coverage_table
+from obsynth.evaluate.data.estimate import estimate as estimate
+from obsynth.evaluate.data.estimated import Estimate as Estimate
 from obsynth.evaluate.domain import Domain as Domain
 from obsynth.evaluate.domain import StatusCount as StatusCount
 from obsynth.evaluate.errors import BoundsError as BoundsError

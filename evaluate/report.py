@@ -4,9 +4,9 @@ import html
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from obsynth.designs.core.files import write_whole
 from obsynth.designs.core.observer import Observer
@@ -19,6 +19,9 @@ from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.svg import constants_html, equations_html, figure_svg, signals_table
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
+
+if TYPE_CHECKING:
+    from obsynth.evaluate.data.estimated import Estimate
 
 Tables = Table | Sequence[Table]
 
@@ -38,7 +41,7 @@ class _Section:
 def report(
     path: str | os.PathLike[str],
     observer: "Observer | Mapping[str, Observer]",
-    runs: Run | Sequence[Run] | Mapping[str, Run | Sequence[Run]] = (),
+    runs: Any = (),
     tables: Tables | Mapping[str, Tables] = (),
     *,
     title: str | None = None,
@@ -59,9 +62,9 @@ def report(
         The file to write; its folder has to exist.
     observer : Observer or mapping of label to Observer
         The designs; the first one's plant is the page's plant.
-    runs : Run, sequence of Run, or mapping of design label to runs
-        Coverage of all of them is tabulated. The first run of each scenario and
-        design is plotted, and the errors of all designs in one figure.
+    runs : Run or Estimate, sequence of them, or mapping of design label to them
+        Estimates have a section of their own. Coverage of all runs is tabulated. The first run of
+        each scenario and design is plotted, and the errors of all designs in one figure.
     tables : Table, sequence of Table, or mapping of heading to tables
         More tables. The headings ``"Plant"``, ``"Derived bounds"``,
         ``"Design and certificate"``, ``"Half widths"``, ``"Simulation"`` and
@@ -96,7 +99,10 @@ def report(
     if not target.parent.is_dir():
         raise ReportError(f"the folder {str(target.parent)!r} does not exist.", path=str(target))
     observers = _labelled_observers(observer)
-    labelled = _labelled_runs(runs)
+    every = _labelled_runs(runs)
+    labelled = {key: [one for one in many if isinstance(one, Run)] for key, many in every.items()}
+    labelled = {key: many for key, many in labelled.items() if many}
+    told = [one for many in every.values() for one in many if not isinstance(one, Run)]
     extra = _labelled_tables(tables)
     say = progress or (lambda word: None)
     first = next(iter(observers.values()))
@@ -108,6 +114,7 @@ def report(
         _design_section(observers),
         _width_section(plant, widths, say),
         _run_section(labelled, say),
+        _record_section(told, say),
         _Section("code", "C code"),
     ]
     known = {section.title: section for section in sections}
@@ -133,13 +140,11 @@ def _labelled_observers(given: Any) -> dict[str, "Observer"]:
     return observers
 
 
-def _labelled_runs(given: Any) -> dict[str, list[Run]]:
-    if isinstance(given, Run):
-        given = [given]
+def _labelled_runs(given: Any) -> dict[str, list[Any]]:
     if isinstance(given, Mapping):
-        return {k: [v] if isinstance(v, Run) else list(v) for k, v in given.items()}
-    labelled: dict[str, list[Run]] = {}
-    for run in given:
+        return {k: [v] if hasattr(v, "estimated") else list(v) for k, v in given.items()}
+    labelled: dict[str, list[Any]] = {}
+    for run in [given] if hasattr(given, "estimated") else given:
         labelled.setdefault(run.method, []).append(run)
     return labelled
 
@@ -300,13 +305,27 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
     return section
 
 
+def _record_section(every: "Sequence[Estimate]", say: Callable[[str], None]) -> _Section:
+    section = _Section("records", "Records")
+    for i, told in enumerate(every):
+        caption = f"{told.record.source}: estimate and interval"
+        say(caption)
+        figure, axes = _panels(told)
+        with style():
+            plot_run(told, axes=axes)
+        table = replace(told.summary(), note="")
+        section.add(table._repr_html_(), _figure_html(figure, f"record{i}", caption))
+        section.add(_bullets("In words", told.said))
+    return section
+
+
 def _facts(run: Run) -> str:
     lines = [f"truth: {run.truth}", *(f"outside the guarantee: {line}" for line in run.reasons)]
     lines += str(run.domain).splitlines() + [str(v) for v in run.violations]
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
 
 
-def _panels(run: Run) -> tuple[Any, Any]:
+def _panels(run: "Run | Estimate") -> tuple[Any, Any]:
     """Make a figure with one panel for each estimated signal, two beside each other."""
     count = len(run.estimated)
     with style():

@@ -13,10 +13,11 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.comparison import list_voids
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import state_box
+from obsynth.evaluate.data.tables import to_dataset
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.table import Table
-from obsynth.evaluate.trace import Trace, Violation
+from obsynth.evaluate.trace import Trace, Violation, take
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -137,27 +138,7 @@ class Run:
         return self.names["x"] + self.names["f"]
 
     def __getitem__(self, name: str) -> Trace:
-        for group, names in self.names.items():
-            if name in names:
-                return self._trace(group, names.index(name))
-        known = ", ".join(n for names in self.names.values() for n in names)
-        raise SimulationError(f"no signal is called {name!r}; there are {known}.", symbol=name)
-
-    def _trace(self, group: str, i: int) -> Trace:
-        name, unit = self.names[group][i], self.units[group][i]
-        true: FloatArray = getattr(self, group)[:, i]
-        if group == "x":
-            claims = (self.xhat[:, i], self.x_lower[:, i], self.x_upper[:, i])
-            return Trace(name, unit, self.t, true, *claims, status=self.status)
-        if group == "f":
-            late = self.fault_delay
-            until = len(self.t) - late
-            claims = (self.fhat[late:, i], self.f_lower[late:, i], self.f_upper[late:, i])
-            alarm = None if self.alarm is None else self.alarm[:until, i]
-            return Trace(
-                name, unit, self.t[:until], true[:until], *claims, alarm, self.status[late:]
-            )
-        return Trace(name, unit, self.t, true)
+        return take(self, name)
 
     @cached_property
     def bounded(self) -> tuple[str, ...]:
@@ -260,23 +241,6 @@ class Run:
         ``fault``, ``output``, ``input``, ``unknown_input``, ``disturbance``,
         ``scheduling``; units stand in coordinates such as ``state_unit``.
         """
-        import xarray as xr
-
-        dims = {"x": "state", "f": "fault", "y": "output", "u": "input", "d": "unknown_input"}
-        dims |= {"w": "disturbance", "rho": "scheduling"}
-        coords: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
-        for group, dim in dims.items():
-            coords[dim] = (dim, np.array(self.names[group], dtype=np.str_))
-            coords[f"{dim}_unit"] = (dim, np.array(self.units[group], dtype=np.str_))
-        claims = {"xhat": "x", "x_lower": "x", "x_upper": "x"}
-        claims |= {"fhat": "f", "f_lower": "f", "f_upper": "f"}
-        groups = {**{key: key for key in dims}, **claims}
-        data: dict[str, Any] = {
-            key: (("time", dims[group]), getattr(self, key)) for key, group in groups.items()
-        }
-        data["status"] = (("time",), self.status)
-        if self.alarm is not None:
-            data["alarm"] = (("time", "fault"), self.alarm)
         attrs = {
             "model": self.model,
             "scenario": self.scenario,
@@ -286,7 +250,7 @@ class Run:
             "outside_guarantee": "; ".join(self.outside),
             "fault_delay": self.fault_delay,
         }
-        return xr.Dataset(data, coords=coords, attrs=attrs)
+        return to_dataset(self, attrs)
 
     def plot(self, signals: tuple[str, ...] | None = None) -> Any:
         """Plot all estimated signals in a grid; see :func:`obsynth.evaluate.plot_run`."""

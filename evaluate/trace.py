@@ -1,12 +1,14 @@
 """One signal of a run, and where it was outside of its interval."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.core.observer import STATUS
 from obsynth.evaluate.errors import SimulationError
-from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,13 @@ class Trace:
         return bool(np.any(~(np.isneginf(self.lower) & np.isposinf(self.upper))))
 
     @property
+    def valid(self) -> BoolArray:
+        """Where the status allows the interval to be relied upon."""
+        bits = STATUS["not_initialised"] | STATUS["fault_not_valid"]
+        none = np.zeros(len(self.t), dtype=np.int64)
+        return np.asarray((none if self.status is None else self.status) & bits == 0)
+
+    @property
     def inside(self) -> NDArray[np.bool_]:
         """Where the truth is inside the interval, tolerance zero; no number is outside."""
         if self.lower is None or self.upper is None:
@@ -62,6 +71,30 @@ class Trace:
         if self.lower is None or self.upper is None:
             raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
         return np.asarray(0.5 * (self.upper - self.lower))
+
+
+def take(run: Any, name: str) -> Trace:
+    """Return a signal of a run or of an estimate, whose truth is no number where it is unknown."""
+    group = next((key for key, names in run.names.items() if name in names), None)
+    if group is None:
+        known = ", ".join(n for names in run.names.values() for n in names)
+        raise SimulationError(f"no signal is called {name!r}; there are {known}.", symbol=name)
+    i = run.names[group].index(name)
+    unit, true = run.units[group][i], getattr(run, group, None)
+    true = np.full(len(run.t), np.nan) if true is None else true[:, i]
+    if group not in ("x", "f"):
+        return Trace(name, unit, run.t, true)
+    late = run.fault_delay if group == "f" else 0
+    until = len(run.t) - late
+    told = (getattr(run, key) for key in (f"{group}hat", f"{group}_lower", f"{group}_upper"))
+    estimate, lower, upper = (array[late:, i] for array in told)
+    t, true, alarm = run.t[:until], true[:until], None
+    status = run.status[late:]
+    if group == "x":
+        status = status & ~STATUS["fault_not_valid"]
+    elif run.alarm is not None:
+        alarm = run.alarm[:until, i]
+    return Trace(name, unit, t, true, estimate, lower, upper, alarm, status)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,11 +35,18 @@ def save(observer: Observer, path: str | os.PathLike[str]) -> None:
 
 
 def write_whole(target: Path, text: str) -> None:
-    """Write beside the target and rename, so that no reader meets half a file."""
+    """Write a text; an existing file is replaced only when it is complete."""
+    with replaced(target) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replaced(target: Path) -> Iterator[Path]:
+    """Give a file to write beside the target, renamed in the end: no reader meets half a file."""
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    os.close(handle)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        yield Path(name)
         os.chmod(name, 0o644)
         os.replace(name, target)
     except BaseException:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.comparison import find_voids
 from obsynth.evaluate.choosing.tries import Try
 from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, new_figure, style
 from obsynth.evaluate.table import Table, text
@@ -154,7 +155,7 @@ class Choice:
         said += ["its faults are means over time"] if one.means else []
         if one.missed or (one.missed == 0 and one is self.kalman):
             said.append(f"misses {100 * one.missed:.3g} % of the instants")
-        voids = sum(void.count for void in one.run.domain.voids)
+        voids = sum(void.count for void in find_voids(one.run.status))
         said += [f"void at {voids} calls, which contradicts the assumptions"] if voids else []
         counted = float(self.guaranteed(one)[self._counted].mean())
         numbers = [self.score(one), counted, self.transient(one), one.operations, one.seconds]

@@ -10,9 +10,10 @@ from obsynth.designs.core.method import Method
 from obsynth.evaluate.choosing.choice import Choice
 from obsynth.evaluate.choosing.kalman import ExtendedKalman
 from obsynth.evaluate.choosing.tries import METHODS, Try, attempt, in_time, named
+from obsynth.evaluate.data.estimate import estimate
+from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.progress import bar
-from obsynth.evaluate.replay import replay
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.simulate import simulate
 from obsynth.symbolic import Plant, Record, Scenario
@@ -86,9 +87,9 @@ def choose(
         assert noise is not None
         chosen = replace(chosen, disturbances=noise[:, :own])
 
-    def run(observer: Any) -> Run:
+    def run(observer: Any) -> Run | Estimate:
         if record is not None:
-            return replay(observer, record)
+            return estimate(observer, record)
         return simulate(observer.model, observer, chosen, seed)
 
     tries, yardstick = [], Try(kalman.method, 0.0, kalman, run(kalman))

@@ -22,6 +22,7 @@ from obsynth.designs import (
 )
 from obsynth.designs.core.method import Method
 from obsynth.designs.detection.detector import core_of
+from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.run import Run
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -51,7 +52,7 @@ class Try:
     name: str
     seconds: float
     observer: Any = None
-    run: Run | None = None
+    run: Run | Estimate | None = None
     reason: str = ""
     means: bool = False
 
@@ -64,13 +65,13 @@ class Try:
     def half_widths(self) -> FloatArray:
         """Of states and faults at every instant that is known of, (N, n + n_f)."""
         run: Any = self.run
-        rows = [run.widths[name] for name in run.estimated]
+        rows = [run[name].half_width for name in run.estimated]
         return np.column_stack([row[: min(map(len, rows))] for row in rows])
 
     @property
     def missed(self) -> float | None:
         """The largest share of instants at which an interval did not hold the truth, if known."""
-        if self.run is None or np.isnan(self.run.x).any():
+        if self.run is None or isinstance(self.run, Estimate):
             return None
         names = self.run.names["x"] if self.means else self.run.estimated
         return max(1.0 - self.run.coverage[name] for name in names)
@@ -89,7 +90,7 @@ def first_sentence(text: str) -> str:
     return line if len(line) <= 120 else f"{line[:118]} …"
 
 
-def attempt(method: Method, model: Plant, run: Callable[[Any], Run]) -> Try:
+def attempt(method: Method, model: Plant, run: Callable[[Any], Run | Estimate]) -> Try:
     """Design for a discrete plant, or for the continuous one behind it, and run the observer."""
     name, start, given, fitted = named(method), time.perf_counter(), model, method
     if method.CLASS.time == "continuous" and model.continuous is not None:

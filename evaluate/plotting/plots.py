@@ -29,13 +29,14 @@ from obsynth.evaluate.trace import Trace
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
+    from obsynth.evaluate.data.estimated import Estimate
     from obsynth.evaluate.run import Run
 
 Window = tuple[float, float]
 
 
 def plot_signal(
-    run: "Run",
+    run: "Run | Estimate",
     name: str,
     ax: Any = None,
     zooms: Sequence[Window] | None = None,
@@ -48,7 +49,8 @@ def plot_signal(
 
     Parameters
     ----------
-    run : Run
+    run : Run or Estimate
+        Of an estimate no truth is drawn.
     name : str
         A state, a fault, or any other signal of the run.
     ax : matplotlib Axes, optional
@@ -118,13 +120,16 @@ def plot_signal(
 
 
 def plot_run(
-    run: "Run", signals: Sequence[str] | None = None, axes: Any = None, window: Window | None = None
+    run: "Run | Estimate",
+    signals: Sequence[str] | None = None,
+    axes: Any = None,
+    window: Window | None = None,
 ) -> Any:
     """Plot all estimated signals of a run in a grid.
 
     Parameters
     ----------
-    run : Run
+    run : Run or Estimate
     signals : sequence of str, optional
         Which signals; all states and faults by default.
     axes : array of Axes, optional
@@ -246,7 +251,8 @@ def _draw(ax: Any, trace: Trace, window: Window | None = None) -> None:
         ax.plot(*low, color=INTERVAL, linewidth=0.8, label="interval")
         ax.plot(*high, color=INTERVAL, linewidth=0.8)
     t, true = _cut(trace.t, trace.true, window)
-    ax.plot(*thin(t, true), color=INK, linewidth=1.5, label="truth")
+    if np.isfinite(true).any():
+        ax.plot(*thin(t, true), color=INK, linewidth=1.5, label="truth")
     if trace.estimate is not None:
         t, estimate = _cut(trace.t, trace.estimate, window)
         ax.plot(*thin(t, estimate), color=ESTIMATE, linewidth=0.8, label="estimate")
@@ -295,10 +301,10 @@ def _settled(run: "Run") -> int:
     return min(start, len(run.t) // 2)
 
 
-def _windows(run: "Run", trace: Trace) -> list[Window]:
+def _windows(run: Any, trace: Trace) -> list[Window]:
     """Choose the start until the estimate has settled, and a stretch around a moving fault."""
     n = len(trace.t)
-    if trace.estimate is None or n < 40:
+    if trace.estimate is None or n < 40 or np.isnan(trace.true).all():
         return []
     error = np.abs(trace.error)
     usual = 1.5 * float(np.nanquantile(error[n // 2 :], 0.99))

@@ -1,0 +1,1 @@
+"""What observers say of a record: a run without truth."""

@@ -1,0 +1,159 @@
+"""`estimate`: an observer on a record, and which readings contradict it."""
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.evaluate.checked import scheduling_columns, step_function
+from obsynth.evaluate.data.estimated import Estimate
+from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.truth import Call, dense, sample_time
+from obsynth.symbolic import Plant, Record
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.scenarios import gentle
+
+JITTER = 0.05
+"""Share of the sample time by which two instants of a record may be too far from each other."""
+BLOCK = 4096
+"""Instants from one memory that is kept to the next."""
+
+
+def estimate(
+    observer: Observer | FaultDetector,
+    record: Record,
+    *,
+    guess: Any = None,
+    x_range: Any = None,
+    f_range: Any = None,
+) -> Estimate:
+    """Run an observer or a fault detector over what was measured.
+
+    Parameters
+    ----------
+    observer : Observer or FaultDetector
+        Of any method, for the plant of the record.
+    record : Record
+        Rows are instants one sample time apart; a missing reading is NaN and costs that reading
+        only. Measured scheduling signals are channels of their own names.
+    guess : array_like (n,), optional
+        Where the state is thought to be at the first instant; the nominal one by default.
+    x_range, f_range : array_like (n, 2), (n_f, 2), optional
+        Boxes that hold the first state and the first faults; the declared ranges by default, so
+        that nothing is assumed of the start.
+
+    Returns
+    -------
+    Estimate
+        The same bits that `observer.step` gives, called instant by instant.
+
+    Raises
+    ------
+    SimulationError
+        The record has other channels, or another sample time, than the observer's plant.
+
+    Examples
+    --------
+    >>> import obsynth as ob
+    >>> observer = ob.IntervalObserver().design(ob.plants.leaking_tanks())
+    >>> told = ob.estimate(observer, ob.records.three_tank_leak())
+    >>> told.consistent, told.refuted
+    (1.0, None)
+    """
+    model, step = observer.model, step_function(observer, observer.model)
+    fits(model, record)
+    start = gentle(model)
+    memory = observer.memory0(
+        start.guess if guess is None else guess,
+        x_range=x_range,
+        f_range=start.f_range if f_range is None else f_range,
+        y0=record.y[0],
+    )
+    names = [model.names("rho")[k] for k in scheduling_columns(step, model, "step")]
+    absent = [name for name in names if name not in record.names["reference"]]
+    if absent:
+        raise SimulationError(
+            f"{model.name} is scheduled by {absent[0]}, which the record {record.source!r} does "
+            "not hold: give it a channel of that name.",
+            symbol=absent[0],
+        )
+    theta = [record[name][:, None] for name in names]
+    rows = np.hstack([record.u, record.y, *theta])
+    log, blamed = _march(step, np.array(memory, dtype=float), rows, model.output_names)
+    log.flags.writeable = False
+    ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out())])
+    parts = np.split(log, ends[:-1], axis=1)
+    told: dict[str, Any] = dict(zip((*STEP_OUTPUTS[1:], "alarm"), parts, strict=False))
+    told["status"] = told["status"][:, 0].astype(np.int64)
+    if "alarm" in told:
+        told["alarm"] = told["alarm"] > 0.5
+    return Estimate(observer, record, blamed=blamed, **told)
+
+
+def fits(model: Plant, record: Record) -> None:
+    """Refuse a record with other channels, or other instants, than a plant has."""
+    for kind, names in (("u", model.names("u")), ("y", model.output_names)):
+        if record.names[kind] != tuple(names):
+            raise SimulationError(
+                f"the record {record.source!r} has {', '.join(record.names[kind])} as {kind}; "
+                f"{model.name} has {', '.join(names)}: give its channels in that order.",
+                field=kind,
+            )
+    Ts, steps = sample_time(model), np.diff(record.time)
+    k = int(np.abs(steps - Ts).argmax())
+    if abs(steps[k] - Ts) > JITTER * Ts:
+        raise SimulationError(
+            f"the record {record.source!r} has {steps[k]:g} s from t = {record.time[k]:g} on; "
+            f"{model.name} is sampled every {Ts:g} s.",
+            instant=k,
+        )
+
+
+def _march(
+    function: ca.Function, memory: FloatArray, rows: FloatArray, outputs: tuple[str, ...]
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return what the step tells at every instant, and the outputs that make it void first.
+
+    Shapes: rows (N, n_u + n_y + n_theta), result (N, numbers of the outputs but the memory).
+    """
+    step = dense(function)
+    sizes = [step.numel_in(i) for i in range(1, step.n_in())]
+    given, moved = np.zeros(sum(sizes)), np.zeros(memory.size)
+    told = np.zeros(sum(step.numel_out(i) for i in range(1, step.n_out())))
+    args = [memory, *np.split(given, np.cumsum(sizes)[:-1])]
+    places = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
+    call = Call(step, args, [moved, *np.split(told, places)])
+    status = call.results[STEP_OUTPUTS.index("status")]
+
+    def run(rows: FloatArray, log: FloatArray) -> None:
+        evaluate = call.evaluate
+        for row, out in zip(rows, log, strict=True):
+            given[:] = row
+            evaluate()
+            out[:] = told
+            memory[:] = moved
+
+    def void() -> bool:
+        call.evaluate()
+        return bool(int(status[0]) & STATUS["void"])
+
+    log, blamed = np.empty((len(rows), told.size)), None
+    column = int(places[STEP_OUTPUTS.index("status") - 2])
+    for k in range(0, len(rows), BLOCK):
+        kept, part = memory.copy(), log[k : k + BLOCK]
+        run(rows[k : k + BLOCK], part)
+        at = np.flatnonzero(part[:, column].astype(np.int64) & STATUS["void"])
+        if at.size and blamed is None:
+            # once more up to the void, then without each of its readings
+            after, memory[:] = memory.copy(), kept
+            k += int(at[0])
+            run(rows[k - int(at[0]) : k], log[k - int(at[0]) : k])
+            alone = []
+            for i, name in enumerate(outputs):
+                given[:] = rows[k]
+                args[2][i] = np.nan
+                alone += [] if void() else [name]
+            blamed, memory[:] = tuple(alone), after
+    return log, blamed or ()

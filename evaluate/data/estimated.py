@@ -1,0 +1,412 @@
+"""What an estimate from a record says: sets, how wide they are, and what contradicts what."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.designs.core.observer import STATUS
+from obsynth.designs.detection.comparison import find_voids, list_voids
+from obsynth.designs.detection.detector import SKIPPED, core_of
+from obsynth.evaluate.data.allowed import allowed
+from obsynth.evaluate.data.meter import Comparison, compare_with
+from obsynth.evaluate.data.tables import to_dataset, write_columns
+from obsynth.evaluate.domain import count_status
+from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.table import Table, text
+from obsynth.evaluate.trace import Trace, take
+from obsynth.symbolic import Record
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class Refutation:
+    """Where a record and the assumptions of an observer cannot both be right.
+
+    Attributes
+    ----------
+    instant, time : int, float
+        The first such instant, in rows of the record and in seconds.
+    signals : tuple of str
+        The readings each of which makes the instant void; else the signals whose sets miss their
+        declared ranges. Empty where no single reading does.
+    why : str
+    """
+
+    instant: int
+    time: float
+    signals: tuple[str, ...]
+    why: str
+
+    def __str__(self) -> str:
+        return f"the record refutes the assumptions at k = {self.instant} ({self.time:g} s): " + (
+            self.why
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate:
+    """What an observer says of a record; arrays are (N, ...), time first, read-only.
+
+    Attributes
+    ----------
+    observer : Observer or FaultDetector
+    record : Record
+        With ``time``, ``u``, ``y``, which the estimate has too.
+    xhat, fhat, x_lower, x_upper, f_lower, f_upper : (N, n or n_f)
+        What ``observer.step`` returned at that instant; with ``fault_delay = 1`` the fault columns
+        at k speak of instant k - 1, and ``estimate[name]`` aligns them.
+    status : (N,) int
+        Bit mask of the step.
+    alarm : (N, n_f) bool or None
+        Alarms of a fault detector; None where an observer ran alone.
+    blamed : tuple of str
+        Outputs without each of which the first void instant would not be void.
+    """
+
+    observer: Any
+    record: Record
+    xhat: FloatArray
+    fhat: FloatArray
+    x_lower: FloatArray
+    x_upper: FloatArray
+    f_lower: FloatArray
+    f_upper: FloatArray
+    status: NDArray[np.int64]
+    alarm: BoolArray | None = None
+    blamed: tuple[str, ...] = ()
+
+    @property
+    def time(self) -> FloatArray:
+        """Time in seconds, (N,)."""
+        return self.record.time
+
+    t = time
+
+    @property
+    def u(self) -> FloatArray:
+        """The inputs, (N, n_u)."""
+        return self.record.u
+
+    @property
+    def y(self) -> FloatArray:
+        """The readings, (N, m)."""
+        return self.record.y
+
+    @property
+    def reference(self) -> FloatArray:
+        """The channels that no observer reads, (N, channels)."""
+        return self.record.reference
+
+    @cached_property
+    def names(self) -> Mapping[str, tuple[str, ...]]:
+        """Signal names by group: "x", "f", "u", "y", "reference"."""
+        model = self.observer.model
+        return {"x": model.names("x"), "f": model.names("f"), **self.record.names}
+
+    @cached_property
+    def units(self) -> Mapping[str, tuple[str, ...]]:
+        """Their units."""
+        own = {k: tuple(s.unit for s in getattr(self.observer.model, k)) for k in ("x", "f")}
+        return {**own, **self.record.units}
+
+    @property
+    def fault_delay(self) -> int:
+        """How many samples the fault columns lag behind."""
+        return int(self.observer.fault_delay)
+
+    @property
+    def method(self) -> str:
+        """The name of the observer's method."""
+        return str(self.observer.method)
+
+    @property
+    def scenario(self) -> str:
+        """Where the record came from."""
+        return self.record.source
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Names of all signals with an estimate: states, then faults."""
+        return self.names["x"] + self.names["f"]
+
+    def __getitem__(self, name: str) -> Trace:
+        return take(self, name)
+
+    @property
+    def status_shares(self) -> dict[str, float]:
+        """Shares of the instants with status 0 ("ok") and with each bit, by its name."""
+        bits = {name: float(np.mean(self.status & bit > 0)) for name, bit in STATUS.items()}
+        return {"ok": float(np.mean(self.status == 0)), **bits}
+
+    @property
+    def first(self) -> dict[str, int | None]:
+        """The first instant with each bit of the status; None where it was never set."""
+        at = {name: np.flatnonzero(self.status & bit) for name, bit in STATUS.items()}
+        return {name: int(k[0]) if k.size else None for name, k in at.items()}
+
+    def widths(self) -> dict[str, dict[str, float]]:
+        """Half widths of every state and fault over the record.
+
+        Returns
+        -------
+        dict of name to dict
+            ``median`` and ``largest`` half width of the finite intervals, the share of instants at
+            which it is ``finite``, and the median as a share ``of_range`` of the half range.
+        """
+        found = {}
+        boxes = np.vstack([self.observer.model.box(k).reshape(-1, 2) for k in ("x", "f")])
+        for name, box in zip(self.estimated, boxes, strict=True):
+            trace = self[name]
+            half = trace.half_width
+            known = half[np.isfinite(half) & trace.valid]
+            middle, most = (np.median(known), known.max()) if known.size else (np.inf, np.inf)
+            size = 0.5 * (box[1] - box[0])
+            share = middle / size if 0 < size < np.inf else np.nan
+            numbers = (middle, most, known.size / len(half), share)
+            words = ("median", "largest", "finite", "of_range")
+            found[name] = dict(zip(words, map(float, numbers), strict=True))
+        return found
+
+    @cached_property
+    def y_range(self) -> tuple[FloatArray, FloatArray]:
+        """What the sets and the bounds of the noise allow of every reading, (N, m) twice.
+
+        Intervals of nonlinear outputs are proved, too. Faults run over their sets of that instant,
+        over their ranges where there is none or it holds a mean.
+        """
+        model, core = self.observer.model, core_of(self.observer)
+        known = {"x": (self.x_lower, self.x_upper), "u": (self.u, self.u)}
+        if core is None or not core.mean_fault:
+            f = np.repeat(model.box("f").reshape(-1, 2).T[:, None, :], len(self.t), axis=1)
+            for j, trace in enumerate(self[name] for name in self.names["f"]):
+                ends = np.array([trace.lower, trace.upper])
+                f[:, : len(trace.t), j] = np.where(trace.valid, ends, f[:, : len(trace.t), j])
+            known["f"] = (f[0], f[1])
+        own = self.names["reference"]
+        if model.rho:
+            box = model.box("rho")
+            rho = np.repeat(box.T[:, None, :], len(self.t), axis=1)
+            for j, signal in enumerate(model.rho):
+                if signal.measured and signal.name in own:
+                    rho[:, :, j] = self.record[signal.name]
+            known["rho"] = (rho[0], rho[1])
+        return allowed(model, **known)
+
+    @property
+    def consistent(self) -> float:
+        """Share of readings inside of what the sets allow, of those that sets say anything of."""
+        lower, upper = self.y_range
+        said = np.isfinite(self.y) & (np.isfinite(lower) | np.isfinite(upper))
+        inside = (lower <= self.y) & (self.y <= upper)
+        return float(inside[said].mean()) if said.any() else float("nan")
+
+    @property
+    def use(self) -> dict[str, float]:
+        """How much of what the sets allow the readings took, by the names of the outputs.
+
+        The largest distance of a reading from the middle of its interval, as a share of the half
+        width: above 1 is a contradiction; far below 1 says that the bounds are loose.
+        """
+        lower, upper = self.y_range
+        with np.errstate(invalid="ignore"):
+            share = np.abs(self.y - 0.5 * (lower + upper)) / (0.5 * (upper - lower))
+        share = np.where(np.isfinite(share), share, 0.0)
+        return dict(zip(self.names["y"], share.max(axis=0).tolist(), strict=True))
+
+    @cached_property
+    def _missed(self) -> BoolArray:
+        """Where a valid interval of this call misses the declared range, (N, n + n_f)."""
+        low, high = np.hstack([self.x_lower, self.f_lower]), np.hstack([self.x_upper, self.f_upper])
+        boxes = np.vstack([self.observer.model.box(k).reshape(-1, 2) for k in ("x", "f")])
+        missed = (low > boxes[:, 1]) | (high < boxes[:, 0])
+        missed[self.status & STATUS["fault_not_valid"] > 0, len(self.names["x"]) :] = False
+        return np.asarray(missed)
+
+    @property
+    def conflict(self) -> IntArray:
+        """Instants at which an interval misses its declared range: an assumption is broken."""
+        return np.flatnonzero(self._missed.any(axis=1))
+
+    @property
+    def refuted(self) -> Refutation | None:
+        """The first instant that is void or in conflict, with the signals; None if none is."""
+        void = np.flatnonzero(self.status & STATUS["void"])
+        both = np.concatenate([void, self.conflict])
+        if not both.size:
+            return None
+        k = int(both.min())
+        if k in void:
+            told = ", ".join(self.blamed) or "no reading alone"
+            why = f"a set is empty or a reading impossible; without {told} it would not be"
+            why = why if self.blamed else "a set is empty whichever single reading is left out"
+            return Refutation(k, float(self.t[k]), self.blamed, why)
+        names = tuple(n for n, m in zip(self.estimated, self._missed[k], strict=True) if m)
+        why = f"the set of {', '.join(names)} misses the declared range"
+        return Refutation(k, float(self.t[k]), names, why)
+
+    def alarms(self, persistence: int = 1) -> dict[str, IntArray]:
+        """Return the instants at which each fault was there for certain.
+
+        Parameters
+        ----------
+        persistence : int
+            Consecutive samples that count, as `FaultDetector` counts them, at which zero has to be
+            outside of the fault's interval.
+
+        Returns
+        -------
+        dict of name to (count,) int
+            Instants of the fault, which is known `fault_delay` samples later.
+        """
+        if persistence < 1:
+            raise SimulationError(f"persistence={persistence!r} is no number of samples from 1 on.")
+        skip = sum(STATUS[name] for name in SKIPPED)
+        valid, void = self.status & skip == 0, self.status & STATUS["void"] > 0
+        kept = np.flatnonzero(valid | void)
+        order = np.arange(len(kept))
+        found = {}
+        for name, low, high in zip(self.names["f"], self.f_lower.T, self.f_upper.T, strict=True):
+            hit = (((low > 0) | (high < 0)) & valid)[kept]
+            since = order - np.maximum.accumulate(np.where(hit, -1, order))
+            at = kept[hit & (since >= persistence)] - self.fault_delay
+            found[name] = at[at >= 0]
+        return found
+
+    def compare(self, scale: float | None = None, **channels: tuple[str, str]) -> Comparison:
+        """Compare a state or a fault with a channel of the record that no observer reads.
+
+        Parameters
+        ----------
+        scale : float, optional
+            Units of the signal in a unit of the channel; by default least squares of the middles of
+            the intervals.
+        **channels
+            One signal with its channel: ``leak=("pulses", "rate")`` for a counter, whose increase
+            from instant k to k + 1 is compared, ``leak=("flow", "level")`` for its values.
+
+        Returns
+        -------
+        Comparison
+
+        Examples
+        --------
+        >>> told.compare(leak=("pulses", "rate"))      # doctest: +SKIP
+        """
+        return compare_with(self, scale, channels)
+
+    def summary(self) -> Table:
+        """Widths of every state and fault, and when a fault was certain."""
+        alarms, rows = self.alarms(), []
+        for name, width in self.widths().items():
+            at = alarms.get(name)
+            since = float(self.t[at[0]]) if at is not None and at.size else None
+            share = width["of_range"]
+            rows.append([self[name].label, width["median"], width["largest"], width["finite"]])
+            rows[-1] += [None if np.isnan(share) else share, since]
+        columns = ["signal", "median half width", "largest", "finite", "of the range"]
+        title = f"{self.method} on {self.record.source}, {len(self.t)} instants"
+        return Table(title, [*columns, "certain from [s]"], rows, "; ".join(self.said))
+
+    @property
+    def said(self) -> list[str]:
+        """What there is to know beside the widths, in sentences."""
+        agree = f"{text(100 * self.consistent, 4)} % of the readings are inside of what sets allow"
+        took = ", ".join(f"{text(share, 2)} of {name}" for name, share in self.use.items())
+        lines = [f"{agree}, of whose half widths they take {took}"]
+        lines += map(str, count_status(self.status))
+        lines += list_voids(find_voids(self.status))
+        lines += [str(self.refuted)] if self.refuted else []
+        return [*lines, *getattr(self.record, "notes", ())]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the estimate says as numbers for JSON; what is no finite number is None."""
+        alarms = {
+            name: {"count": len(at), "first": int(at[0]) if at.size else None}
+            for name, at in self.alarms().items()
+        }
+        refuted, numbers = (
+            self.refuted,
+            ("fault_delay", "status_shares", "first", "consistent", "use"),
+        )
+        told: dict[str, Any] = {
+            "method": self.method,
+            "model": self.observer.model.name,
+            "source": self.record.source,
+            "instants": len(self.t),
+            **{name: getattr(self, name) for name in numbers},
+            "widths": self.widths(),
+            "conflict": self.conflict.tolist(),
+            "alarms": alarms,
+            "refuted": None if refuted is None else {**vars(refuted), "said": str(refuted)},
+            "notes": list(getattr(self.record, "notes", ())),
+        }
+        return {key: _plain(value) for key, value in told.items()}
+
+    def columns(self) -> dict[str, FloatArray]:
+        """Return every signal by its name, (N,) each, all about the instant of their row.
+
+        Faults that are known a call late stand in the row of their own instant, and are no number
+        in the last row.
+        """
+        found = {"time": self.t}
+        for group in ("u", "y", "reference"):
+            found |= zip(self.names[group], getattr(self, group).T, strict=True)
+        late, gap = self.fault_delay, np.full(self.fault_delay, np.nan)
+        for key, labels in self.observer.outputs.items():
+            array = getattr(self, key)
+            if key[0] == "f":
+                array = np.vstack([array[late:], np.repeat(gap[:, None], array.shape[1], axis=1)])
+            found |= zip(labels, array.reshape(len(self.t), -1).T, strict=True)
+        return found
+
+    def to_frame(self) -> Any:
+        """Return a ``pandas.DataFrame``: rows are instants, see `columns`."""
+        frame = import_module("pandas").DataFrame(self.columns())
+        return frame.set_index("time")
+
+    def to_xarray(self) -> Any:
+        """Return an ``xarray.Dataset`` as `Run.to_xarray` does; faults as the step gave them."""
+        attrs = {"model": self.observer.model.name, "method": self.method}
+        attrs |= {"source": self.record.source, "fault_delay": self.fault_delay}
+        return to_dataset(self, attrs)
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write `columns` as .parquet (with pyarrow) or .csv; replaced only when complete."""
+        return write_columns(path, self.columns())
+
+    def plot(self, signals: tuple[str, ...] | None = None) -> Any:
+        """Plot all estimated signals in a grid; see :func:`obsynth.evaluate.plot_run`."""
+        from obsynth.evaluate.plotting.plots import plot_run
+
+        return plot_run(self, signals)
+
+    def report(self, path: str | os.PathLike[str], **channels: tuple[str, str]) -> Path:
+        """Write one self-contained HTML page as `report` does; `channels` as in `compare`."""
+        from obsynth.evaluate.report import report
+
+        lead = str(compare_with(self, None, channels)) if channels else ""
+        return report(path, self.observer, self, lead=lead)
+
+    def __repr__(self) -> str:
+        said = str(self.refuted or "nothing refutes the assumptions")
+        return f"<Estimate by {self.method} on {self.record.source!r}, {said}>"
+
+    def __str__(self) -> str:
+        return str(self.summary())
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()
+
+
+def _plain(value: Any) -> Any:
+    """Replace numbers that are not finite by None."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return None if isinstance(value, float) and not np.isfinite(value) else value

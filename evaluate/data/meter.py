@@ -1,0 +1,114 @@
+"""An estimated signal against a meter that no observer reads."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.evaluate.errors import SimulationError
+
+KINDS = ("rate", "level")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A signal in units of the plant beside a channel in units of its own.
+
+    Attributes
+    ----------
+    signal, channel, kind : str
+    scale : float
+        Units of the signal in a unit of the channel: as given, or least squares of the middles.
+    scales : (float, float) or None
+        The scales with which every reading of the channel lies in its interval; None: none does.
+    inside : float
+        Share of instants at which the channel, times `scale`, lies in the interval.
+    false_alarms : int
+        Instants at which zero was outside of the interval and the channel was at zero.
+    first, known : int or None
+        First instant at which zero was outside and the channel was not at zero, and at which that
+        was known.
+    certain : float
+        Share of the instants at which the channel was not at zero that zero was outside at.
+    """
+
+    signal: str
+    channel: str
+    kind: str
+    scale: float
+    scales: tuple[float, float] | None
+    inside: float
+    false_alarms: int
+    first: int | None
+    known: int | None
+    certain: float
+
+    def __str__(self) -> str:
+        every = "no scale holds all readings"
+        if self.scales is not None:
+            every = "all are inside for {:.4g} to {:.4g}".format(*self.scales)
+        since = "never certain" if self.first is None else f"certain from k = {self.first}"
+        late = f" (known at {self.known})" if self.known != self.first else ""
+        return (
+            f"{self.signal} beside {self.channel}: {self.scale:.4g} a unit, "
+            f"{100 * self.inside:.4g} % inside, {every}; {since}{late}, at "
+            f"{100 * self.certain:.3g} % of its instants; {self.false_alarms} false alarms"
+        )
+
+
+def compare_with(
+    told: Any, scale: float | None, channels: Mapping[str, tuple[str, str]]
+) -> Comparison:
+    """Compare one signal of an estimate with a channel of its record."""
+    name, (channel, kind) = _checked(told, channels)
+    trace, values = told[name], told.record[channel]
+    true = np.append(np.diff(values), np.nan) if kind == "rate" else values
+    true, low, high = true[: len(trace.t)], trace.lower, trace.upper
+    known = trace.valid & np.isfinite(true) & np.isfinite(low) & np.isfinite(high)
+    there = known & (true != 0)
+    if scale is None:
+        if not there.any():
+            raise SimulationError(
+                f"{channel} is nowhere other than zero where {name} has an interval: give scale=.",
+                symbol=channel,
+            )
+        middle = 0.5 * (low + high)[there]
+        scale = float(middle @ true[there] / (true[there] @ true[there]))
+    ends = np.sort([low[there] / true[there], high[there] / true[there]], axis=0)
+    least, most = ends[0].max(initial=-np.inf), ends[1].min(initial=np.inf)
+    quiet = known & (true == 0)
+    right = least <= most and bool(np.all((low <= 0) & (high >= 0) | ~quiet))
+    inside = (low <= scale * true) & (scale * true <= high)
+    outside = np.zeros(len(true), dtype=bool)
+    at = told.alarms().get(name)
+    outside[np.flatnonzero(known & ((low > 0) | (high < 0))) if at is None else at] = True
+    first = np.flatnonzero(outside & there)
+    late = told.fault_delay if name in told.names["f"] else 0
+    return Comparison(
+        name,
+        channel,
+        kind,
+        scale,
+        (float(least), float(most)) if right else None,
+        float(inside[known].mean()),
+        int((outside & quiet).sum()),
+        int(first[0]) if first.size else None,
+        int(first[0]) + late if first.size else None,
+        float((outside & there).sum() / max(there.sum(), 1)),
+    )
+
+
+def _checked(told: Any, channels: Mapping[str, tuple[str, str]]) -> tuple[str, tuple[str, str]]:
+    """Return one signal and its channel and kind, or refuse what was given."""
+    if len(channels) != 1 or not {*channels} <= {*told.estimated}:
+        raise SimulationError(
+            f"compare takes one of {', '.join(told.estimated)} with its channel, for instance "
+            f"{told.estimated[-1]}=('meter', 'rate'); got {', '.join(channels) or 'none'}."
+        )
+    ((name, given),) = channels.items()
+    if not isinstance(given, tuple) or len(given) != 2 or given[1] not in KINDS:
+        raise SimulationError(
+            f"{name}={given!r} is no channel with 'rate' (of a counter) or 'level'.", symbol=name
+        )
+    return name, given

@@ -1,0 +1,74 @@
+"""Runs and estimates as labelled arrays, as columns, and as files."""
+
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.designs.core.files import replaced
+from obsynth.evaluate.errors import ReportError
+from obsynth.symbolic.arrays import FloatArray
+
+DIMENSIONS = {"x": "state", "f": "fault", "y": "output", "u": "input", "d": "unknown_input"}
+DIMENSIONS |= {"w": "disturbance", "rho": "scheduling", "reference": "channel"}
+CLAIMS = {"xhat": "x", "x_lower": "x", "x_upper": "x", "fhat": "f", "f_lower": "f", "f_upper": "f"}
+ROWS = 8192
+"""Rows of a text that are made at once."""
+
+
+def to_dataset(run: Any, attrs: Mapping[str, Any]) -> Any:
+    """Return what a run or an estimate holds as an ``xarray.Dataset``."""
+    import xarray as xr
+
+    coords: dict[str, Any] = {"time": ("time", run.t, {"units": "s"})}
+    groups = {key: key for key in DIMENSIONS if key in run.names} | CLAIMS
+    for group in dict.fromkeys(groups.values()):
+        dim = DIMENSIONS[group]
+        coords[dim] = (dim, np.array(run.names[group], dtype=np.str_))
+        coords[f"{dim}_unit"] = (dim, np.array(run.units[group], dtype=np.str_))
+    data: dict[str, Any] = {
+        key: (("time", DIMENSIONS[group]), getattr(run, key))
+        for key, group in groups.items()
+        if hasattr(run, key)
+    }
+    data["status"] = (("time",), run.status)
+    if run.alarm is not None:
+        data["alarm"] = (("time", "fault"), run.alarm)
+    return xr.Dataset(data, coords=coords, attrs=dict(attrs))
+
+
+def write_columns(path: str | os.PathLike[str], columns: Mapping[str, FloatArray]) -> Path:
+    """Write columns as Parquet or CSV by the ending; an existing file is replaced when complete."""
+    target = Path(path)
+    if target.suffix not in (".parquet", ".csv"):
+        raise ReportError(f"{str(target)!r} ends neither with .parquet nor .csv.", path=str(target))
+    if not target.parent.is_dir():
+        raise ReportError(f"the folder {str(target.parent)!r} does not exist.", path=str(target))
+    if target.suffix == ".csv":
+        with replaced(target) as beside:
+            _write_text(beside, columns)
+        return target
+    try:
+        pa, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        raise ReportError(
+            f"writing {target.name} needs pyarrow (pip install pyarrow); a name that ends with "
+            ".csv needs nothing.",
+            path=str(target),
+        ) from None
+    with replaced(target) as beside:
+        parquet.write_table(pa.table({key: np.asarray(v) for key, v in columns.items()}), beside)
+    return target
+
+
+def _write_text(path: Path, columns: Mapping[str, FloatArray]) -> None:
+    """Write digits from which the same numbers are read; a missing number is an empty cell."""
+    with path.open("w", encoding="utf-8") as stream:
+        stream.write(",".join(columns) + "\n")
+        for k in range(0, len(next(iter(columns.values()))), ROWS):
+            cells = [map(repr, column[k : k + ROWS].tolist()) for column in columns.values()]
+            text = "\n".join(map(",".join, zip(*cells, strict=True))) + "\n"
+            stream.write(text.replace("nan", ""))

@@ -1,0 +1,315 @@
+"""An observer on a record: the same bits as its step, and what is made of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import obsynth as ob
+from methods import METHODS, observer_of, run_of
+from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
+from obsynth.evaluate.data import estimate as module
+
+RECORD = ob.records.three_tank_leak()
+# least disturbance bounds of the record and its parameters, /reference/data.json cv.whole
+TH = {
+    "a1": 0.023763991113147354,
+    "a3": 0.021526928813387875,
+    "b1": 0.03753119977068314,
+    "b3": 0.035026740816003106,
+}
+OMEGA = 0.001568056043987548, 0.006994620522516981
+
+
+def measured(name, count=40):
+    """The first instants of a method's run as a record, one reading and one instant missing."""
+    run = run_of(name)
+    y, rho = run.y[:count].copy(), run.rho[:count]
+    y[7, -1], y[20] = np.nan, np.nan
+    names = {"u": run.names["u"], "y": run.names["y"], "reference": run.names["rho"]}
+    return ob.Record(
+        time=run.t[:count],
+        u=run.u[:count],
+        y=y,
+        reference=rho,
+        names=names,
+        units={key: ("",) * len(value) for key, value in names.items()},
+        source="a run",
+    )
+
+
+def start_of(name):
+    scenario = METHODS[name].scenario()
+    declared = ob.scenarios.gentle(observer_of(name).model).f_range
+    f_range = declared if scenario.f_range is None else scenario.f_range
+    return {"guess": scenario.guess, "x_range": scenario.x_range, "f_range": f_range}
+
+
+def called(observer, record, memory):
+    """What plain calls of the step return, by name."""
+    rows = []
+    for k in range(len(record)):
+        given = [record.u[k], record.y[k]]
+        if observer.step.n_in() == 4:
+            given.append(record.reference[k])
+        memory, *told = observer.step(memory, *given)
+        rows.append([np.array(part).ravel() for part in told])
+    names = (*STEP_OUTPUTS[1:], "alarm")
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=False))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_and_detector_tells_the_bits_of_its_step(name):
+    """Mutants: the memory of the call before; inputs of the instant before; no scheduling."""
+    record, start = measured(name), start_of(name)
+    observer = observer_of(name)
+    every = [observer, ob.FaultDetector(observer)] if METHODS[name].detects else [observer]
+    for one in every:
+        told = ob.estimate(one, record, **start)
+        expected = called(one, record, one.memory0(**start, y0=record.y[0]))
+        for key, values in expected.items():
+            found = getattr(told, key)
+            assert np.array_equal(found, values.reshape(found.shape), equal_nan=True), key
+        assert (told.alarm is None) == (one is observer)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_missing_output_costs_that_output_only(name):
+    """Sets with one reading are inside those with none, and say more wherever readings bound them.
+
+    Mutant: all readings of the instant left out where one is missing.
+    """
+    record, start = measured(name), start_of(name)
+    observer, m = observer_of(name), record.y.shape[1]
+    if m == 1:
+        pytest.skip("one output")
+    told = {}
+    for missing in ((), (m - 1,), range(m)):
+        y = record.y[:12].copy()
+        y[7] = run_of(name).y[7]
+        y[10, list(missing)] = np.nan
+        short = dataclasses.replace(
+            record, time=record.time[:12], u=record.u[:12], y=y, reference=record.reference[:12]
+        )
+        told[len(missing)] = ob.estimate(observer, short, **start)
+    states = {count: one.x_upper[10] - one.x_lower[10] for count, one in told.items()}
+    assert not told[0].status[10] & 32 and told[1].status[10] & 32 and told[m].status[10] & 32
+    assert not told[1].status[10] & (STATUS["void"] | STATUS["non_finite_input"])
+    assert np.all((told[1].x_lower >= told[m].x_lower) & (told[1].x_upper <= told[m].x_upper))
+    if np.any(states[0] < states[m]):
+        assert np.any(states[1] < states[m])
+
+
+def tanks(rate=None, factor=1.2):
+    wx, wy = factor * np.array(OMEGA)
+    return ob.plants.leaking_tanks(wx=wx, wy=wy, rate=rate, **TH)
+
+
+@pytest.fixture(scope="module")
+def told():
+    return ob.estimate(ob.IntervalObserver().design(tanks()), RECORD)
+
+
+def test_the_leak_at_the_least_bounds_of_its_record(told):
+    """The note's numbers: .0199 by one step, all readings of the meter inside, certain from 61.
+
+    Mutants: pulses of the interval before; the leak's sets one instant late.
+    """
+    assert told.widths()["leak"]["median"] <= 0.0199 and told.refuted is None
+    assert told.widths()["leak"]["of_range"] == told.widths()["leak"]["median"] / 0.05
+    beside = told.compare(leak=("pulses", "rate"), scale=0.000968)
+    assert beside.inside == 1.0 and beside.false_alarms == 0
+    assert beside.scales == pytest.approx((0.0007024857, 0.0012708368), rel=1e-3)
+    assert (told.time[beside.first], told.time[beside.known]) == (61, 62)
+    own = told.compare(leak=("pulses", "rate"))
+    assert own.scale == pytest.approx(0.000968, rel=3e-3) and own.inside == 1.0
+    at = told.time[told.alarms()["leak"]]
+    assert at[0] == 61 and np.mean(np.isin(np.arange(61, 200), at)) >= 0.604
+    assert told.consistent == 1.0 and max(told.use.values()) <= 1.0
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        ob.BoundedErrorUIO(bounds="peak"),
+        ob.BoundedErrorUIO(),
+        pytest.param(ob.SetMembershipObserver(), marks=pytest.mark.long),
+        pytest.param(ob.IntervalObserver(gains="search"), marks=pytest.mark.long),
+    ],
+)
+def test_other_methods_are_as_sharp_on_it(method):
+    told = ob.estimate(method.design(tanks()), RECORD)
+    beside = told.compare(leak=("pulses", "rate"), scale=0.000968)
+    assert told.widths()["leak"]["median"] <= 0.0199
+    assert beside.inside == 1.0 and beside.false_alarms == 0 and told.time[beside.first] == 61
+    assert told.refuted is None and told.consistent == 1.0
+
+
+def with_y(change):
+    return dataclasses.replace(RECORD, y=RECORD.y + change)
+
+
+def test_a_reading_that_is_off_refutes_the_record_and_is_named(told, monkeypatch):
+    """Mutants: the memory before the block kept for the next; the instant before."""
+    for i, name in enumerate(RECORD.names["y"]):
+        off = np.zeros((181, 3))
+        off[64, i] = 0.3
+        broken = ob.estimate(told.observer, with_y(off))
+        assert (broken.refuted.instant, broken.refuted.time) == (64, 100)
+        assert broken.refuted.signals == (name,) and broken.status[64] & 8
+        assert f"without {name} it would not be" in str(broken.refuted)
+        assert np.array_equal(broken.x_lower[:64], told.x_lower[:64])
+        assert broken.first["void"] == 64 and broken.status_shares["void"] < 0.02
+        assert np.array_equal(broken.x_lower[90:], told.x_lower[90:])
+        with monkeypatch.context() as patched:
+            patched.setattr(module, "BLOCK", 70)
+            again = ob.estimate(told.observer, broken.record)
+        assert again.blamed == (name,) and np.array_equal(again.f_lower, broken.f_lower)
+    assert told.status_shares["ok"] == 180 / 181 and told.first["fault_not_valid"] == 0
+
+
+def test_a_set_that_misses_its_declared_range_is_a_conflict():
+    """The sets of a core alone are not cut with the ranges. Mutant: upper ends not looked at."""
+    observer = ob.IntervalObserver(cuts=()).design(tanks())
+    off = np.zeros((181, 3))
+    off[64, 1] = 0.3
+    missed = {}
+    for sign in (1, -1):
+        told = ob.estimate(observer, with_y(sign * off))
+        assert not np.any(told.status & STATUS["void"])
+        assert told.conflict[0] == 64 and set(told.conflict) <= {64, 65}
+        assert told.refuted.instant == 64 and "misses the declared range" in told.refuted.why
+        missed[sign] = told.refuted.signals
+    assert missed[1] == ("e1", "h2", "leak") and "leak" in missed[-1]
+    clean = ob.estimate(observer, RECORD)
+    assert clean.conflict.size == 0 and clean.refuted is None
+
+
+def test_alarms_are_those_of_the_detector(told):
+    """Mutants: skipped samples end a count; void ones keep it."""
+    rng, late = np.random.default_rng(0), told.fault_delay
+    bits = rng.choice([0, 0, 0, 4, 8, 16, 32, 64], 181)
+    low = rng.uniform(-0.02, 0.03, (181, 1))
+    made = dataclasses.replace(told, status=bits, f_lower=low, f_upper=low + 0.03)
+    for persistence in (1, 2, 4):
+        detector = ob.FaultDetector(told.observer, persistence=persistence)
+        on = detector.alarms(low, low + 0.03, bits)[:, 0] & detector.valid(bits)
+        expected = np.flatnonzero(on) - late
+        assert made.alarms(persistence)["leak"].tolist() == expected[expected >= 0].tolist()
+    assert on.any()
+    with pytest.raises(ob.SimulationError, match="persistence=0"):
+        told.alarms(0)
+
+
+def test_a_comparison_counts_what_it_says(told):
+    """Mutants: scales of negative readings the wrong way round; quiet instants not looked at."""
+    low = np.full((181, 1), -1.0)
+    low[51:101] = 1.0
+    level = np.zeros((181, 1))
+    level[50:100], level[120:130] = 2.0, -0.5
+    names = {**RECORD.names, "reference": ("meter",)}
+    record = dataclasses.replace(RECORD, reference=level, names=names)
+    made = dataclasses.replace(
+        told, record=record, f_lower=low, f_upper=low + 2.0, status=told.status * 0
+    )
+    found = made.compare(leak=("meter", "level"))
+    assert found.scales == (0.5, 1.5) and found.false_alarms == 0 and found.inside == 1.0
+    assert found.scale == pytest.approx(50 * 2 * 2 / (50 * 4 + 10 * 0.25))
+    assert (found.first, found.known, found.certain) == (50, 51, 50 / 60)
+    late = np.roll(level, 1)
+    shifted = dataclasses.replace(made, record=dataclasses.replace(record, reference=late))
+    found = shifted.compare(leak=("meter", "level"))
+    assert found.scales is None and found.false_alarms == 1 and found.first == 51
+    assert "no scale holds all readings" in str(found)
+    assert shifted.compare(leak=("meter", "level"), scale=0.6).inside == 178 / 180
+    none = dataclasses.replace(made, record=dataclasses.replace(record, reference=0 * level))
+    for given, refusal in [
+        ({"leak": ("meter", "level")}, "nowhere other than zero"),
+        ({"leak": ("meter", "flow")}, "'rate'"),
+        ({"leek": ("meter", "rate")}, "takes one of e1, h2, e3, leak"),
+        ({}, "got none"),
+    ]:
+        with pytest.raises(ob.SimulationError, match=refusal):
+            none.compare(**given)
+    with pytest.raises(ob.PlantError, match="no channel is called 'flow'"):
+        none.compare(leak=("flow", "rate"))
+
+
+def test_what_is_allowed_holds_nonlinear_outputs():
+    """Dense sampling of the sets. Mutants: ends of one state exchanged; noise left out."""
+    name, rng = "general_uio", np.random.default_rng(1)
+    told = ob.estimate(observer_of(name), measured(name), **start_of(name))
+    lower, upper = told.y_range
+    box, shown = told.observer.model.box("w"), []
+    corners = np.array(np.meshgrid(*[[0, 1]] * 3)).reshape(3, -1).T
+    for share in [*rng.uniform(size=(200, 3)), *corners]:
+        x = told.x_lower + share[:2] * (told.x_upper - told.x_lower)
+        w = box[:, 0] + np.roll(share, 1) * (box[:, 1] - box[:, 0])
+        y = [[i + w[0], omega + w[1], i * omega / 20 + w[2]] for i, omega in x]
+        shown.append(y)
+    assert np.all(np.array(shown) >= lower - 1e-12) and np.all(np.array(shown) <= upper + 1e-12)
+    assert np.all(np.ptp(shown, axis=0) >= 0.5 * (upper - lower))
+    assert told.consistent == 1.0
+
+
+def test_columns_files_and_frames_are_the_same_numbers(told, tmp_path):
+    """Mutants: faults in the row of the call that knows them; fewer digits."""
+    import pandas as pd
+
+    path = told.write(tmp_path / "told.csv")
+    frame = told.to_frame()
+    assert frame.index.name == "time" and frame["leak_lower"].iloc[25] == told.f_lower[26, 0]
+    assert np.isnan(frame["leak_hat"].iloc[-1]) and frame["pulses"].iloc[-1] == RECORD["pulses"][-1]
+    again = pd.read_csv(path).set_index("time")
+    pd.testing.assert_frame_equal(again, frame, check_exact=True)
+    cube = told.to_xarray()
+    assert np.array_equal(cube["f_lower"], told.f_lower) and cube.attrs["fault_delay"] == 1
+    assert cube["reference"].sel(channel="pulses").shape == (181,)
+
+
+def test_a_file_is_replaced_only_when_it_is_complete(told, tmp_path, monkeypatch):
+    path = tmp_path / "told.csv"
+    path.write_text("old")
+    from obsynth.evaluate.data import tables
+
+    def breaks(*_):
+        raise OSError("full")
+
+    monkeypatch.setattr(tables, "_write_text", breaks)
+    with pytest.raises(OSError, match="full"):
+        told.write(path)
+    assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["told.csv"]
+    for bad, refusal in [("told.txt", "neither with"), ("no/told.csv", "does not exist")]:
+        with pytest.raises(ob.ObsynthError, match=refusal):
+            told.write(tmp_path / bad)
+
+
+def test_what_is_shown(told, tmp_path):
+    import json
+
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    page = told.report(tmp_path / "page.html", leak=("pulses", "rate")).read_text()
+    assert "Records" in page and "100 % inside" in page and "src=" not in page
+    assert "nothing refutes" in repr(told) and "certain from [s]" in told._repr_html_()
+    assert [ax.get_ylabel() for ax in told.plot()] == ["e1 [V]", "h2 [V]", "e3 [V]", "leak [V/s]"]
+    ob.plot_signal(told, "leak")
+    numbers = json.loads(json.dumps(told.to_dict(), allow_nan=False))
+    assert numbers["alarms"]["leak"]["first"] == 25 and numbers["refuted"] is None
+
+
+def test_a_record_of_another_plant_is_refused(told):
+    turned = dataclasses.replace(RECORD, names={**RECORD.names, "y": ("y2", "y1", "y3")})
+    with pytest.raises(ob.SimulationError, match=r"y2, y1, y3 as y; .* has y1, y2, y3"):
+        ob.estimate(told.observer, turned)
+    record = measured("qpv_observer")
+    bare = {"reference": ()}
+    without = dataclasses.replace(
+        record,
+        reference=record.reference[:, :0],
+        names=record.names | bare,
+        units=record.units | bare,
+    )
+    with pytest.raises(ob.SimulationError, match="is scheduled by theta, which the record"):
+        ob.estimate(observer_of("qpv_observer"), without)
