@@ -2,6 +2,7 @@
 
 import html
 import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import sympy as sp
@@ -10,6 +11,21 @@ from obsynth.symbolic.signals import Signal
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
+
+
+def aligned(rows: Iterable[str]) -> str:
+    """Return rows with an & before their relation as one LaTeX environment."""
+    return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
+
+
+def html_table(heads: Sequence[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
+    """Return an HTML table of plain text, without heads or caption where there are none."""
+    title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heads)
+    lines = [head] if heads else []
+    lines += ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+    lines = [f"<tr>{line}</tr>".replace("\n", "<br>") for line in lines]
+    return f"<table>{title}{''.join(lines)}</table>"
 
 
 def plant_latex(plant: "Plant") -> str:
@@ -30,8 +46,7 @@ def plant_latex(plant: "Plant") -> str:
     if plant.has_outputs:
         for name, row in zip(plant.output_names, plant.output, strict=True):
             rows.append(f"{sp.latex(sp.Symbol(name))} &= {sp.latex(row)}")
-    body = " \\\\\n".join(rows)
-    return f"\\begin{{aligned}}\n{body}\n\\end{{aligned}}"
+    return aligned(rows)
 
 
 def plant_html(plant: "Plant") -> str:
@@ -45,14 +60,9 @@ def plant_html(plant: "Plant") -> str:
     rows = [(row[0], word, *row[2:]) if row[0] in rest else row for row in rows]
     sensors = zip(plant.output_names, plant.output_ranges, plant.output_units, strict=True)
     rows += [(name, "output", _span(*ends), "", "", unit) for name, ends, unit in sensors]
-    cells = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
     return (
         f"<p><b>{html.escape(plant.name)}</b>, {time}{method}</p>"
-        f"<div>$${html.escape(plant_latex(plant), quote=False)}$$</div>"
-        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
-        f"<tbody>{cells}</tbody></table>"
+        f"<div>$${html.escape(plant_latex(plant), quote=False)}$$</div>{html_table(heads, rows)}"
     )
 
 

@@ -74,15 +74,17 @@ class Maximum:
         """Guaranteed minus attained value."""
         return self.upper - self.attained
 
+    @property
+    def where(self) -> str:
+        """The point as text."""
+        return ", ".join(f"{name} = {value:.6g}" for name, value in self.at.items())
+
     def __float__(self) -> float:
         return self.upper
 
     def __str__(self) -> str:
-        where = ", ".join(f"{name} = {value:.6g}" for name, value in self.at.items())
-        word = str(self.status).split(":")[0]
-        return f"{self.upper:.8g} ({word}, gap {self.gap:.1e}; {self.method})" + (
-            f" at {where}" if where else ""
-        )
+        text = f"{self.upper:.8g} ({self.status.word}, gap {self.gap:.1e}; {self.method})"
+        return f"{text} at {self.where}" if self.at else text
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
 """Lipschitz, one-sided Lipschitz and quadratic inner-boundedness constants, guaranteed."""
 
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
 
 _MOST_VERTICES = 4096
@@ -77,18 +77,12 @@ class LipschitzConstants:
         return "\n".join([f"Constants of {self.what}, over the box", *lines])
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{m.upper:.8g}</td>"
-            f"<td>{m.attained:.8g}</td><td>{escape(str(m.status).split(':')[0])}</td>"
-            f"<td>{escape(m.method)}</td>"
-            f"<td>{escape(', '.join(f'{k} = {v:.6g}' for k, v in m.at.items()))}</td></tr>"
+        heads = ("", "guaranteed", "attained", "status", "by", "at")
+        rows = [
+            (name, f"{m.upper:.8g}", f"{m.attained:.8g}", m.status.word, m.method, m.where)
             for name, m in self._rows()
-        )
-        return (
-            f"<table><caption>Constants of {escape(self.what)}, over the box</caption>"
-            "<tr><th></th><th>guaranteed</th><th>attained</th><th>status</th><th>by</th>"
-            f"<th>at</th></tr>{rows}</table>"
-        )
+        ]
+        return html_table(heads, rows, f"Constants of {self.what}, over the box")
 
 
 def lipschitz(

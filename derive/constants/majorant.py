@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import numpy as np
@@ -24,6 +23,7 @@ from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian
 from obsynth.derive.rigour import up
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,7 @@ class Majorant:
     @property
     def status(self) -> Status:
         """The worst status of all groups."""
-        order = list(Status)
-        found = [group[2].status for group in self.groups]
-        return max(found, key=order.index, default=Status.EXACT)
+        return Status.worst(group[2].status for group in self.groups)
 
     def _lines(self) -> list[tuple[str, str]]:
         names = self.split.model.names("x")
@@ -80,9 +78,8 @@ class Majorant:
                 f"g of {', '.join(names[i] for i in rows)} by "
                 f"{', '.join(names[j] for j in columns)}"
             )
-            word = str(largest.status).split(":")[0]
-            where = ", ".join(f"{k} = {v:.6g}" for k, v in largest.at.items())
-            lines.append((what, f"{largest.attained:.10g} of 1 attained ({word}) at {where}"))
+            reached = f"{largest.attained:.10g} of 1 attained ({largest.status.word})"
+            lines.append((what, f"{reached} at {largest.where}"))
         return lines
 
     def __str__(self) -> str:
@@ -96,14 +93,7 @@ class Majorant:
         )
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{escape(text)}</td></tr>"
-            for name, text in self._lines()
-        )
-        return (
-            f"<table><caption>Majorant of g of {escape(self.split.model.name)}</caption>{rows}"
-            "</table>"
-        )
+        return html_table((), self._lines(), f"Majorant of g of {self.split.model.name}")
 
 
 def majorant(

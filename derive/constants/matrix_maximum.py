@@ -138,12 +138,12 @@ def _blocks(size: int, places: list[tuple[int, int]], fixed: FloatArray) -> list
 
 def _larger(a: Maximum, b: Maximum, rtol: float) -> Maximum:
     above, below = (a if a.upper >= b.upper else b), (a if a.attained >= b.attained else b)
-    status = max(a, b, key=lambda m: list(Status).index(m.status)).status
+    status = Status.worst([a.status, b.status])
     gap = above.upper - below.attained
     if gap <= max(above.gap, below.gap) and above.status is Status.EXACT is below.status:
         status = Status.EXACT
-    elif gap <= rtol * abs(below.attained):
-        status = min(status, Status.CONVERGED, key=list(Status).index)
+    elif gap <= rtol * abs(below.attained) and status is not Status.EXACT:
+        status = Status.CONVERGED
     return Maximum(above.upper, below.attained, below.at, status, above.method, a.boxes + b.boxes)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -42,23 +42,18 @@ def short(expression: sp.Expr) -> sp.Expr:
     return expression.func(*[short(a) if isinstance(a, sp.Expr) else a for a in expression.args])
 
 
-class Layout(ABC):
+@dataclass(frozen=True)
+class Layout:
     """Where the blocks of a form stand in one matrix, the rows of the dynamics first.
 
-    BLOCKS: every block, whether it stands in the dynamics or in the outputs, and its columns
+    blocks: what the columns of every block multiply, those in the dynamics, those in the outputs
+    heights: number of states and of outputs
+    widths: columns by what they multiply, from left to right
     """
 
-    BLOCKS: ClassVar[dict[str, tuple[str, str]]]
-
-    @property
-    @abstractmethod
-    def heights(self) -> tuple[int, int]:
-        """Number of states and of outputs."""
-
-    @property
-    @abstractmethod
-    def widths(self) -> dict[str, int]:
-        """Columns by what they multiply, from left to right."""
+    blocks: tuple[dict[str, str], dict[str, str]]
+    heights: tuple[int, int]
+    widths: dict[str, int]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,18 +62,18 @@ class Layout(ABC):
 
     def place(self, block: str) -> tuple[slice, slice]:
         """Rows and columns of a block."""
-        if block not in self.BLOCKS:
-            raise DerivationError(
-                f"there is no block {block!r}; there are {', '.join(self.BLOCKS)}", block=block
-            )
-        where, factor = self.BLOCKS[block]
+        dynamics, outputs = self.blocks
+        if block not in dynamics | outputs:
+            listed = ", ".join(dynamics | outputs)
+            raise DerivationError(f"there is no block {block!r}; there are {listed}", block=block)
         n, m = self.heights
-        start = 0
-        for name, width in self.widths.items():
-            if name == factor:
-                break
-            start += width
-        rows = slice(0, n) if where == "dynamics" else slice(n, n + m)
+        factor, rows = (
+            (dynamics[block], slice(0, n))
+            if block in dynamics
+            else (outputs[block], slice(n, n + m))
+        )
+        names = list(self.widths)
+        start = sum(self.widths[name] for name in names[: names.index(factor)])
         return rows, slice(start, start + self.widths[factor])
 
     def unfold(self, block: str, values: FloatArray) -> FloatArray:
@@ -86,8 +81,24 @@ class Layout(ABC):
         return values
 
 
+class Blocks(ABC):
+    """Something made of blocks, which are its attributes."""
+
+    layout: Layout
+
+    @abstractmethod
+    def block(self, name: str) -> Any:
+        """Return a block."""
+
+    def __getattr__(self, name: str) -> Any:
+        layout = self.__dict__.get("layout")
+        if layout is None or not any(name in blocks for blocks in layout.blocks):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return self.block(name)
+
+
 @dataclass(frozen=True, eq=False)
-class Vertices:
+class Vertices(Blocks):
     """The blocks of a form at the vertices of its scheduling variables.
 
     Attributes
@@ -95,7 +106,7 @@ class Vertices:
     family : AffineFamily
         The stacked matrix, affine in the scheduling variables; its radius bounds the rounding.
     layout : Layout
-        Where the blocks are.
+        Where the blocks are. Each is an attribute: ``A`` of shape (V, n, n), ``B`` (V, n, n_u), ...
 
     Notes
     -----
@@ -136,19 +147,9 @@ class Vertices:
         """Elementwise bound of the rounding of a block, shape (rows, columns)."""
         return self.layout.unfold(name, self.family.radius[self.layout.place(name)])
 
-    @property
-    def A(self) -> FloatArray:
-        """Vertices of A, shape (V, n, n)."""
-        return self.block("A")
-
-    @property
-    def B(self) -> FloatArray:
-        """Vertices of B, shape (V, n, n_u)."""
-        return self.block("B")
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class VaryingForm:
+class VaryingForm(Blocks):
     """A plant as constant plus varying matrices, stacked in one.
 
     Attributes
@@ -156,7 +157,8 @@ class VaryingForm:
     matrix : sympy.Matrix
         All blocks stacked, exact, as functions of the plant's signals; see `block`.
     layout : Layout
-        Where the blocks are.
+        Where the blocks are. Each is an attribute: the state matrix ``A``, shape (n, n), the input
+        matrix ``B`` (n, n_u), the output matrix ``C`` (m, n), ...
     schedule : AffineSchedule
         The same matrix, affine in the scheduling variables.
     proof : FormProof
@@ -174,7 +176,7 @@ class VaryingForm:
         Parameters
         ----------
         name : str
-            One of ``layout.BLOCKS``: ``"A"``, ``"B"``, ``"C"``, ...
+            One of ``layout.blocks``: ``"A"``, ``"B"``, ``"C"``, ...
 
         Returns
         -------
@@ -182,21 +184,6 @@ class VaryingForm:
             As a function of the plant's signals.
         """
         return self.matrix[self.layout.place(name)]
-
-    @property
-    def A(self) -> sp.Matrix:
-        """State matrix, shape (n, n)."""
-        return self.block("A")
-
-    @property
-    def B(self) -> sp.Matrix:
-        """Input matrix, shape (n, n_u)."""
-        return self.block("B")
-
-    @property
-    def C(self) -> sp.Matrix:
-        """Output matrix, shape (m, n)."""
-        return self.block("C")
 
     @property
     def scheduling(self) -> tuple[SchedulingVariable, ...]:

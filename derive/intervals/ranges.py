@@ -1,6 +1,6 @@
 """Guaranteed ranges of expressions over a box: the way into the interval engine."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -225,6 +225,16 @@ class Status(StrEnum):
     BUDGET = "budget: the bound is valid but looser than asked; raise the effort"
     UNBOUNDED = "unbounded: no finite bound over the box"
 
+    @property
+    def word(self) -> str:
+        """The sentence in one word."""
+        return self.value.split(":")[0]
+
+    @classmethod
+    def worst(cls, found: Iterable["Status"]) -> "Status":
+        """Return the worst of several; EXACT of none."""
+        return max(found, key=list(cls).index, default=cls.EXACT)
+
 
 EFFORTS = {
     "fast": Budget(boxes=4_000, sweeps=60),
@@ -287,11 +297,7 @@ class Ranges:
     @property
     def status(self) -> list[Status]:
         """The worse status of the two bounds of every expression."""
-        order = list(Status)
-        return [
-            max(pair, key=order.index)
-            for pair in zip(self.status_lower, self.status_upper, strict=True)
-        ]
+        return list(map(Status.worst, zip(self.status_lower, self.status_upper, strict=True)))
 
 
 def bound_ranges(

@@ -39,6 +39,7 @@ from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.discretise import runge_kutta
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
@@ -254,38 +255,39 @@ class JacobianBounds:
         """Elementwise rounding of the vertices, shape (n, k)."""
         return self.family.radius
 
-    def __str__(self) -> str:
-        count = self.family.vertex_count
+    @property
+    def counted(self) -> str:
+        """How many vertices there are, as text."""
         kind = "exact" if self.family.exact else "outer"
-        lines = [
-            f"{int(self.varying.sum())} varying entries, {count} vertices ({kind}) "
-            f"in place of {self.naive_vertex_count}",
-        ]
+        count = f"{self.family.vertex_count} vertices ({kind})"
+        return f"{count} in place of {self.naive_vertex_count}"
+
+    def __str__(self) -> str:
+        lines = [f"{int(self.varying.sum())} varying entries, {self.counted}"]
         for (i, j), status in np.ndenumerate(self.status):
             if self.varying[i, j]:
-                word = str(status).split(":")[0]
                 lines.append(
                     f"  {entry_name((i, j))} in [{self.min[i, j]:.8g}, {self.max[i, j]:.8g}]  "
-                    f"gap {self.gap[i, j]:.1e}  {word}"
+                    f"gap {self.gap[i, j]:.1e}  {status.word}"
                 )
         lines += [f"  {d}" for d in self.dependences if d.coefficients]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{entry_name((i, j))}</td><td>{self.min[i, j]:.8g}</td>"
-            f"<td>{self.max[i, j]:.8g}</td><td>{self.gap[i, j]:.1e}</td>"
-            f"<td>{str(s).split(':')[0]}</td></tr>"
-            for (i, j), s in np.ndenumerate(self.status)
-            if self.varying[i, j]
-        )
+        rows = [
+            (
+                entry_name(p),
+                f"{self.min[p]:.8g}",
+                f"{self.max[p]:.8g}",
+                f"{self.gap[p]:.1e}",
+                s.word,
+            )
+            for p, s in np.ndenumerate(self.status)
+            if self.varying[p]
+        ]
         reasons = "".join(f"<li>{d}</li>" for d in self.dependences if d.coefficients)
-        kind = "exact" if self.family.exact else "outer"
-        return (
-            "<table><tr><th>entry</th><th>min</th><th>max</th><th>gap</th><th>status</th></tr>"
-            f"{rows}</table><p>{self.family.vertex_count} vertices ({kind}) in place of "
-            f"{self.naive_vertex_count}</p><ul>{reasons}</ul>"
-        )
+        table = html_table(("entry", "min", "max", "gap", "status"), rows)
+        return f"{table}<p>{self.counted}</p><ul>{reasons}</ul>"
 
 
 def _refuse(entries: JacobianEntries, ranges: Ranges, what: str) -> None:
@@ -387,7 +389,8 @@ def _assemble(entries: JacobianEntries, ranges: Ranges, shape: tuple[int, int]) 
         name: np.zeros(shape) for name in ("min", "max", "attained_min", "attained_max", "gap")
     }
     where = np.full((*shape, 2, len(entries.names)), np.nan)
-    status = np.full(shape, Status.EXACT, dtype=object)
+    # NumPy would fill with plain text
+    status = np.array([Status.EXACT] * (shape[0] * shape[1]), dtype=object).reshape(shape)
     bounds: dict[tuple[int, int], tuple[float, float]] = {}
     supports: dict[tuple[int, int], tuple[str, ...]] = {}
     judged = ranges.status

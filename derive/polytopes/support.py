@@ -71,7 +71,7 @@ class Group:
         return max(1.0 - hull_volume(self.attained) / volume, 0.0) if volume > 0.0 else 0.0
 
     def __str__(self) -> str:
-        names, word = ", ".join(map(entry_name, self.places)), str(self.label).split(":")[0]
+        names, word = ", ".join(map(entry_name, self.places)), self.label.value.split(":")[0]
         text = (
             f"{names}: {len(self.polytope.vertices)} vertices ({word}) in place of "
             f"{2 ** len(self.scalars)}"
@@ -174,7 +174,7 @@ class JacobianPolytope:
         return bool((np.abs(matrix - self.family.at(scalars)) <= self.radius).all())
 
     def __str__(self) -> str:
-        word = str(self.label).split(":")[0]
+        word = self.label.value.split(":")[0]
         lines = [
             f"{self.vertex_count} vertices ({word}) in place of {self.box_vertex_count} of the "
             f"box of scalars and {self.naive_vertex_count} of the box of entries"

@@ -1,7 +1,6 @@
 """Intervals for the local error of a discretisation, and the plant that carries them."""
 
 from dataclasses import dataclass, replace
-from html import escape
 
 import numpy as np
 import sympy as sp
@@ -10,7 +9,10 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import Step
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+
+_HEADS = ("state", "guaranteed", "attained", "flow over a step", "unit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,18 +135,16 @@ class Remainder:
         return result
 
     def _table(self) -> list[tuple[str, ...]]:
-        rows: list[tuple[str, ...]] = []
-        for i, signal in enumerate(self.plant.x):
-            rows.append(
-                (
-                    signal.name,
-                    f"[{self.lower[i]:.4g}, {self.upper[i]:.4g}]",
-                    f"[{self.attained_lower[i]:.4g}, {self.attained_upper[i]:.4g}]",
-                    f"[{self.flow_lower[i]:.6g}, {self.flow_upper[i]:.6g}]",
-                    signal.unit,
-                )
+        return [
+            (
+                signal.name,
+                f"[{self.lower[i]:.4g}, {self.upper[i]:.4g}]",
+                f"[{self.attained_lower[i]:.4g}, {self.attained_upper[i]:.4g}]",
+                f"[{self.flow_lower[i]:.6g}, {self.flow_upper[i]:.6g}]",
+                signal.unit,
             )
-        return rows
+            for i, signal in enumerate(self.plant.x)
+        ]
 
     def _title(self) -> str:
         held = "".join(f", {k} in [{a:g}, {b:g}]" for k, (a, b) in self.assumed.items())
@@ -154,9 +154,8 @@ class Remainder:
         )
 
     def __str__(self) -> str:
-        head = ("state", "guaranteed", "attained", "flow over a step", "unit")
-        table = [head, *self._table()]
-        widths = [max(len(row[k]) for row in table) for k in range(len(head))]
+        table = [_HEADS, *self._table()]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
             "  " + "  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip()
             for row in table
@@ -164,12 +163,4 @@ class Remainder:
         return "\n".join([self._title(), *lines])
 
     def _repr_html_(self) -> str:
-        head = "".join(
-            f"<th>{word}</th>"
-            for word in ("state", "guaranteed", "attained", "flow over a step", "unit")
-        )
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in self._table()
-        )
-        return f"<table><caption>{escape(self._title())}</caption><tr>{head}</tr>{rows}</table>"
+        return html_table(_HEADS, self._table(), self._title())

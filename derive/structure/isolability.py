@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
 from obsynth.derive.structure.frozen import freeze, original, precision, rank, transfer
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
 
 # Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
@@ -123,17 +123,11 @@ class FaultIsolability:
         return "; ".join(parts)
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{escape(name)}</th>" for name in self.faults)
-        rows = "".join(
-            f"<tr><th>{escape(name)}</th><td>{'yes' if seen else 'no'}</td>"
-            + "".join(f"<td>{'yes' if ok else '&middot;'}</td>" for ok in row)
-            + "</tr>"
+        rows = [
+            (name, "yes" if seen else "no", *("yes" if ok else "\u00b7" for ok in row))
             for name, seen, row in zip(self.faults, self.detectable, self.isolable, strict=True)
-        )
-        return (
-            f"<table><caption>{escape(str(self))}</caption>"
-            f"<tr><th>fault</th><th>seen</th>{head}</tr>{rows}</table>"
-        )
+        ]
+        return html_table(("fault", "seen", *self.faults), rows, str(self))
 
 
 def fault_isolability(model: Plant) -> FaultIsolability:

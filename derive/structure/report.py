@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import TypeVar
 
 import numpy as np
 
 from obsynth.derive.equilibrium import Equilibrium
+from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.split import Split, split
 from obsynth.derive.structure.conditions import (
@@ -24,6 +24,7 @@ from obsynth.derive.structure.zeros import (
     separable_faults,
     zeros_over_polytope,
 )
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
 
@@ -93,13 +94,9 @@ class StructureReport:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        marks = {True: "&#10003;", False: "&#10007;", None: ""}
-        rows = "".join(
-            f"<tr><td>{marks[c.passed]}</td><th style='text-align:left'>{escape(c.title)}</th>"
-            f"<td style='text-align:left'>{escape(c.text).replace(chr(10), '<br>')}</td></tr>"
-            for c in self.checks
-        )
-        return f"<table><caption>Structure of {escape(self.plant)}</caption>{rows}</table>"
+        marks = {True: "\u2713", False: "\u2717", None: ""}
+        rows = [(marks[check.passed], check.title, check.text) for check in self.checks]
+        return html_table((), rows, f"Structure of {self.plant}")
 
 
 def _signals(model: Plant) -> str:
@@ -234,10 +231,7 @@ def _decouple(part: Split) -> tuple[bool, str]:
 
 def _bounds(part: Split) -> tuple[JacobianBounds, str]:
     bounds = jacobian_bounds(part)
-    worst = max(
-        (str(s).split(":")[0] for s in bounds.status.ravel()),
-        key=["exact", "converged", "budget"].index,
-    )
+    worst = Status.worst(bounds.status.ravel()).word
     varying = int(bounds.varying.sum())
     words = "1 entry of dg/dx varies" if varying == 1 else f"{varying} entries of dg/dx vary"
     return bounds, f"{words}; worst status {worst}"

@@ -178,7 +178,7 @@ class QPVDesign(Record):
         """Where the blocks of the family are."""
         plant = self.plant
         n = len(plant.x) + len(plant.f)
-        return QPVLayout(n, len(plant.output), len(plant.u), 0, 0, len(plant.w))
+        return QPVLayout.of(n, len(plant.output), len(plant.u), 0, 0, len(plant.w))
 
     @cached_property
     def data(self) -> VertexData:
@@ -231,7 +231,7 @@ class QPVDesign(Record):
             "coordinates of error": (self.error.dimension, len(places)),
         }
         if noise is not None:
-            wanted = layout.disturbances + len(noise.faults)
+            wanted = layout.widths["w"] + len(noise.faults)
             sizes["noise weights"] = (noise.weights.size, wanted)
         for name, (found, needed) in sizes.items():
             if found != needed:

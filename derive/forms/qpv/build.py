@@ -76,7 +76,8 @@ def qpv(
             degree=None,
         )
     plant = augment_plant(model, augment, effectiveness)
-    layout = QPVLayout.of(plant)
+    signals = (plant.states, plant.outputs, model.u, model.d, plant.faults, model.w)
+    layout = QPVLayout.of(*map(len, signals))
     entries = read_coefficients(plant, layout, form_of_N)
     matrix = sp.zeros(*layout.shape)
     for place, value in entries.items():

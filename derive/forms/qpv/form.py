@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from html import escape
-from typing import ClassVar, Literal
+from typing import Literal
 
 import casadi as ca
 import sympy as sp
@@ -13,67 +13,31 @@ from obsynth.derive.forms.qpv.augment import Augmented
 from obsynth.derive.forms.varying import Layout, VaryingForm, Vertices, casadi_elements, short
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.display import aligned, html_table
 from obsynth.symbolic.plant import Plant
 
+_DYNAMICS = {"c": "1", "A": "x", "N": "xx", "M": "ux", "B": "u", "D": "d", "B_f": "f", "G": "w"}
+_OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset": "1"}
 
-@dataclass(frozen=True)
+
 class QPVLayout(Layout):
     """Columns [c A N M B D B_f G] over the rows of the dynamics, then of the outputs.
 
     A row of N holds the matrix N_i row by row, a row of M the rows of M_1, M_2, ... one after the
     other.
-
-    states, outputs, inputs, unknown, faults, disturbances: numbers of signals, states after
-        augmentation
     """
 
-    BLOCKS: ClassVar[dict[str, tuple[str, str]]] = {
-        "c": ("dynamics", "1"),
-        "A": ("dynamics", "x"),
-        "N": ("dynamics", "xx"),
-        "M": ("dynamics", "ux"),
-        "B": ("dynamics", "u"),
-        "D": ("dynamics", "d"),
-        "B_f": ("dynamics", "f"),
-        "G": ("dynamics", "w"),
-        "C": ("outputs", "x"),
-        "feedthrough": ("outputs", "u"),
-        "D_f": ("outputs", "f"),
-        "H": ("outputs", "w"),
-        "output_offset": ("outputs", "1"),
-    }
-
-    states: int
-    outputs: int
-    inputs: int
-    unknown: int
-    faults: int
-    disturbances: int
-
     @classmethod
-    def of(cls, plant: Augmented) -> QPVLayout:
-        """Return the layout of an augmented plant."""
-        model = plant.model
-        return cls(
-            len(plant.states),
-            len(plant.outputs),
-            len(model.u),
-            len(model.d),
-            len(plant.faults),
-            len(model.w),
-        )
+    def of(cls, n: int, m: int, n_u: int, n_d: int, n_f: int, n_w: int) -> QPVLayout:
+        """Return the layout for numbers of signals, states after augmentation."""
+        counts = (1, n, n * n, n * n_u, n_u, n_d, n_f, n_w)
+        widths = dict(zip(_DYNAMICS.values(), counts, strict=True))
+        return cls((_DYNAMICS, _OUTPUTS), (n, m), widths)
 
     @property
-    def heights(self) -> tuple[int, int]:
-        """Number of states and of outputs."""
-        return self.states, self.outputs
-
-    @property
-    def widths(self) -> dict[str, int]:
-        """Columns by the signals they multiply."""
-        n, k = self.states, self.inputs
-        counts = (1, n, n * n, n * k, k, self.unknown, self.faults, self.disturbances)
-        return dict(zip(("1", "x", "xx", "ux", "u", "d", "f", "w"), counts, strict=True))
+    def states(self) -> int:
+        """Number of states after augmentation."""
+        return self.heights[0]
 
     def unfold(self, block: str, values: FloatArray) -> FloatArray:
         """Give N and M their shapes, (n, n, n) and (n_u, n, n)."""
@@ -90,10 +54,6 @@ class QPVLayout(Layout):
         """Column of the entry (a, b) of N_i."""
         return self.start("N") + a * self.states + b
 
-    def bilinear(self, j: int, a: int) -> int:
-        """Column of u_j x_a."""
-        return self.start("M") + j * self.states + a
-
 
 @dataclass(frozen=True, eq=False)
 class QPVVertices(Vertices):
@@ -104,7 +64,8 @@ class QPVVertices(Vertices):
     family : AffineFamily
         The stacked matrix, affine in the scheduling variables; its radius bounds the rounding.
     layout : QPVLayout
-        Where the matrices are.
+        Where the matrices are: N has the shape (V, n, n, n), N[v, i] is N_i; M (V, n_u, n, n),
+        M[v, j] belongs to u_j; G (V, n, n_w), C (V, m, n), H (V, m, n_w).
 
     Notes
     -----
@@ -118,31 +79,6 @@ class QPVVertices(Vertices):
     def c(self) -> FloatArray:
         """Constant part, shape (V, n)."""
         return self.block("c")[:, :, 0]
-
-    @property
-    def N(self) -> FloatArray:
-        """Quadratic part, shape (V, n, n, n): N[v, i] is N_i."""
-        return self.block("N")
-
-    @property
-    def M(self) -> FloatArray:
-        """State-by-input terms, shape (V, n_u, n, n): M[v, j] belongs to u_j."""
-        return self.block("M")
-
-    @property
-    def G(self) -> FloatArray:
-        """Disturbances in the dynamics, shape (V, n, n_w)."""
-        return self.block("G")
-
-    @property
-    def C(self) -> FloatArray:
-        """Output matrix, shape (V, m, n)."""
-        return self.block("C")
-
-    @property
-    def H(self) -> FloatArray:
-        """Disturbances in the outputs, shape (V, m, n_w)."""
-        return self.block("H")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,7 +94,9 @@ class QPV(VaryingForm):
     matrix : sympy.Matrix
         All blocks stacked, exact.
     layout : QPVLayout
-        Where the blocks are; see `block`.
+        Where the blocks are: the constant part c (n, 1), A, B, the unknown inputs' D, B_f of the
+        faults that are no states, the disturbances' G; C, feedthrough, D_f, H of the disturbances,
+        output_offset.
     schedule : AffineSchedule
         The same, affine in scheduling variables.
     proof : FormProof
@@ -189,11 +127,6 @@ class QPV(VaryingForm):
         return self.plant.box
 
     @property
-    def c(self) -> sp.Matrix:
-        """Constant part, shape (n, 1)."""
-        return self.block("c")
-
-    @property
     def N(self) -> tuple[sp.Matrix, ...]:
         """Quadratic part: row i is x'N_i x."""
         n = self.layout.states
@@ -205,42 +138,7 @@ class QPV(VaryingForm):
         """State-by-input terms: the sum of u_j M_j x."""
         n = self.layout.states
         columns = self.block("M")
-        return tuple(columns[:, j * n : (j + 1) * n] for j in range(self.layout.inputs))
-
-    @property
-    def D(self) -> sp.Matrix:
-        """Matrix of the unknown inputs, shape (n, n_d)."""
-        return self.block("D")
-
-    @property
-    def B_f(self) -> sp.Matrix:
-        """Matrix of the faults that are no states, shape (n, n_f)."""
-        return self.block("B_f")
-
-    @property
-    def G(self) -> sp.Matrix:
-        """Disturbances in the dynamics, shape (n, n_w)."""
-        return self.block("G")
-
-    @property
-    def feedthrough(self) -> sp.Matrix:
-        """Inputs in the outputs, shape (m, n_u)."""
-        return self.block("feedthrough")
-
-    @property
-    def D_f(self) -> sp.Matrix:
-        """Remaining faults in the outputs, shape (m, n_f)."""
-        return self.block("D_f")
-
-    @property
-    def H(self) -> sp.Matrix:
-        """Disturbances in the outputs, shape (m, n_w)."""
-        return self.block("H")
-
-    @property
-    def output_offset(self) -> sp.Matrix:
-        """Constant part of the outputs, shape (m, 1)."""
-        return self.block("output_offset")
+        return tuple(columns[:, j * n : (j + 1) * n] for j in range(self.layout.widths["u"]))
 
     def vertices(self) -> QPVVertices:
         """Matrices at the vertices of the scheduling variables.
@@ -304,19 +202,6 @@ class QPV(VaryingForm):
         return qpv_html(self)
 
 
-def _quadratic(form: QPV, i: int) -> sp.Expr:
-    """Quadratic part of a row as an expression."""
-    x = sp.Matrix([s.symbol for s in form.plant.states])
-    return (x.T * form.N[i] * x)[0]
-
-
-def _bilinear(form: QPV, i: int) -> sp.Expr:
-    x = sp.Matrix([s.symbol for s in form.plant.states])
-    u = [s.symbol for s in form.model.u]
-    parts = (s * (part[i, :] * x)[0] for s, part in zip(u, form.M, strict=True))
-    return sum(parts, sp.Integer(0))
-
-
 def qpv_text(form: QPV) -> str:
     """Return a quadratic form as plain text."""
     time = "x+" if form.model.Ts is not None else "x'"
@@ -324,8 +209,10 @@ def qpv_text(form: QPV) -> str:
         f"{form.model.name}: {time} = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + ...; "
         f"x = ({', '.join(form.names)}), N {form.form_of_N}"
     ]
+    x, u = sp.Matrix([s.symbol for s in form.plant.states]), [s.symbol for s in form.model.u]
     for i, name in enumerate(form.names):
-        parts = [p for p in (_quadratic(form, i), _bilinear(form, i)) if p != 0]
+        products = (s * (part[i, :] * x)[0] for s, part in zip(u, form.M, strict=True))
+        parts = [p for p in ((x.T * form.N[i] * x)[0], sum(products, sp.Integer(0))) if p != 0]
         if parts:
             listed = " + ".join(sp.sstr(short(p)) for p in parts).replace("+ -", "- ")
             lines.append(f"  {name}: {listed}")
@@ -346,21 +233,16 @@ def qpv_latex(form: QPV) -> str:
         for name, part in blocks
         if any(entry != 0 for entry in part)
     ]
-    body = " \\\\\n".join(rows)
-    return f"\\begin{{aligned}}\n{body}\n\\end{{aligned}}"
+    return aligned(rows)
 
 
 def qpv_html(form: QPV) -> str:
     """Return a quadratic form for a notebook."""
-    states = "".join(
-        f"<tr><td>{escape(s.name)}</td><td>{escape(str(s.role))}</td>"
-        f"<td>{s.lower:.6g}</td><td>{s.upper:.6g}</td></tr>"
-        for s in form.plant.states
-    )
+    states = [(s.name, str(s.role), f"{s.lower:.6g}", f"{s.upper:.6g}") for s in form.plant.states]
     scheduling = "".join(f"<li>{escape(str(v))}</li>" for v in form.scheduling)
     head, *_ = qpv_text(form).split("\n")
     return (
         f"<p><b>{escape(head)}</b></p><div>$${escape(qpv_latex(form), quote=False)}$$</div>"
-        f"<table><tr><th>state</th><th>role</th><th>min</th><th>max</th></tr>{states}</table>"
+        f"{html_table(('state', 'role', 'min', 'max'), states)}"
         f"<ul>{scheduling}<li>{escape(str(form.proof))}</li></ul>"
     )

@@ -100,7 +100,7 @@ def _columns(monomial: _Monomial, layout: QPVLayout, form_of_N: str) -> list[tup
                 return [(layout.quadratic(a, b), one)]
             return [(layout.quadratic(a, b), half), (layout.quadratic(b, a), half)]
         case (1, 1, 0, 0, 0):
-            return [(layout.bilinear(inputs[0], states[0]), one)]
+            return [(layout.start("M") + inputs[0] * layout.states + states[0], one)]
         case (0, 1, 0, 0, 0):
             return [(layout.start("B") + inputs[0], one)]
         case (0, 0, 1, 0, 0):

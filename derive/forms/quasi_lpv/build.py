@@ -7,7 +7,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.forms.quasi_lpv.form import LinearLayout, QuasiLPV, Ranging
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, Ranging, linear_layout
 from obsynth.derive.forms.quasi_lpv.options import Option
 from obsynth.derive.forms.quasi_lpv.ranking import choose
 from obsynth.derive.forms.quasi_lpv.terms import (
@@ -22,7 +22,7 @@ from obsynth.derive.forms.quasi_lpv.terms import (
     stacked_rows,
 )
 from obsynth.derive.forms.scheduling import make_schedule
-from obsynth.derive.forms.varying import prove_rows
+from obsynth.derive.forms.varying import Layout, prove_rows
 from obsynth.symbolic.plant import Plant
 
 
@@ -110,7 +110,7 @@ def quasi_lpv(
     terms, chosen, rankings, lifts = choose(
         model, rows, terms, point, alternatives, penalty, "fast"
     )
-    layout = LinearLayout.of(model)
+    layout = linear_layout(model)
     proxy = assemble(model, layout, point, terms, chosen)
     matrix = sp.ImmutableMatrix(proxy.xreplace({k.signal.symbol: k.meaning for k in lifts}))
     proof = prove_form(model, matrix, point, rows)
@@ -130,7 +130,7 @@ def quasi_lpv(
 
 def assemble(
     model: Plant,
-    layout: LinearLayout,
+    layout: Layout,
     centre: Centre,
     terms: Sequence[Term],
     chosen: Sequence[Option],

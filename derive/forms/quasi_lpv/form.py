@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
 import sympy as sp
@@ -23,50 +23,18 @@ from obsynth.derive.forms.quasi_lpv.terms import Centre
 from obsynth.derive.forms.scheduling import Lift, SchedulingVariable
 from obsynth.derive.forms.varying import Layout, VaryingForm, casadi_elements, short
 from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.display import aligned, html_table
 from obsynth.symbolic.plant import Plant
 
+_DYNAMICS = ("A", "B", "D", "B_f", "W1", "offset")
+_OUTPUTS = ("C", "feedthrough", "D_y", "D_f", "W2", "output_offset")
 
-@dataclass(frozen=True)
-class LinearLayout(Layout):
-    """Sizes of [A B D B_f W1 offset; C feedthrough D_y D_f W2 output_offset].
 
-    rows: number of states and of outputs
-    columns: number of states, inputs, unknown inputs, faults, disturbances, and 1 for the offset
-    """
-
-    BLOCKS: ClassVar[dict[str, tuple[str, str]]] = {
-        "A": ("dynamics", "x"),
-        "B": ("dynamics", "u"),
-        "D": ("dynamics", "d"),
-        "B_f": ("dynamics", "f"),
-        "W1": ("dynamics", "w"),
-        "offset": ("dynamics", "1"),
-        "C": ("outputs", "x"),
-        "feedthrough": ("outputs", "u"),
-        "D_y": ("outputs", "d"),
-        "D_f": ("outputs", "f"),
-        "W2": ("outputs", "w"),
-        "output_offset": ("outputs", "1"),
-    }
-
-    rows: tuple[int, int]
-    columns: tuple[int, int, int, int, int, int]
-
-    @classmethod
-    def of(cls, model: Plant) -> LinearLayout:
-        """Return the layout of a plant."""
-        n, n_u, n_d, n_f, n_w = (len(model.names(kind)) for kind in "xudfw")
-        return cls((n, len(model.output_names)), (n, n_u, n_d, n_f, n_w, 1))
-
-    @property
-    def heights(self) -> tuple[int, int]:
-        """Number of states and of outputs."""
-        return self.rows
-
-    @property
-    def widths(self) -> dict[str, int]:
-        """Columns by the signals they multiply."""
-        return dict(zip("xudfw1", self.columns, strict=True))
+def linear_layout(model: Plant) -> Layout:
+    """Return the layout [A B D B_f W1 offset; C feedthrough D_y D_f W2 output_offset]."""
+    widths = {kind: len(model.names(kind)) for kind in "xudfw"} | {"1": 1}
+    dynamics, outputs = (dict(zip(b, widths, strict=True)) for b in (_DYNAMICS, _OUTPUTS))
+    return Layout((dynamics, outputs), (widths["x"], len(model.output_names)), widths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +64,9 @@ class QuasiLPV(VaryingForm):
     ----------
     matrix : sympy.Matrix, shape (n + m, n + n_u + n_d + n_f + n_w + 1)
         All blocks in one matrix, exact, as functions of the plant's signals.
-    layout : LinearLayout
-        Where the blocks are; see `block`.
+    layout : Layout
+        Where the blocks are: A, B, D, B_f, W1, ``offset`` (what is left of the dynamics at the
+        centre, shape (n, 1)); C, feedthrough, D_y, D_f, W2, output_offset.
     schedule : AffineSchedule
         The same matrix, affine in the scheduling variables.
     proof : FormProof
@@ -125,11 +94,6 @@ class QuasiLPV(VaryingForm):
     ranking: tuple[RowRanking, ...]
     unfactored: tuple[tuple[str, sp.Expr, str], ...]
     ranging: Ranging
-
-    @property
-    def offset(self) -> sp.Matrix:
-        """What is left of the dynamics at the centre, shape (n, 1)."""
-        return self.block("offset")
 
     @property
     def unmeasured(self) -> tuple[SchedulingVariable, ...]:
@@ -333,42 +297,35 @@ def form_latex(form: QuasiLPV) -> str:
     for v in form.scheduling:
         own = "" if v.symbol == v.expression else f"= {sp.latex(short(v.expression))} "
         rows.append(f"{sp.latex(v.symbol)} &{own}\\in [{v.lower:.6g},\\, {v.upper:.6g}]")
-    body = " \\\\\n".join(rows)
-    return f"\\begin{{aligned}}\n{body}\n\\end{{aligned}}"
+    return aligned(rows)
 
 
 def form_html(form: QuasiLPV) -> str:
     """Return a form for a notebook: matrices, scheduling table, ranking, notes."""
-    cells = "".join(
-        f"<tr><td>{escape(str(v.symbol))}</td><td>{escape(sp.sstr(short(v.expression)))}</td>"
-        f"<td>{v.lower:.8g}</td><td>{v.upper:.8g}</td><td>{str(v.status).split(':')[0]}</td>"
-        f"<td>{'measured' if v.measured else 'needs ' + escape(', '.join(v.unmeasured))}</td></tr>"
-        for v in form.scheduling
-    )
     heads = ("variable", "function", "min", "max", "range", "known on line")
-    table = (
-        f"<table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{cells}</table>" if cells else ""
-    )
-    listed = "".join(f"<li>{escape(note)}</li>" for note in notes(form))
-    ranked = "".join(
-        f"<tr><td>{escape(r.row)}</td><td>{k + 1}</td><td>{escape(_ways(a.choices))}</td>"
-        f"<td>{a.inflation:.4g}</td><td>{escape(', '.join(a.unmeasured))}</td></tr>"
+    variables = [
+        (
+            str(v.symbol),
+            sp.sstr(short(v.expression)),
+            f"{v.lower:.8g}",
+            f"{v.upper:.8g}",
+            v.status.word,
+            "measured" if v.measured else f"needs {', '.join(v.unmeasured)}",
+        )
+        for v in form.scheduling
+    ]
+    ranked = [
+        (r.row, str(k + 1), a.ways, f"{a.inflation:.4g}", ", ".join(a.unmeasured))
         for r in form.ranking
         if r.total > 1
         for k, a in enumerate(r.alternatives)
-    )
-    ranking = (
-        "<table><tr><th>row</th><th>rank</th><th>term by divisor</th><th>inflation</th>"
-        f"<th>unmeasured</th></tr>{ranked}</table>"
-        if ranked
-        else ""
-    )
+    ]
+    listed = "".join(f"<li>{escape(note)}</li>" for note in notes(form))
+    table = html_table(heads, variables) if variables else ""
+    columns = ("row", "rank", "term by divisor", "inflation", "unmeasured")
+    ranking = html_table(columns, ranked) if ranked else ""
     latex = escape(form_latex(form), quote=False)
     return (
         f"<p><b>{escape(_title(form))}</b></p><div>$${latex}$$</div>{table}"
         f"<ul>{listed}</ul>{ranking}"
     )
-
-
-def _ways(choices: tuple[tuple[str, str], ...]) -> str:
-    return "; ".join(f"{term} by {divisor}" for term, divisor in choices)

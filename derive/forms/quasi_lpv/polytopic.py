@@ -1,7 +1,6 @@
 """Polytopic and centred versions of a linear form whose matrices are affine in scalars."""
 
 from dataclasses import dataclass, replace
-from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +9,7 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.varying import Vertices
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +42,9 @@ class PolytopicForm(Vertices):
         return f"{self.count} vertices ({kind}) over {scalars}; affine dependence proved ({ways})"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{escape(label)}</td><td>{low:.8g}</td><td>{high:.8g}</td></tr>"
-            for label, (low, high) in zip(self.family.labels, self.family.ranges, strict=True)
-        )
-        return (
-            f"<p>{escape(str(self))}</p><table><tr><th>variable</th><th>min</th><th>max</th></tr>"
-            f"{rows}</table>"
-        )
+        ends = ((f"{low:.8g}", f"{high:.8g}") for low, high in self.family.ranges)
+        rows = [(label, *pair) for label, pair in zip(self.family.labels, ends, strict=True)]
+        return html_table(("variable", "min", "max"), rows, str(self))
 
 
 @dataclass(frozen=True, eq=False)

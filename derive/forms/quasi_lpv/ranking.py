@@ -135,8 +135,13 @@ class Alternative:
     unmeasured: tuple[str, ...]
     score: float
 
+    @property
+    def ways(self) -> str:
+        """The choices as text."""
+        return "; ".join(f"{term} by {divisor}" for term, divisor in self.choices)
+
     def __str__(self) -> str:
-        ways = "; ".join(f"{term} by {divisor}" for term, divisor in self.choices) or "no choice"
+        ways = self.ways or "no choice"
         needs = f", needs {', '.join(self.unmeasured)}" if self.unmeasured else ""
         return f"{ways}: inflation {self.inflation:.3g}{needs}"
 
