@@ -18,7 +18,6 @@ from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
 
 _MOST_VERTICES = 4096
-_SAMPLES = 96
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +239,7 @@ def _smallest_ball(bounds: JacobianBounds, hull: Hull, pairs: MatrixEntries) -> 
 
     vertices, n = hull.vertices, len(bounds.min)
     if not len(vertices) or not bounds.family.exact:
-        sampled = pairs.sample(_SAMPLES)
+        sampled = pairs.sample()
         count = len(next(iter(sampled.values()))) if sampled else 0
         vertices = np.zeros((count, n, n))
         for (i, j), values in sampled.items():

@@ -188,9 +188,7 @@ def _scalars(
     """Scheduling functions, and every entry through them."""
     known = set(entries.symbols)
     parts = {place: _monomials(e, known) for place, e in entries.exact.items()}
-    basis, dependences = find_dependences(
-        entries.exact, entries.sample(_SAMPLES) if entries.exact else {}, entries.symbols
-    )
+    basis, dependences = find_dependences(entries.exact, entries.sample(), entries.symbols)
     through = {d.entry: d for d in dependences}
     scalars: list[sp.Expr] = []
     position: dict[sp.Expr, int] = {}

@@ -17,16 +17,10 @@ from numpy.typing import NDArray
 from sympy.core.relational import Relational
 
 from obsynth.derive.algebra.zero_test import is_zero, prove_zero
-from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
+from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
-from obsynth.derive.jacobian.entries import (
-    COLUMNS,
-    JacobianEntries,
-    all_variables,
-    jacobian_entries,
-    sample_entries,
-)
+from obsynth.derive.jacobian.entries import COLUMNS, all_variables, jacobian_entries
 from obsynth.derive.jacobian.family import (
     AffineDependence,
     AffineFamily,
@@ -34,6 +28,7 @@ from obsynth.derive.jacobian.family import (
     entry_name,
     find_dependences,
 )
+from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
@@ -290,37 +285,6 @@ class JacobianBounds:
         return f"{table}<p>{self.counted}</p><ul>{reasons}</ul>"
 
 
-def _refuse(entries: JacobianEntries, ranges: Ranges, what: str) -> None:
-    failures = ranges.failures
-    if not failures:
-        return
-    names = tuple(
-        f"{what}[{entries.places[f.index][0] + 1},{entries.places[f.index][1] + 1}]"
-        for f in failures
-    )
-    first = failures[0]
-    boxes = {}
-    lines = []
-    for name, failure in zip(names, failures, strict=True):
-        expression = entries.symbolic[entries.places[failure.index]]
-        relevant = [k for k, s in enumerate(entries.symbols) if expression.has(s)]
-        box = {
-            entries.names[k]: (float(failure.lower[k]), float(failure.upper[k])) for k in relevant
-        }
-        boxes[name] = box
-        where = ", ".join(f"{s} in [{lo:.9g}, {hi:.9g}]" for s, (lo, hi) in box.items())
-        lines.append(f"{name} ({failure.operation} at {where})")
-    shrink = sorted({s for box in boxes.values() for s in box})
-    raise UnboundedError(
-        f"no finite bound over the box for {'; '.join(lines)}. Keep the range of "
-        f"{', '.join(shrink)} away from there",
-        entries=names,
-        operation=first.operation,
-        sub_box=boxes[names[0]],
-        sub_boxes=boxes,
-    )
-
-
 def jacobian_bounds(
     split_or_model: Split | Plant,
     wrt: Literal["states", "inputs", "joint"] = "states",
@@ -375,16 +339,15 @@ def jacobian_bounds(
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     refuse_jumps(model.check(), outputs=joint)
     entries = jacobian_entries(model, part, wrt)
-    ranges = entries.search(rtol, effort)
     function = "d[f; h]" if joint else "dg" if part is not None else "df"
     kinds = COLUMNS[wrt]
-    _refuse(entries, ranges, f"{function}/d{''.join(kinds)}")
+    ranges = entries.ranges(rtol, effort, f"{function}/d{''.join(kinds)}")
     rows = len(model.x) + (len(model.output_names) if joint else 0)
     shape = rows, sum(len(getattr(model, kind)) for kind in kinds)
     return _assemble(entries, ranges, shape)
 
 
-def _assemble(entries: JacobianEntries, ranges: Ranges, shape: tuple[int, int]) -> JacobianBounds:
+def _assemble(entries: MatrixEntries, ranges: Ranges, shape: tuple[int, int]) -> JacobianBounds:
     filled = {
         name: np.zeros(shape) for name in ("min", "max", "attained_min", "attained_max", "gap")
     }
@@ -395,16 +358,13 @@ def _assemble(entries: JacobianEntries, ranges: Ranges, shape: tuple[int, int]) 
     supports: dict[tuple[int, int], tuple[str, ...]] = {}
     judged = ranges.status
     for k, place in enumerate(entries.places):
-        expression = entries.symbolic[place]
-        supports[place] = tuple(
-            n for n, s in zip(entries.names, entries.symbols, strict=True) if expression.has(s)
-        )
+        supports[place] = entries.support(place)
         low, high = float(ranges.lower[k]), float(ranges.upper[k])
         reached = float(ranges.attained_lower[k]), float(ranges.attained_upper[k])
         gap = float(ranges.gap[k])
         if not supports[place]:
             # a number, not below its lower bound and not above its upper one: both are passed
-            low, high = enclose_number(expression)
+            low, high = enclose_number(entries.exact[place])
             reached, gap = (high, low), 2.0 * (high - low)
         bounds[place] = (low, high)
         filled["min"][place], filled["max"][place] = low, high
@@ -413,7 +373,7 @@ def _assemble(entries: JacobianEntries, ranges: Ranges, shape: tuple[int, int]) 
         where[place][0], where[place][1] = ranges.points_lower[k], ranges.points_upper[k]
         status[place] = judged[k]
     basis, dependences = find_dependences(
-        entries.symbolic, sample_entries(entries) if entries.places else {}, entries.symbols
+        entries.exact, entries.sample(corners=False), entries.symbols
     )
     family = build_family(shape, basis, dependences, bounds, supports)
     varying = sum(1 for place in entries.places if supports[place])

@@ -1,7 +1,5 @@
 """Entries of a plant's Jacobian, in CasADi for the interval engine and in SymPy for proofs."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 import sympy as sp
@@ -10,9 +8,9 @@ from obsynth.derive.algebra.factorise import cancel_common_factors, products_to_
 from obsynth.derive.algebra.sizes import LARGEST_ROW, size, symbols
 from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.intervals.program import Program, evaluate
-from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.rewriting.removable import remove_singularities
+from obsynth.derive.jacobian.matrix_entries import KINDS, Entry, MatrixEntries
 from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
@@ -20,11 +18,8 @@ from obsynth.symbolic.convert import nearest_double, to_sx
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
 
-Entry = tuple[int, int]
-_SAMPLES = 96
 # Expanding a longer entry costs more than the zeros it may show.
 _LONG = 1000
-_KINDS = ("x", "u", "p", "rho", "d", "f", "w")
 COLUMNS = {"states": ("x",), "inputs": ("u",), "joint": ("x", "w")}
 """Kinds of signals that a Jacobian is taken by."""
 # Two forms of a row are compared on boxes of this share of the ranges.
@@ -33,47 +28,7 @@ _GAIN = 0.9
 _POINTS = 16
 
 
-@dataclass(frozen=True, eq=False)
-class JacobianEntries:
-    """Entries of the Jacobian that are not structurally zero.
-
-    places: row and column of every entry
-    values: the entries, with constants as symbols
-    variables: variables of the box: all states, and the other signals that occur
-    names, symbols: their names and SymPy symbols
-    box: their ranges
-    constants: symbols that stand for numbers
-    constant_box: their enclosures
-    symbolic: the entries, exact
-    quotients: what further symbols in the values stand for
-    """
-
-    places: list[Entry]
-    values: ca.SX
-    variables: ca.SX
-    names: tuple[str, ...]
-    symbols: list[sp.Symbol]
-    box: FloatArray
-    constants: ca.SX
-    constant_box: list[tuple[float, float]]
-    symbolic: dict[Entry, sp.Expr]
-    quotients: Quotients | None
-
-    def search(self, rtol: float, effort: str, values: ca.SX | None = None) -> Ranges:
-        """Bound every entry over the box, or other functions of the same signals."""
-        return bound_ranges(
-            self.values if values is None else values,
-            self.variables,
-            self.box,
-            self.constants,
-            self.constant_box,
-            rtol=rtol,
-            effort=effort,
-            quotients=self.quotients,
-        )
-
-
-def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntries:
+def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> MatrixEntries:
     """Collect the entries of a Jacobian that are not structurally zero.
 
     wrt: "states" or "inputs" of the right-hand side; "joint" of it and the outputs below it, by
@@ -95,7 +50,7 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
     linear = None if part is None else (part.A if kind == "x" else part.B)
     wrt_symbols = [s.symbol for k in kinds for s in getattr(model, k)]
     quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
-    places, values, shifts, shift_symbols = [], [], [], []
+    values, shifts, shift_symbols = [], [], []
     expressions: dict[Entry, sp.Expr] = {}
     for i in range(jacobian.shape[0]):
         for j in range(jacobian.shape[1]):
@@ -116,33 +71,27 @@ def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> JacobianEntr
                 exact = sp.expand(exact)
             if exact == 0:
                 continue
-            places.append((i, j))
             values.append(value)
             expressions[(i, j)] = exact
     column = ca.vertcat(*values) if values else ca.SX(0, 1)
     inner = [] if quotients is None else [q.argument for q in quotients.members]
     needed = {str(s) for s in ca.symvar(ca.vertcat(column, *inner))}
-    names: list[str] = []
-    symbols: list[sp.Symbol] = []
-    parts: list[ca.SX] = []
-    boxes: list[tuple[float, float]] = []
-    for k in _KINDS:
+    signals, parts = [], []
+    for k in KINDS:
         for signal, element in zip(getattr(model, k), ca.vertsplit(getattr(sx, k)), strict=True):
             if k == "x" or signal.name in needed:
-                names.append(signal.name)
-                symbols.append(signal.symbol)
+                signals.append(signal)
                 parts.append(element)
-                boxes.append((signal.lower, signal.upper))
-    return JacobianEntries(
-        places,
+    return MatrixEntries(
+        expressions,
         column,
         ca.vertcat(*parts),
-        tuple(names),
-        symbols,
-        np.array(boxes, dtype=float).reshape(-1, 2),
+        tuple(s.name for s in signals),
+        tuple(s.symbol for s in signals),
+        np.array([(s.lower, s.upper) for s in signals], dtype=float).reshape(-1, 2),
         ca.vertcat(sx.c, *shift_symbols),
         [*constants, *shifts],
-        expressions,
+        model,
         quotients,
     )
 
@@ -158,8 +107,8 @@ def _exact_entry(row: sp.Expr, symbol: sp.Symbol, name: str, model: Plant) -> sp
 def all_variables(model: Plant) -> tuple[ca.SX, FloatArray]:
     """Return all signals of a plant but its constants, and their ranges."""
     sx = model.sx(constants="symbol")
-    variables = ca.vertcat(*[getattr(sx, k) for k in _KINDS])
-    return variables, np.vstack([model.box(k).reshape(-1, 2) for k in _KINDS])
+    variables = ca.vertcat(*[getattr(sx, k) for k in KINDS])
+    return variables, np.vstack([model.box(k).reshape(-1, 2) for k in KINDS])
 
 
 def _differentiated(
@@ -183,7 +132,7 @@ def _preferred_rows(
     """Return every row of the plant as it is or in a form with narrower ranges."""
     sx = model.sx(constants="symbol")
     columns = ca.vertcat(sx.x, sx.u)
-    signals = [s for k in _KINDS for s in getattr(model, k)] + list(model.constants)
+    signals = [s for k in KINDS for s in getattr(model, k)] + list(model.constants)
     variables, box = all_variables(model)
     elements = ca.vertsplit(ca.vertcat(variables, sx.c))
     symbols = dict(zip((s.symbol for s in signals), elements, strict=True))
@@ -227,7 +176,7 @@ def _agree(row: sp.Expr, written: ca.SX, symbols: dict[sp.Symbol, ca.SX], model:
     numbers = [ca.DM(value) for _, value in values]
     plain = ca.substitute([written], [symbol for symbol, _ in values], numbers)[0]
     function = ca.Function("form", [variables], [plain])
-    names = [s.symbol for k in _KINDS for s in getattr(model, k)]
+    names = [s.symbol for k in KINDS for s in getattr(model, k)]
     try:
         points = sample_box(box, _POINTS)
         check_parity([row], names, lambda p: np.array(function(p)), points, ["a row"])
@@ -269,22 +218,3 @@ def _is_narrower(one: FloatArray, other: FloatArray) -> bool:
     if gained != lost:
         return gained
     return bool(known.any() and float(ratio[known].mean()) < np.log(_GAIN))
-
-
-def sample_entries(entries: JacobianEntries) -> dict[Entry, FloatArray]:
-    """Evaluate all entries at fixed random points of the box."""
-    rng = np.random.default_rng(0)
-    lower = np.where(np.isfinite(entries.box[:, 0]), entries.box[:, 0], -1.0)
-    upper = np.where(np.isfinite(entries.box[:, 1]), entries.box[:, 1], lower + 2.0)
-    # fewer samples than entries could not tell which depend on each other
-    count = max(_SAMPLES, len(entries.places) + _SAMPLES // 2)
-    points = lower + rng.random((count, len(lower))) * (upper - lower)
-    middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
-    values = entries.values
-    if entries.quotients is not None:
-        values = entries.quotients.closed(values)
-    function = ca.Function("sample", [entries.variables, entries.constants], [values])
-    result = np.array(function(points.T, np.tile(middle[:, None], (1, count))))
-    # points outside the domain of some entry say nothing about dependences
-    usable = np.isfinite(result).all(axis=0)
-    return dict(zip(entries.places, result[:, usable], strict=True))

@@ -6,7 +6,7 @@ exactly before it is rounded once.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -14,9 +14,11 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.algebra.sizes import size
 from obsynth.derive.algebra.slopes import jacobian
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
+from obsynth.derive.intervals.rewriting.quotients import Quotients
 from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.rigour import enclose_number, substitute
 from obsynth.derive.split import Split
@@ -26,8 +28,12 @@ from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
 Entry = tuple[int, int]
-_KINDS = ("x", "u", "p", "rho", "d", "f", "w")
+KINDS = ("x", "u", "p", "rho", "d", "f", "w")
+"""The order of variables."""
 _EXACT_BITS = 24
+_SAMPLES = 96
+# Parts of an expression that is written out in a refusal.
+_SHORT = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +48,7 @@ class MatrixEntries:
     constants: symbols that stand for numbers
     constant_box: their enclosures
     model: whose signals they are
+    quotients: what further symbols in the values stand for
     """
 
     exact: dict[Entry, sp.Expr]
@@ -53,6 +60,7 @@ class MatrixEntries:
     constants: ca.SX
     constant_box: list[tuple[float, float]]
     model: Plant
+    quotients: Quotients | None = None
 
     @property
     def places(self) -> list[Entry]:
@@ -64,17 +72,17 @@ class MatrixEntries:
         places = self.places
         exact = {places[k]: self.exact[places[k]] for k in which}
         present = {s for expression in exact.values() for s in expression.free_symbols}
-        kept = [k for k, s in enumerate(self.symbols) if s in present] or [0]
-        return MatrixEntries(
-            exact,
-            _column([self.values[int(k)] for k in which]),
-            _column([self.variables[k] for k in kept]),
-            tuple(self.names[k] for k in kept),
-            tuple(self.symbols[k] for k in kept),
-            self.box[kept],
-            self.constants,
-            self.constant_box,
-            self.model,
+        # arguments of quotients may hold signals that none of the entries has
+        every = self.quotients is not None
+        kept = [k for k, s in enumerate(self.symbols) if every or s in present] or [0]
+        return replace(
+            self,
+            exact=exact,
+            values=_column([self.values[int(k)] for k in which]),
+            variables=_column([self.variables[k] for k in kept]),
+            names=tuple(self.names[k] for k in kept),
+            symbols=tuple(self.symbols[k] for k in kept),
+            box=self.box[kept],
         )
 
     def problem(self) -> Problem:
@@ -93,30 +101,35 @@ class MatrixEntries:
             self.constant_box,
             rtol=rtol,
             effort=effort,
+            quotients=self.quotients,
         )
 
     def ranges(self, rtol: float, effort: str, what: str = "entry") -> Ranges:
         """Bound every entry over the box, or refuse."""
         found = self.search(rtol, effort)
-        if found.failures:
-            failure = found.failures[0]
-            i, j = self.places[failure.index]
-            expression = self.exact[(i, j)]
-            sub_box = {
+        if not found.failures:
+            return found
+        boxes, lines = {}, []
+        for failure in found.failures:
+            place = self.places[failure.index]
+            box = {
                 name: (float(failure.lower[k]), float(failure.upper[k]))
-                for k, (name, s) in enumerate(zip(self.names, self.symbols, strict=True))
-                if expression.has(s)
+                for k, name in enumerate(self.names)
+                if name in self.support(place)
             }
-            where = ", ".join(f"{n} in [{lo:.6g}, {hi:.6g}]" for n, (lo, hi) in sub_box.items())
-            raise UnboundedError(
-                f"no finite bound over the box for {what}[{i + 1},{j + 1}] = {expression} "
-                f"({failure.operation} at {where}). Keep the range of {', '.join(sub_box)} away "
-                "from there",
-                entries=(f"{what}[{i + 1},{j + 1}]",),
-                operation=failure.operation,
-                sub_box=sub_box,
-            )
-        return found
+            name = f"{what}[{place[0] + 1},{place[1] + 1}]"
+            where = ", ".join(f"{s} in [{lo:.9g}, {hi:.9g}]" for s, (lo, hi) in box.items())
+            shown = f" = {self.exact[place]}" if size(self.exact[place]) <= _SHORT else ""
+            lines.append(f"{name}{shown} ({failure.operation} at {where})")
+            boxes[name] = box
+        raise UnboundedError(
+            f"no finite bound over the box for {'; '.join(lines)}. Keep the range of "
+            f"{', '.join(sorted({s for box in boxes.values() for s in box}))} away from there",
+            entries=tuple(boxes),
+            operation=found.failures[0].operation,
+            sub_box=next(iter(boxes.values())),
+            sub_boxes=boxes,
+        )
 
     def support(self, place: Entry) -> tuple[str, ...]:
         """Names of the signals on which an entry depends."""
@@ -132,19 +145,28 @@ class MatrixEntries:
             if symbol in present
         }
 
-    def sample(self, count: int) -> dict[Entry, FloatArray]:
-        """Evaluate the entries at fixed random points and corners, those in their domain."""
+    def sample(self, corners: bool = True) -> dict[Entry, FloatArray]:
+        """Evaluate the entries at fixed random points, some of them corners, of their domain."""
+        if not self.exact:
+            return {}
         rng = np.random.default_rng(0)
+        # fewer samples than entries could not tell which depend on each other
+        count = max(_SAMPLES, len(self.exact) + _SAMPLES // 2)
         lower = np.where(np.isfinite(self.box[:, 0]), self.box[:, 0], -1.0)
         upper = np.where(np.isfinite(self.box[:, 1]), self.box[:, 1], lower + 2.0)
         share = rng.random((count, len(lower)))
-        share[: count // 3] = np.round(share[: count // 3])
-        points = lower + share * (upper - lower)
+        if corners:
+            share[: count // 3] = np.round(share[: count // 3])
+        result = self.at(lower + share * (upper - lower))
+        return dict(zip(self.places, result, strict=True))
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Evaluate the entries in doubles, shape (entries, points of (N, v) in their domain)."""
         middle = np.array([0.5 * lo + 0.5 * hi for lo, hi in self.constant_box])
-        function = ca.Function("sample", [self.variables, self.constants], [self.values])
-        result = np.array(function(points.T, np.tile(middle[:, None], (1, count))))
-        usable = np.isfinite(result).all(axis=0)
-        return dict(zip(self.places, result[:, usable], strict=True))
+        values = self.values if self.quotients is None else self.quotients.closed(self.values)
+        function = ca.Function("at", [self.variables, self.constants], [values])
+        result = np.array(function(points.T, np.tile(middle[:, None], (1, len(points)))))
+        return result[:, np.isfinite(result).all(axis=0)]
 
 
 def exact_jacobian(split_or_model: Split | Plant) -> sp.Matrix:
@@ -167,7 +189,7 @@ def matrix_entries(
         if (expression := _expanded(substitute(entries[place], model.constant_values))) != 0
     }
     present = {s for expression in exact.values() for s in expression.free_symbols}
-    available = [*(s for kind in _KINDS for s in getattr(model, kind)), *more]
+    available = [*(s for kind in KINDS for s in getattr(model, kind)), *more]
     # the interval engine wants a box, for constants as well
     signals = [s for s in available if s.symbol in present] or [model.x[0]]
     numbers: dict[sp.Expr, sp.Dummy] = {}

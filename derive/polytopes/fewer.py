@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.jacobian.bounds import jacobian_bounds
-from obsynth.derive.jacobian.entries import jacobian_entries, sample_entries
+from obsynth.derive.jacobian.entries import jacobian_entries
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.polytopes.support import basis_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
@@ -105,7 +105,7 @@ def principal_family(
         raise DerivationError(f"keep={keep} has to be between 0 and {count}, the number of scalars")
     if count == 0:
         return family
-    samples = sample_entries(entries)
+    samples = entries.sample(corners=False)
     half = np.maximum(family.half_ranges, 1e-300)
     values = np.array([samples[place] for place in basis]).T / half
     # coordinates c = axes s, and back

@@ -16,8 +16,9 @@ import numpy as np
 
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.jacobian.entries import JacobianEntries, jacobian_entries
+from obsynth.derive.jacobian.entries import jacobian_entries
 from obsynth.derive.jacobian.family import AffineFamily, entry_name
+from obsynth.derive.jacobian.matrix_entries import Entry, MatrixEntries
 from obsynth.derive.polytopes.polytope import (
     Label,
     Polytope,
@@ -30,7 +31,6 @@ from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 
-Entry = tuple[int, int]
 _MOST_VERTICES = 2**16
 _LARGEST_GROUP = 3
 # Smallest integer directions: multiples of pi/8 or so in the plane, and towards the faces, edges
@@ -246,15 +246,12 @@ def jacobian_polytope(
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     entries = jacobian_entries(model, part, wrt)
     basis = basis_entries(bounds)
-    values = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
-    named = list(zip(entries.names, entries.symbols, strict=True))
-    supports = [[n for n, s in named if entries.symbolic[place].has(s)] for place in basis]
+    supports = [entries.support(place) for place in basis]
     groups = []
     for members in groups_of(supports):
         places = tuple(basis[k] for k in members)
-        expressions = ca.vertcat(*[values[place] for place in places])
-        options = (rtol, effort, most_vertices)
-        groups.append(_group(members, places, expressions, bounds, entries, options))
+        some = entries.take([entries.places.index(place) for place in places])
+        groups.append(_group(members, places, bounds, some, (rtol, effort, most_vertices)))
     radius = _radius(bounds.family, groups)
     return JacobianPolytope(bounds.family, tuple(groups), radius, bounds.naive_vertex_count)
 
@@ -273,20 +270,6 @@ def _radius(family: AffineFamily, groups: Sequence[Group]) -> FloatArray:
     total = family.radius + moved
     total = total + np.where(sums, (4 * len(size) + 8) * UNIT_ROUNDOFF * magnitude, 0.0)
     return np.where(total > 0.0, np.nextafter(total * (1.0 + 2.0**-40), np.inf), 0.0)
-
-
-def scalar_values(
-    entries: JacobianEntries, places: Sequence[Entry], points: FloatArray
-) -> FloatArray:
-    """Evaluate entries at points of the box, in doubles."""
-    columns = dict(zip(entries.places, ca.vertsplit(entries.values), strict=True))
-    expressions = ca.vertcat(*[columns[place] for place in places])
-    if entries.quotients is not None:
-        expressions = entries.quotients.closed(expressions)
-    middle = np.array([0.5 * (lo + hi) for lo, hi in entries.constant_box])
-    function = ca.Function("scalars", [entries.variables, entries.constants], [expressions])
-    found = np.array(function(points.T, np.tile(middle[:, None], (1, len(points)))))
-    return found[:, np.isfinite(found).all(axis=0)].T
 
 
 def basis_entries(bounds: JacobianBounds) -> list[Entry]:
@@ -318,9 +301,8 @@ def _box(ranges: FloatArray) -> Polytope:
 def _group(
     members: tuple[int, ...],
     places: tuple[Entry, ...],
-    expressions: ca.SX,
     bounds: JacobianBounds,
-    entries: JacobianEntries,
+    entries: MatrixEntries,
     options: tuple[float, str, int | None],
 ) -> Group:
     ranges = bounds.family.ranges[list(members)]
@@ -337,7 +319,7 @@ def _group(
     directions = np.array(_PLANE if len(members) == 2 else _SPACE, dtype=float)
     single = np.abs(directions).sum(axis=1) == 1.0
     scaled = directions * weight
-    found = entries.search(rtol, effort, ca.mtimes(ca.DM(scaled[~single]), expressions))
+    found = entries.search(rtol, effort, ca.mtimes(ca.DM(scaled[~single]), entries.values))
     lower, upper = np.empty(len(directions)), np.empty(len(directions))
     lower[~single], upper[~single] = found.lower, found.upper
     for k in np.flatnonzero(single):
@@ -347,7 +329,7 @@ def _group(
     offsets = np.concatenate([upper, -lower])
     usable = np.isfinite(offsets)
     normals, offsets = normals[usable], offsets[usable]
-    attained = scalar_values(entries, places, np.vstack([found.points_lower, found.points_upper]))
+    attained = entries.at(np.vstack([found.points_lower, found.points_upper])).T
     kept = thin(normals, offsets, (attained * weight).mean(axis=0), most)
     try:
         polytope = polytope_from_halfspaces(normals[kept], offsets[kept])

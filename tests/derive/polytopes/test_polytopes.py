@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
-from obsynth.derive.jacobian.entries import JacobianEntries
 from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.polytopes import fewer, support
 from obsynth.derive.polytopes.fewer import drop_scalars, principal_family
 from obsynth.derive.polytopes.polytope import (
@@ -247,13 +247,13 @@ def test_membership_of_a_polytope():
 
 def change_supports(monkeypatch, change):
     """Falsify what branch and bound says of directions, but not of the single entries."""
-    real = JacobianEntries.search
+    real = MatrixEntries.search
 
     def wrong(self, rtol, effort, values=None):
         found = real(self, rtol, effort, values)
         return found if values is None else change(found)
 
-    monkeypatch.setattr(JacobianEntries, "search", wrong)
+    monkeypatch.setattr(MatrixEntries, "search", wrong)
 
 
 def too_small_support(monkeypatch):
@@ -398,7 +398,7 @@ def test_too_many_vertices_are_refused():
 @pytest.mark.parametrize("end", ["lower", "upper"])
 def test_a_coordinate_without_an_end_is_refused(monkeypatch, end):
     """Mutant: one end asked twice."""
-    real = JacobianEntries.search
+    real = MatrixEntries.search
 
     def endless(self, *arguments):
         found = real(self, *arguments)
@@ -407,6 +407,6 @@ def test_a_coordinate_without_an_end_is_refused(monkeypatch, end):
         value = np.full_like(found.lower, -np.inf if end == "lower" else np.inf)
         return replace(found, **{end: value})
 
-    monkeypatch.setattr(JacobianEntries, "search", endless)
+    monkeypatch.setattr(MatrixEntries, "search", endless)
     with pytest.raises(UnboundedError, match="principal coordinate"):
         principal_family(exothermic_cstr(), keep=1)
