@@ -28,6 +28,7 @@ from obsynth.derive.jacobian.bounds import JacobianBounds as JacobianBounds
 from obsynth.derive.jacobian.bounds import jacobian_bounds as jacobian_bounds
 from obsynth.derive.jacobian.family import AffineDependence as AffineDependence
 from obsynth.derive.jacobian.family import AffineFamily as AffineFamily
+from obsynth.derive.mismatch import mismatch as mismatch
 from obsynth.derive.polytopes.fewer import principal_family as principal_family
 from obsynth.derive.polytopes.polytope import Polytope as Polytope
 from obsynth.derive.polytopes.polytope import polytope_from_halfspaces as polytope_from_halfspaces

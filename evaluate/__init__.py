@@ -1,5 +1,7 @@
 """What it is worth: simulation, coverage, plots, report."""
 
+from obsynth.evaluate.bounds.identify import Identified as Identified
+from obsynth.evaluate.bounds.identify import identify as identify
 from obsynth.evaluate.bounds.least_bounds import LeastBounds as LeastBounds
 from obsynth.evaluate.bounds.least_bounds import least_bounds as least_bounds
 from obsynth.evaluate.choosing.choice import Choice as Choice

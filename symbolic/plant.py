@@ -90,6 +90,7 @@ class Plant:
     process_faults = declarations.process_faults
     faults = declarations.process_faults
     with_ranges = altered.with_ranges
+    with_params = altered.with_params
 
     def declare(self, role: Role, names: Names, **keywords: Any) -> Symbols:
         """Declare signals of a role; the methods above say which keywords it takes."""

@@ -39,65 +39,107 @@ def explain(
 
     largest, least: of the bounds, (n_groups,)
     """
-    steps, n_v, n_u = len(problem), len(problem.box), problem.u.shape[1]
-    v = ca.MX.sym("v", n_v, steps)
+    search = Search.of(problem)
     bounds = ca.MX.sym("bounds", len(problem.groups))
-    rows, shown = problem.equations.map(steps)(v, ca.DM(problem.u.T).reshape((n_u, steps)))
-    n = problem.n
-    read = np.isfinite(problem.y)
-    equal = [ca.vec(v[:n, 1:] - rows[:, :-1])]
-    for i in range(read.shape[1]):
-        k = np.flatnonzero(read[:, i]).tolist()
-        if k:
-            equal.append((shown[i, k] - ca.DM(problem.y[k, i]).T).T)
-    still = np.flatnonzero(problem.still).tolist()
-    if still and steps > 1:
-        equal.append(ca.vec(v[still, 1:] - v[still, :-1]))
-    zeros = ca.vertcat(*equal)
-    w = v[problem.places["w"], :]
     size = ca.DM(problem.shape) * ca.vertcat(bounds, 1.0)[problem.group.tolist()]
-    room = ca.repmat(size, 1, steps)
-    off = w - ca.repmat(ca.DM(problem.middle), 1, steps)
-    within = [ca.vec(off - room), ca.vec(-off - room)]
-    faults = problem.places["f"]
-    for j, signal in enumerate(problem.plant.f):
-        rate = 0.0 if signal.constant else signal.rate
-        if rate is not None:
-            moved = ca.vec(v[faults.start + j, 1:] - v[faults.start + j, :-1])
-            within += [moved - rate, -moved - rate]
-    inside = ca.vertcat(*within)
-    box = problem.box.copy()
-    box[problem.places["w"]] = [-np.inf, np.inf]
-    low, high = (np.tile(box[:, side], steps) for side in (0, 1))
+    room = ca.vec(ca.repmat(size, 1, len(problem)))
     top = np.full(len(problem.groups), np.inf) if largest is None else largest
     bottom = np.zeros(len(problem.groups)) if least is None else least
     first = guess(problem) if start is None else start
-    solver = ca.nlpsol(
-        "explain",
-        "ipopt",
-        {
-            "x": ca.vertcat(ca.vec(v), bounds),
-            "f": ca.dot(ca.DM(weights), bounds),
-            "g": ca.vertcat(zeros, inside),
-        },
-        {
-            "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 400, "tol": 1e-9},
-            "print_time": False,
-            "show_eval_warnings": False,
-            "error_on_fail": False,
-        },
+    answer = search.minimise(
+        ca.dot(ca.DM(weights), bounds),
+        ca.vertcat(search.off - room, -search.off - room),
+        first,
+        bounds,
+        (bottom, np.minimum(_reach(problem, first), top), top),
     )
-    zero, below = np.zeros(zeros.numel()), np.full(inside.numel(), -np.inf)
-    found = solver(
-        x0=np.concatenate([first.ravel(), np.minimum(_reach(problem, first), top)]),
-        lbx=np.concatenate([low, bottom]),
-        ubx=np.concatenate([high, top]),
-        lbg=np.concatenate([zero, below]),
-        ubg=np.concatenate([zero, np.zeros(inside.numel())]),
-    )
-    answer = np.array(found["x"]).ravel()[: n_v * steps].reshape(steps, n_v)
-    answer[:, problem.still] = answer[0, problem.still]
-    return measured(problem, np.clip(answer, box[:, 0], box[:, 1]))
+    return measured(problem, answer)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A search among the trajectories of a problem.
+
+    v: (n_v, N)
+    zeros: what is zero of a trajectory that agrees with the readings
+    off: disturbances less their middles, (n_w N,), one instant after the other
+    rates: what is not positive of faults with a rate
+    """
+
+    problem: Problem
+    v: ca.MX
+    zeros: ca.MX
+    off: ca.MX
+    rates: ca.MX
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Search":
+        """Write the equations of every instant."""
+        steps, n_u, n = len(problem), problem.u.shape[1], problem.n
+        v = ca.MX.sym("v", len(problem.box), steps)
+        inputs = ca.DM(problem.u.T).reshape((n_u, steps))
+        rows, shown = problem.equations.map(steps)(v, inputs)
+        equal = [ca.vec(v[:n, 1:] - rows[:, :-1])]
+        for i, read in enumerate(np.isfinite(problem.y).T):
+            k = np.flatnonzero(read).tolist()
+            if k:
+                equal.append((shown[i, k] - ca.DM(problem.y[k, i]).T).T)
+        still = np.flatnonzero(problem.still).tolist()
+        equal.append(ca.vec(v[still, 1:] - v[still, :-1]))
+        rates = [ca.MX(0, 1)]
+        for j, signal in enumerate(problem.plant.f, problem.places["f"].start):
+            rate = 0.0 if signal.constant else signal.rate
+            if rate is not None:
+                moved = ca.vec(v[j, 1:] - v[j, :-1])
+                rates += [moved - rate, -moved - rate]
+        off = v[problem.places["w"], :] - ca.repmat(ca.DM(problem.middle), 1, steps)
+        return cls(problem, v, ca.vertcat(*equal), ca.vec(off), ca.vertcat(*rates))
+
+    def minimise(
+        self,
+        objective: ca.MX,
+        within: ca.MX,
+        start: FloatArray,
+        extra: ca.MX,
+        ends: tuple[FloatArray, FloatArray, FloatArray],
+    ) -> FloatArray:
+        """Return v of the smallest objective, (N, n_v), in the ranges.
+
+        within: what else is not positive
+        extra, ends: further variables; their lower ends, start and upper ends
+        """
+        problem, steps = self.problem, len(self.problem)
+        box = problem.box.copy()
+        box[problem.places["w"]] = [-np.inf, np.inf]
+        low, high = (np.tile(box[:, side], steps) for side in (0, 1))
+        inside = ca.vertcat(self.rates, within)
+        solver = ca.nlpsol(
+            "search",
+            "ipopt",
+            {
+                "x": ca.vertcat(ca.vec(self.v), extra),
+                "f": objective,
+                "g": ca.vertcat(self.zeros, inside),
+            },
+            {
+                "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 400, "tol": 1e-9},
+                "print_time": False,
+                "show_eval_warnings": False,
+                "error_on_fail": False,
+            },
+        )
+        zero = np.zeros(self.zeros.numel())
+        found = solver(
+            x0=np.concatenate([start.ravel(), ends[1]]),
+            lbx=np.concatenate([low, ends[0]]),
+            ubx=np.concatenate([high, ends[2]]),
+            lbg=np.concatenate([zero, np.full(inside.numel(), -np.inf)]),
+            ubg=np.concatenate([zero, np.zeros(inside.numel())]),
+        )
+        answer = np.array(found["x"]).ravel()[: self.v.numel()].reshape(steps, len(box))
+        answer[:, problem.still] = answer[0, problem.still]
+        inside_box: FloatArray = np.clip(answer, box[:, 0], box[:, 1])
+        return inside_box
 
 
 def _reach(problem: Problem, v: FloatArray) -> float:

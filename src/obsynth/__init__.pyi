@@ -36,6 +36,7 @@ from .designs import worst_case as worst_case
 from .evaluate import BoundsError as BoundsError
 from .evaluate import Choice as Choice
 from .evaluate import Estimate as Estimate
+from .evaluate import Identified as Identified
 from .evaluate import LeastBounds as LeastBounds
 from .evaluate import Run as Run
 from .evaluate import SimulationError as SimulationError
@@ -43,6 +44,7 @@ from .evaluate import Table as Table
 from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
 from .evaluate import estimate as estimate
+from .evaluate import identify as identify
 from .evaluate import least_bounds as least_bounds
 from .evaluate import plot_alarms as plot_alarms
 from .evaluate import plot_errors as plot_errors
