@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.derive.intervals.program import Program
 from obsynth.designs.core.equations import symbols
+from obsynth.evaluate.data.estimate import fits
 from obsynth.evaluate.errors import BoundsError
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
@@ -26,7 +27,7 @@ class Problem:
     """A record, a plant, and what of it may vary.
 
     plant: discrete
-    u, y: what was measured, (N, n_u), (N, m); NaN is no reading
+    u, y: inputs with measured scheduling, and readings, NaN where there is none; (N, n_u), (N, m)
     groups: names of the disturbances that share a bound
     group: of every disturbance, (n_w,)
     shape, middle: of every disturbance, (n_w,)
@@ -114,15 +115,15 @@ def pose(
             f"plant.discretise('taylor', Ts={np.median(np.diff(record.time)):g}).",
             field="Ts",
         )
-    if any(s.measured for s in plant.rho):
-        raise BoundsError(f"{plant.name} is scheduled, which a record does not hold.", field="rho")
-    for kind, names in (("u", plant.names("u")), ("y", plant.output_names)):
-        if record.names[kind] != tuple(names):
-            raise BoundsError(
-                f"the record {record.source!r} has {', '.join(record.names[kind])} as {kind}; "
-                f"{plant.name} has {', '.join(names)}: give its channels in that order.",
-                field=kind,
-            )
+    fits(plant, record)
+    known = np.hstack([record.u, record.rho])
+    scheduling = tuple(s.name for s in plant.rho if s.measured)
+    if record.names["rho"] != scheduling or not np.isfinite(known).all():
+        raise BoundsError(
+            f"the record {record.source!r} lacks inputs or measured scheduling at some instants: "
+            f"{', '.join((*plant.names('u'), *scheduling))} have to be known throughout.",
+            field="u",
+        )
     kinds = [s for kind in ("x", "f", "d", "w", "p") for s in getattr(plant, kind)]
     kinds += [s for s in plant.rho if not s.measured]
     held = {s.name for s in (*plant.f, *plant.d) if wanted is not None and s.name not in wanted}
@@ -132,7 +133,7 @@ def pose(
             box[k] = 0.5 * (s.lower + s.upper) if s.nominal is None else s.nominal
     return Problem(
         plant,
-        np.array(record.u),
+        known,
         np.array(record.y),
         *_grouped(plant, groups),
         box.reshape(-1, 2),
