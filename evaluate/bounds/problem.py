@@ -200,7 +200,10 @@ def _grouped(
 
 
 def default_groups(plant: Plant) -> dict[str, tuple[str, ...]]:
-    """Return disturbances by where they stand: in the dynamics, in the outputs, or in both."""
+    """Return disturbances by where they stand: in the dynamics, in the outputs, or in both.
+
+    What a discretisation leaves out has bounds that are derived, and stands in no group.
+    """
     v, _, rows, outputs, _ = symbols(plant)
     start = len(plant.x) + len(plant.f) + len(plant.d)
     w = v[start : start + len(plant.w)]
@@ -215,5 +218,7 @@ def default_groups(plant: Plant) -> dict[str, tuple[str, ...]]:
         "outputs": [k for k in range(len(moves)) if shows[k] and not moves[k]],
         "both": [k for k in range(len(moves)) if moves[k] and shows[k]],
     }
-    names = plant.names("w")
-    return {key: tuple(names[k] for k in places) for key, places in found.items() if places}
+    names, derived = plant.names("w"), {s.name for s in plant.remainder or ()}
+    given = {key: tuple(names[k] for k in places) for key, places in found.items()}
+    given = {key: tuple(n for n in members if n not in derived) for key, members in given.items()}
+    return {key: members for key, members in given.items() if members}
