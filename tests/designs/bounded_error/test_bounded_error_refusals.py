@@ -33,7 +33,7 @@ def no_solver(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("the solver was called before the structural conditions")
 
-    monkeypatch.setattr("obsynth.designs.lmi.Problem.solve", refuse)
+    monkeypatch.setattr("obsynth.designs.lmi.problem.Problem.solve", refuse)
 
 
 def test_rank_condition(monkeypatch):
