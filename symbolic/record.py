@@ -1,14 +1,18 @@
 """Records: what was measured of a plant, one row for each instant."""
 
-from collections.abc import Mapping
+import html
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, overload
 
 import numpy as np
 
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.errors import RecordError
+from obsynth.symbolic.findings import Finding, find, quantum
 
 GROUPS = ("u", "rho", "y", "reference")
 
@@ -121,26 +125,60 @@ class Record:
             )
         return tuple(self[a : a + length] for a in range(0, count * length, length))
 
-    def without(self, name: str, rows: Any = slice(None)) -> "Record":
+    def findings(self, *kinds: str) -> tuple[Finding, ...]:
+        """Return what the readings show before any model, of these kinds or all.
+
+        "stuck", "saturated", "outlier" and "missing"; each says what it means and what to do.
+        """
+        return tuple(f for f in self._findings if not kinds or f.kind in kinds)
+
+    @property
+    def stuck(self) -> tuple[Finding, ...]:
+        """Findings of readings that do not move though the channel does."""
+        return self.findings("stuck")
+
+    @property
+    def saturated(self) -> tuple[Finding, ...]:
+        """Findings of readings that do not move at the channel's extreme value."""
+        return self.findings("saturated")
+
+    @property
+    def quanta(self) -> dict[str, float]:
+        """Step of each output's readings, NaN where there is none; half of it is noise at least."""
+        return {name: quantum(self[name]) for name in self.names["y"]}
+
+    @cached_property
+    def _findings(self) -> tuple[Finding, ...]:
+        inputs = np.hstack([self.u, self.rho])
+        return tuple(
+            found for name in self.names["y"] for found in find(name, self[name], self.time, inputs)
+        )
+
+    def without(self, name: str | Finding, rows: Any = slice(None)) -> "Record":
         """Return the record with NaN in an output or reference, at these rows or all.
 
-        rows: a row, a slice, a sequence of rows or an array of bool (N,)
+        Parameters
+        ----------
+        name : str or Finding
+            A channel, or what was found in one, with its rows.
+        rows : int, slice, sequence of int or array (N,) of bool
         """
-        group, column = self._place(name)
+        channel, at = (name, rows) if isinstance(name, str) else (name.channel, name.rows)
+        group, column = self._place(channel)
         if group in ("u", "rho"):
             raise RecordError(
-                f"{name} is known to the plant, and no observer can do without it; leave the "
+                f"{channel} is known to the plant, and no observer can do without it; leave the "
                 "instants out: record[a:b]",
-                symbol=name,
+                symbol=channel,
             )
         array = np.array(getattr(self, group))
         try:
-            array[rows, column] = np.nan
+            array[at, column] = np.nan
         except IndexError as error:
             raise RecordError(
-                f"{name}: rows {rows!r} are not among 0 to {len(self) - 1}", symbol=name
+                f"{channel}: rows {at!r} are not among 0 to {len(self) - 1}", symbol=channel
             ) from error
-        note = f"{name}: readings were taken out at {np.isnan(array[:, column]).sum()} instants"
+        note = f"{channel}: readings were taken out at {np.isnan(array[:, column]).sum()} instants"
         changed: dict[str, Any] = {group: array}
         return replace(self, **changed, notes=(*self.notes, note))
 
@@ -166,3 +204,51 @@ class Record:
     def __repr__(self) -> str:
         u, y = (", ".join(self.names[group]) for group in ("u", "y"))
         return f"<Record {self.source!r}, {len(self)} samples, inputs {u}, outputs {y}>"
+
+    def _repr_html_(self) -> str:
+        heads = ("channel", "role", "unit", "range", "missing", "quantum", "findings")
+        words = {"u": "input", "rho": "scheduling", "y": "output", "reference": "reference"}
+        rows = []
+        for group, word in words.items():
+            for name, unit in zip(self.names[group], self.units[group], strict=True):
+                values = self[name][np.isfinite(self[name])]
+                span = f"[{values.min():g}, {values.max():g}]" if values.size else "none"
+                step = self.quanta[name] if group == "y" else np.nan
+                kinds = [f.kind for f in self.findings() if f.channel == name]
+                found = ", ".join(f"{kinds.count(k)} {k}" for k in dict.fromkeys(kinds))
+                missing = str(len(self) - values.size)
+                multiple = "" if np.isnan(step) else f"{step:.4g}"
+                rows.append((name, word, unit, span, missing, multiple, found))
+        told = "".join(
+            f"<li>{html.escape(t)}</li>" for t in (*map(str, self.findings()), *self.notes)
+        )
+        return (
+            f"<p><b>{html.escape(self.source)}</b>, {len(self)} instants, {self.time[0]:g} to "
+            f"{self.time[-1]:g} s</p>{html_table(heads, rows)}<ul>{told}</ul>"
+        )
+
+    def plot(self, names: Sequence[str] | None = None) -> Any:
+        """Plot channels over time, by default all; findings are shaded.
+
+        Returns
+        -------
+        ndarray of Axes, one for each channel
+        """
+        import matplotlib.pyplot as plt
+
+        chosen = names or [name for group in GROUPS for name in self.names[group]]
+        figure = plt.figure(figsize=(7.2, 0.6 + 1.1 * len(chosen)), layout="constrained")
+        axes = figure.subplots(len(chosen), 1, sharex=True, squeeze=False).ravel()
+        for ax, name in zip(axes, chosen, strict=True):
+            group, column = self._place(name)
+            held = group in ("u", "rho")
+            style = {"drawstyle": "steps-post"} if held else {"marker": ".", "markersize": 3}
+            ax.plot(self.time, self[name], color="#1b1d21", linewidth=0.8, **style)
+            unit = self.units[group][column]
+            ax.set_ylabel(f"{name} [{unit}]" if unit else name)
+            rows = [f.rows for f in self.findings() if f.channel == name]
+            marks = {"marker": "|", "linestyle": "", "color": "#d55e00", "clip_on": False}
+            at = self.time[np.concatenate([np.zeros(0, dtype=int), *rows])]
+            ax.plot(at, 0 * at, transform=ax.get_xaxis_transform(), **marks)
+        axes[-1].set_xlabel("time [s]")
+        return axes

@@ -145,6 +145,9 @@ def test_what_is_seen_and_assumed_is_noted():
     none = read(map={"weight": None})
     assert np.isnan(none["weight"]).all() and none.notes == ("weight was not measured",)
     assert none.names["reference"] == ("column weight",)
+    scaled = read(map={"level": ("weight", 0.5, 0.1)})
+    assert np.array_equal(scaled["level"], 0.5 * log()["weight"] + 0.1)
+    assert scaled.notes[0] == "level = 0.5 * weight + 0.1"
     minutes = read(t=log()["t"] / 60, time=("t", 60))
     np.testing.assert_allclose(minutes.time, log()["t"], rtol=1e-15)
 
@@ -167,6 +170,11 @@ def test_resampling_is_asked_for_and_said():
             "to cover" in record.notes[0]
             and "inputs change between instants after 1" in record.notes[1]
         )
+    at = ob.read_record(data | {"v": (t >= 1.0) * 1.0}, TANK, resample="nearest")
+    assert at["v"].tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
+    assert not [note for note in at.notes if "between instants" in note]
+    late = {name: column[:2] for name, column in log(t=0.08 + log()["t"]).items()}
+    assert len(ob.read_record(late, TANK, resample="nearest")) == 2  # .58 - .08 < .5 in doubles
     slow = {"t": [0, 1, 2, 5], "v": [0, 1, 1, 0], "level": [0, 1, 2, 5], "weight": [1, 1, 1, 1]}
     record = ob.read_record(slow, TANK, resample="linear")
     expected = [0, 0.5, 1, 1.5, 2] + [np.nan] * 5 + [5]
