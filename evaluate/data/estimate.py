@@ -72,7 +72,7 @@ def estimate(
         y0=record.y[0],
     )
     names = [model.names("rho")[k] for k in scheduling_columns(step, model, "step")]
-    absent = [name for name in names if name not in record.names["reference"]]
+    absent = [name for name in names if not any(name in g for g in record.names.values())]
     if absent:
         raise SimulationError(
             f"{model.name} is scheduled by {absent[0]}, which the record {record.source!r} does "

@@ -152,6 +152,20 @@ def test_what_is_seen_and_assumed_is_noted():
     np.testing.assert_allclose(minutes.time, log()["t"], rtol=1e-15)
 
 
+def test_measured_scheduling_is_held_like_an_input():
+    plant = ob.Plant("vessel")
+    (x,) = plant.states("x", range=(0, 9))
+    theta, _ = plant.scheduling("theta hidden", range=(0, 1), measured=[True, False])
+    plant.dynamics([x * theta / 2], Ts=1)
+    plant.outputs([x])
+    data = {"y1": [1.0, 2, 3], "theta": [0, np.nan, 2], "other": [7, 8, 9]}
+    record = ob.read_record(data, plant, time=False)
+    assert record.names["rho"] == ("theta",) and record.names["reference"] == ("other",)
+    assert record.u.shape == (3, 0) and record.units["rho"] == ("",)
+    assert record["theta"].tolist() == [0, 0, 2] and record["other"].tolist() == [7, 8, 9]
+    assert "theta runs over [0, 2]" in record.notes[2]
+
+
 def test_resampling_is_asked_for_and_said():
     """Rows off the grid. Mutants: interpolation over gaps; inputs of the next row."""
     t = 0.07 + 0.1 * np.arange(40)
