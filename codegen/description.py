@@ -14,7 +14,13 @@ import numpy as np
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import STEP_INPUTS, Machine
-from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
+from obsynth.designs.core.observer import (
+    ALARM_OUTPUT,
+    FURTHER_OUTPUTS,
+    MEAN_OUTPUTS,
+    STEP_OUTPUTS,
+    Observer,
+)
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -117,6 +123,11 @@ class Description:
     def alarms(self) -> bool:
         """Whether the step is a fault detector's, with one alarm per fault."""
         return bool(self.observer.step.n_out() > len(STEP_OUTPUTS))
+
+    @property
+    def means(self) -> bool:
+        """Whether it has means over a window behind the alarms."""
+        return bool(self.observer.step.n_out() > len(STEP_OUTPUTS) + 1)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -222,9 +233,11 @@ def _check_step(step: ca.Function, model: Plant, n_memory: int, n_theta: int) ->
     inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
     names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
     expected_in = (n_memory, len(model.u), len(model.output_names)) + (n_theta,) * bool(n_theta)
-    alarms = len(outputs) == len(STEP_OUTPUTS) + 1 and outputs[-1] == ALARM_OUTPUT
-    results = (*STEP_OUTPUTS, ALARM_OUTPUT) if alarms else STEP_OUTPUTS
-    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1) + (n_f,) * alarms
+    further = {ALARM_OUTPUT: n_f} | dict(zip(MEAN_OUTPUTS, (n_f, n_f, 1), strict=True))
+    behind = outputs[len(STEP_OUTPUTS) :]
+    behind = behind if behind in FURTHER_OUTPUTS else ()
+    results = (*STEP_OUTPUTS, *behind)
+    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1, *(further[name] for name in behind))
     found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
     found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
     if len(inputs) != len(names) or len(outputs) != len(results):

@@ -9,13 +9,13 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.errors import CodegenError
-from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS
+from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
 STEP_INPUTS = ("memory", "u", "y", "theta")
 """Inputs of a step, in their order; the last one of scheduled observers only."""
 
-_RESULTS = ("next", *STEP_OUTPUTS[1:], ALARM_OUTPUT)
+_RESULTS = ("next", *STEP_OUTPUTS[1:], *FURTHER_OUTPUTS[-1])
 
 # CasADi wraps these to serve C89 as well; the wrapped C99 function is what its VM calls.
 _WRAPPED = frozenset({"expm1", "fabs", "fmax", "fmin", "hypot", "log1p"})

@@ -6,7 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.observer import ALARM_OUTPUT, STEP_OUTPUTS, Observer
+from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector, core_of
 from obsynth.evaluate.domain import outside_box
 from obsynth.evaluate.errors import SimulationError
@@ -173,10 +173,11 @@ def step_function(observer: Observer | FaultDetector, model: Plant) -> ca.Functi
     step: ca.Function = observer.step
     scheduling_columns(step, model, "step")
     # CasADi accepts one name on both sides only on request, so the first output is left free.
-    if tuple(step.name_out())[1:] not in (STEP_OUTPUTS[1:], (*STEP_OUTPUTS[1:], ALARM_OUTPUT)):
+    if tuple(step.name_out())[1:] not in [(*STEP_OUTPUTS[1:], *more) for more in FURTHER_OUTPUTS]:
         raise SimulationError(
             f"the observer's step returns ({', '.join(step.name_out())}); "
-            f"({', '.join(STEP_OUTPUTS)}[, {ALARM_OUTPUT}]) is needed.",
+            f"({', '.join(STEP_OUTPUTS)}[, alarm[, mean_lower, mean_upper, mean_status]]) is "
+            "needed.",
             given=tuple(step.name_out()),
         )
     return step

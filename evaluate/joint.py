@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.observer import Observer
+from obsynth.designs.core.observer import MEAN_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
     WORDS,
@@ -55,8 +55,10 @@ def joint(
     """
     if isinstance(observer, FaultDetector):
         run = joint(model, observer.observer, scenario, seed, substeps)
-        alarm = observer.alarms(run.f_lower, run.f_upper, run.status)
-        return replace(run, alarm=alarm, method=observer.method)
+        means = observer.means(run)
+        alarm = observer.alarms(run.f_lower, run.f_upper, run.status, *means)
+        told: Any = dict(zip(MEAN_OUTPUTS, means, strict=False))
+        return replace(run, alarm=alarm, method=observer.method, **told)
     system = _System(model, observer, 1 if substeps is None else substeps_of(substeps))
     fields = scenario_fields(model, scenario, seed)
     march = _with_feedback if scenario.feedback else _with_signals

@@ -43,6 +43,8 @@ class Run:
         Bit mask of the step, explained by :attr:`domain`.
     alarm : (N + 1, n_f) bool or None
         Alarms of a fault detector; None where an observer ran alone.
+    mean_lower, mean_upper : (N + 1, n_f) or None, mean_status : (N + 1,) int or None
+        Of a detector with a window m: means of the faults over k - m..k - 1, and the status.
     names, units : dict
         Signal names and units by group ("x", "y", "u", "d", "f", "w", "rho").
     box : (n_x, 2)
@@ -84,6 +86,9 @@ class Run:
     truth: str
     outside: tuple[str, ...]
     alarm: NDArray[np.bool_] | None = None
+    mean_lower: FloatArray | None = None
+    mean_upper: FloatArray | None = None
+    mean_status: NDArray[np.int64] | None = None
 
     @classmethod
     def collect(
@@ -106,8 +111,11 @@ class Run:
         names["y"] = tuple(model.output_names)
         units["y"] = tuple(model.output_units)
         status = np.asarray(claims["status"], dtype=np.int64).reshape(-1)
-        arrays = {key: value for key, value in claims.items() if key not in ("status", "alarm")}
+        words = ("status", "alarm", "mean_status")
+        arrays = {key: value for key, value in claims.items() if key not in words}
         arrays |= truths
+        told = claims.get("mean_status")
+        joined = None if told is None else np.asarray(told, dtype=np.int64).reshape(-1)
         alarm = np.asarray(claims["alarm"] > 0.5) if "alarm" in claims else None
         for array in (t, status, *arrays.values()):
             array.setflags(write=False)
@@ -129,6 +137,7 @@ class Run:
             truth=truth,
             outside=outside,
             alarm=alarm,
+            mean_status=joined,
             **arrays,
         )
 

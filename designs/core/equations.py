@@ -45,6 +45,7 @@ class Before:
 class Equations:
     """Rows of a plant and their derivatives as programs over (x, f, rest) and (u, theta).
 
+    form: other rows over these than those of the dynamics, ((x, f, rest), (u, theta)) -> (rows,)
     rest: unknown inputs, disturbances, parameters and scheduling that is not measured
     box: ranges of (x, f, rest), `FAR` where there is none or where it does not matter
     curved: states on which some derivative by a state or a fault depends, (n,)
@@ -53,10 +54,13 @@ class Equations:
     usable: those that no unbounded signal enters, (n,)
     """
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: Plant, form: ca.Function | None = None) -> None:
         self.plant = plant
         n, n_f = len(plant.x), len(plant.f)
         v, known, rows, _, rest = symbols(plant)
+        if form is not None:
+            rows = ca.densify(ca.SX(form(v, known)))
+        self.n_rows = int(rows.numel())
         self.curved = curved = curved_states(plant)
         self.n, self.n_f, self.n_v = n, n_f, int(v.numel())
         faults = plant.box("f") + 0.0
@@ -69,14 +73,14 @@ class Equations:
         self.program = Program.from_casadi(ca.Function("rows", [v, known], [rows, J.nz[:]]))
         places = zip(J.sparsity().row(), J.sparsity().get_col(), strict=True)
         self.entries: dict[tuple[int, int], int] = {
-            (i, j): n + k for k, (i, j) in enumerate(places) if not J.nz[k].is_zero()
+            (i, j): self.n_rows + k for k, (i, j) in enumerate(places) if not J.nz[k].is_zero()
         }
         self.slopes = self._slopes()
         free = [j for j in range(n + n_f, self.n_v) if not np.isfinite(given[j]).all()]
         self.small: BoolArray = np.array(
-            [plant.Ts is not None and self._size(i) <= MOST_NODES for i in range(n)]
+            [plant.Ts is not None and self._size(i) <= MOST_NODES for i in range(self.n_rows)]
         )
-        bounded = [not any((i, j) in self.entries for j in free) for i in range(n)]
+        bounded = [not any((i, j) in self.entries for j in free) for i in range(self.n_rows)]
         self.usable: BoolArray = self.small & np.array(bounded)
 
     def _size(self, row: int) -> int:
@@ -84,7 +88,7 @@ class Equations:
         return len(self.program.live([row, *entries]))
 
     def _slopes(self) -> FloatArray:
-        slopes = np.zeros((self.n, self.n_v, 2))
+        slopes = np.zeros((self.n_rows, self.n_v, 2))
         whole = np.vstack([self.box, self.known_box])
         for (i, j), k in self.entries.items():
             support = list(self.program.support(k))

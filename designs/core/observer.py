@@ -44,6 +44,12 @@ STEP_OUTPUTS = (
 ALARM_OUTPUT = "alarm"
 """Name of the output that a fault detector's step has behind them."""
 
+MEAN_OUTPUTS = ("mean_lower", "mean_upper", "mean_status")
+"""Names of those behind the alarm, of a detector with a window."""
+
+FURTHER_OUTPUTS = ((), (ALARM_OUTPUT,), (ALARM_OUTPUT, *MEAN_OUTPUTS))
+"""What a step may have behind `STEP_OUTPUTS`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Observer:

@@ -10,18 +10,37 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.core.certificate import Certificate, Guarantee
+from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.core import Core
 from obsynth.designs.core.errors import DetectorError
-from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
+from obsynth.designs.core.observer import (
+    ALARM_OUTPUT,
+    MEAN_OUTPUTS,
+    STATUS,
+    STEP_OUTPUTS,
+    Observer,
+)
 from obsynth.designs.detection.comparison import Detection, RunLike, compare
-from obsynth.symbolic import Plant
+from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
 
 SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "recovering")
 """Bits of the status at which a sample never counts; at a void one all counters return to 0."""
 
 _COUNT = "alarm_count"
+
+
+class _Observers(property):
+    """What a detector has of its observer, under the same name."""
+
+    def __init__(self, doc: str) -> None:
+        super().__init__(doc=doc)
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        return self if instance is None else getattr(instance.observer, self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +58,16 @@ class FaultDetector:
         Further bits of the status, by their names in ``STATUS``, at which a sample does not
         count, for example ``("outside_domain",)``. Samples that are not initialised, void or
         recovering, saw an input that is not finite or have no valid fault interval never count.
+    window : int, optional
+        A number m of instants: the step then returns the mean of every fault over the m instants
+        before the one of the call too, guaranteed for any course of the fault, and zero outside of
+        it counts towards the alarm as well.
 
     Raises
     ------
     DetectorError
-        The observer gives no bounds of its faults, or the plant has no faults; the message
-        names the reason.
+        The observer gives no bounds of its faults, or bounds of a mean where a window is asked
+        for, or the plant has no faults; the message names the reason.
 
     Notes
     -----
@@ -67,8 +90,16 @@ class FaultDetector:
     remain inside an interval that holds zero for ever. Where a method does not predict its
     steady widths nothing is promised.
 
+    **Window.** At call k the mean of f over k - m..k - 1 is enclosed by what the states moved in
+    that time and the sets of these instants (``designs/detection/window.py`` has the formula), far
+    narrower than at one instant. ``mean_status`` joins the statuses of the calls k - m..k; its bit
+    16 says that there are no m instants yet, since the first call, a void one or a missing input.
+    Such means, and those at whose calls a sample did not count, are left out of the alarm. A mean
+    may keep the alarm up for m - 1 instants after the fault's end.
+
     The detector can be simulated and turned into C like an observer: its step has the
-    observer's outputs and, behind them, ``alarm`` (n_f,), each 0 or 1.
+    observer's outputs and, behind them, ``alarm`` (n_f,), each 0 or 1; with a window also
+    ``mean_lower``, ``mean_upper`` (n_f,) and ``mean_status``.
 
     Examples
     --------
@@ -83,6 +114,7 @@ class FaultDetector:
     observer: Observer
     persistence: int | Sequence[int] = 1
     also_skip: tuple[str, ...] = ()
+    window: int | None = None
 
     def __post_init__(self) -> None:
         model, method = self.observer.model, self.observer.method
@@ -109,6 +141,15 @@ class FaultDetector:
                 f"{', '.join(STATUS)}.",
                 also_skip=self.also_skip,
             )
+        if self.window is not None:
+            (length,) = _whole_numbers(self.window, names[:1], "window")
+            object.__setattr__(self, "window", length)
+            if self._of_mean:
+                raise DetectorError(
+                    f"window={length}: {method} encloses a mean of {', '.join(names)} already, and "
+                    "a mean of means is none of the fault: leave the window out.",
+                    window=length,
+                )
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -121,54 +162,19 @@ class FaultDetector:
         return tuple(dict.fromkeys((*SKIPPED, *self.also_skip)))
 
     @property
-    def model(self) -> Plant:
-        """The observer's discrete plant."""
-        return self.observer.model
-
-    @property
     def method(self) -> str:
         """Name of the observer's method, with the detector's."""
         return f"{self.observer.method} with fault_detector"
 
-    @property
-    def fault_delay(self) -> int:
-        """By how many samples bounds and alarms lag behind."""
-        return self.observer.fault_delay
-
-    @property
-    def half_widths(self) -> FloatArray | None:
-        """The observer's steady half widths."""
-        return self.observer.half_widths
-
-    @property
-    def ode(self) -> ca.Function | None:
-        """The observer's right-hand side; its memory has no counters, as alarms do not flow."""
-        return self.observer.ode
-
-    @property
-    def step_covered(self) -> bool:
-        """Whether the observer's guarantee covers its step, for continuous-time methods."""
-        return self.observer.step_covered
-
-    @property
-    def gains(self) -> Mapping[str, FloatArray]:
-        """The observer's gains."""
-        return self.observer.gains
-
-    @property
-    def performance(self) -> Mapping[str, float]:
-        """The observer's performance."""
-        return self.observer.performance
-
-    @property
-    def figures(self) -> Mapping[str, float]:
-        """The observer's performance as it is shown."""
-        return self.observer.figures
-
-    @property
-    def certificate(self) -> Certificate:
-        """The observer's certificate; an alarm rests on nothing else."""
-        return self.observer.certificate
+    model = _Observers("The observer's discrete plant.")
+    fault_delay = _Observers("By how many samples bounds and alarms lag behind.")
+    half_widths = _Observers("The observer's steady half widths.")
+    ode = _Observers("The observer's right-hand side; nothing of the detector flows.")
+    step_covered = _Observers("Whether the observer's guarantee covers its step.")
+    gains = _Observers("The observer's gains.")
+    performance = _Observers("The observer's performance.")
+    figures = _Observers("The observer's performance as it is shown.")
+    certificate = _Observers("The observer's certificate; an alarm rests on nothing else.")
 
     @property
     def smallest_detectable(self) -> FloatArray | None:
@@ -193,30 +199,42 @@ class FaultDetector:
         return core is not None and core.mean_fault
 
     @cached_property
-    def decide(self) -> ca.Function:
-        """The decision alone: (count, f_lower, f_upper, status) -> (count, alarm)."""
-        n_f = len(self.model.f)
-        count, lower, upper = (ca.SX.sym(name, n_f) for name in ("count", "f_lower", "f_upper"))
-        status = ca.SX.sym("status")
+    def mean(self) -> Window | None:
+        """The recursion of the means; None without a window."""
+        return None if self.window is None else window_of(self.observer, self.window)
 
-        def bit(name: str) -> Any:
+    @cached_property
+    def decide(self) -> ca.Function:
+        """The decision alone: (count, f_lower, f_upper, status, *means) -> (count, alarm)."""
+        n_f = len(self.model.f)
+        sizes = {"f_lower": n_f, "f_upper": n_f, "status": 1}
+        if self.window is not None:
+            sizes |= dict(zip(MEAN_OUTPUTS, (n_f, n_f, 1), strict=True))
+        count, told = ca.SX.sym("count", n_f), [ca.SX.sym(k, size) for k, size in sizes.items()]
+
+        def bit(name: str, status: ca.SX) -> Any:
             return ca.fmod(ca.floor(status / STATUS[name]), 2) >= 1
 
-        valid, void = ca.SX(1), bit("void")
-        for name in self._skipped:
-            valid = ca.logic_and(valid, ca.logic_not(bit(name)))
+        valid = []
+        for status in told[2::3]:
+            valid.append(ca.SX(1))
+            for name in self._skipped:
+                valid[-1] = ca.logic_and(valid[-1], ca.logic_not(bit(name, status)))
         following, alarm = [], []
         for i, needed in enumerate(self.counts):
-            outside = ca.logic_or(lower[i] > 0, upper[i] < 0)
+            outside = ca.SX(0)
+            for lower, upper, sound in zip(told[::3], told[1::3], valid, strict=True):
+                apart = ca.logic_or(lower[i] > 0, upper[i] < 0)
+                outside = ca.logic_or(outside, ca.logic_and(sound, apart))
             counted = ca.if_else(outside, ca.fmin(count[i] + 1, needed), 0)
-            kept = ca.if_else(void, 0, count[i])
-            following.append(ca.if_else(valid, counted, kept))
+            kept = ca.if_else(bit("void", told[2]), 0, count[i])
+            following.append(ca.if_else(ca.logic_or(valid[0], outside), counted, kept))
             alarm.append(following[-1] >= needed)
         return ca.Function(
             "decide",
-            [count, lower, upper, status],
+            [count, *told],
             [ca.vertcat(*following), ca.vertcat(*alarm)],
-            ["count", "f_lower", "f_upper", "status"],
+            ["count", *sizes],
             ["count_next", ALARM_OUTPUT],
         )
 
@@ -225,25 +243,30 @@ class FaultDetector:
         """Observer and decision as one step, with the further output ``alarm``.
 
         (memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
-        status, alarm); the memory is the observer's with the counters behind it.
+        status, alarm); the memory is the observer's with the counters behind it. With a window,
+        what its means remember stands behind these, and (mean_lower, mean_upper, mean_status)
+        behind the alarm.
         """
-        step = self.observer.step
-        n_memory, n_f = int(step.numel_in(0)), len(self.model.f)
-        names = list(step.name_in())
-        ports = [ca.MX.sym("memory", n_memory + n_f)]
+        step, layout = self.observer.step, self.memory_layout
+        n_memory, names = int(step.numel_in(0)), list(step.name_in())
+        ports = [ca.MX.sym("memory", max(place.stop for place in layout.values()))]
         ports += [ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate(names) if i]
         outputs = list(step.call([ports[0][:n_memory], *ports[1:]]))
-        at = STEP_OUTPUTS.index
+        sets = dict(zip(STEP_OUTPUTS, outputs, strict=True))
+        means: list[Any] = []
+        following: list[Any] = []
+        if self.mean is not None:
+            recursion: Any = self.mean.step
+            remembered = ports[0][layout[_COUNT].stop :]
+            theta = ports[3] if names[3:] else ca.MX(0, 1)
+            told = (sets[name] for name in STEP_OUTPUTS[3:])
+            following, *means = recursion(remembered, ports[1], theta, *told)
         decision: Any = self.decide
-        count, alarm = decision(
-            ports[0][n_memory:],
-            outputs[at("f_lower")],
-            outputs[at("f_upper")],
-            outputs[at("status")],
-        )
-        outputs[0] = ca.vertcat(outputs[0], count)
-        results = [ca.densify(output) for output in (*outputs, alarm)]
-        labels = [*STEP_OUTPUTS, ALARM_OUTPUT]
+        told = (sets[name] for name in STEP_OUTPUTS[5:])
+        count, alarm = decision(ports[0][layout[_COUNT]], *told, *means)
+        outputs[0] = ca.vertcat(outputs[0], count, following)
+        results = [ca.densify(output) for output in (*outputs, alarm, *means)]
+        labels = [*STEP_OUTPUTS, ALARM_OUTPUT, *(MEAN_OUTPUTS if means else ())]
         options = {"allow_duplicate_io_names": True}
         composed = ca.Function("step", ports, results, names, labels, options)
         try:
@@ -253,18 +276,22 @@ class FaultDetector:
 
     @property
     def memory_layout(self) -> dict[str, slice]:
-        """The observer's layout, and the counters as ``alarm_count``."""
+        """The observer's layout, the counters as ``alarm_count``, and what means remember."""
         n_memory = int(self.observer.step.numel_in(0))
-        return {
-            **self.observer.memory_layout,
-            _COUNT: slice(n_memory, n_memory + len(self.model.f)),
-        }
+        end = n_memory + len(self.model.f)
+        means = {} if self.mean is None else self.mean.layout
+        behind = {name: slice(end + p.start, end + p.stop) for name, p in means.items()}
+        return {**self.observer.memory_layout, _COUNT: slice(n_memory, end), **behind}
 
     @property
     def outputs(self) -> Mapping[str, tuple[str, ...]]:
         """Labels of every output of the step, by the names of the plant's signals."""
-        alarms = tuple(f"{name}_alarm" for name in self.model.names("f"))
-        return {**self.observer.outputs, ALARM_OUTPUT: alarms}
+        names = self.model.names("f")
+        labels = {ALARM_OUTPUT: tuple(f"{name}_alarm" for name in names)}
+        if self.window is not None:
+            ends = {key: tuple(f"{name}_{key}" for name in names) for key in MEAN_OUTPUTS[:2]}
+            labels |= ends | {MEAN_OUTPUTS[2]: MEAN_OUTPUTS[2:]}
+        return {**self.observer.outputs, **labels}
 
     @property
     def guarantee(self) -> Guarantee:
@@ -283,6 +310,12 @@ class FaultDetector:
                     f"in the steady state a magnitude {whose} above {smallest[i]:.6g} at {count} "
                     "consecutive samples that count raises its alarm"
                 )
+        if self.window is not None:
+            claims.append(
+                f"the mean of {', '.join(names)} over the {self.window} instants before the call "
+                "lies in [mean_lower, mean_upper], whatever the course, where what is claimed of "
+                "the returned sets holds at these calls"
+            )
         claims.append(
             "a void sample (status bit 8) proves that some assumption failed since the last void "
             "one or the start; it ends every alarm, and one that stood until then proves nothing"
@@ -294,10 +327,15 @@ class FaultDetector:
     ) -> FloatArray:
         """Return the memory for the first call of `step`; see `Observer.memory0`."""
         memory = self.observer.memory0(guess, x_range=x_range, f_range=f_range, y0=y0, **options)
-        return np.concatenate([memory, np.zeros(len(self.model.f))])
+        means = () if self.mean is None else self.mean.first
+        return np.concatenate([memory, np.zeros(len(self.model.f)), means])
 
     def alarms(
-        self, f_lower: FloatArray, f_upper: FloatArray, status: NDArray[np.int64]
+        self,
+        f_lower: FloatArray,
+        f_upper: FloatArray,
+        status: NDArray[np.int64],
+        *means: FloatArray,
     ) -> NDArray[np.bool_]:
         """Decide for recorded bounds, from counters at zero.
 
@@ -305,13 +343,16 @@ class FaultDetector:
         ----------
         f_lower, f_upper : (N + 1, n_f)
         status : (N + 1,)
+        *means : (N + 1, n_f), (N + 1, n_f) and (N + 1,)
+            With a window: mean_lower, mean_upper, mean_status.
 
         Returns
         -------
         (N + 1, n_f) bool
         """
         decide: Any = self.decide.mapaccum(len(status))
-        columns = (f_lower.T, f_upper.T, np.asarray(status, dtype=float)[None, :])
+        rows = (f_lower, f_upper, status, *means)
+        columns = [np.asarray(row, dtype=float).reshape(len(status), -1).T for row in rows]
         _, alarm = decide(np.zeros(len(self.model.f)), *columns)
         return np.asarray(np.array(alarm).T > 0.5)
 
@@ -354,7 +395,7 @@ class FaultDetector:
         if self.half_widths is not None and not self._of_mean:
             width = np.asarray(run.f_upper - run.f_lower, dtype=np.float64)
         return compare(
-            self.alarms(run.f_lower, run.f_upper, run.status),
+            self.alarms(run.f_lower, run.f_upper, run.status, *self.means(run)),
             run.f,
             run.t,
             names,
@@ -365,6 +406,16 @@ class FaultDetector:
             status=np.asarray(run.status, dtype=np.int64),
             persistence=self.counts,
         )
+
+    def means(self, run: Any) -> list[FloatArray]:
+        """Return mean_lower, mean_upper, mean_status of a run; nothing without a window."""
+        if self.mean is None:
+            return []
+        theta = np.zeros((len(run.t), 0))
+        if self.mean.scheduled:
+            theta = run.rho[:, [i for i, s in enumerate(self.model.rho) if s.measured]]
+        sets = (run.x_lower, run.x_upper, run.f_lower, run.f_upper, run.status)
+        return self.mean.over(run.u, theta, *sets)
 
     def __str__(self) -> str:
         lines = [f"fault detector over {self.observer.method} for {self.model.name}"]
@@ -410,14 +461,29 @@ def _told(bound: ca.SX, told: ca.SX) -> bool:
     return not all(slopes[i].is_zero() for i in range(slopes.numel()))
 
 
-def _whole_numbers(given: Any, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the persistence of each fault."""
+def window_of(observer: Any, m: int) -> Window:
+    """Return the means over m instants of what an observer says."""
+    design = getattr(getattr(observer, "certificate", None), "design", None)
+    return Window(
+        observer.model,
+        m,
+        observer.fault_delay,
+        moving=observer.ode is None,
+        scheduled=observer.step.n_in() > 3,
+        half_widths=observer.half_widths,
+        precision=getattr(design, "precision", "double"),
+    )
+
+
+def _whole_numbers(
+    given: Any, names: tuple[str, ...], what: str = "persistence"
+) -> tuple[int, ...]:
+    """Return a number of samples for each fault."""
     values = tuple(given) if np.ndim(given) else (given,) * len(names)
     if len(values) != len(names):
         raise DetectorError(
-            f"persistence has {len(values)} numbers for the {len(names)} faults "
-            f"{', '.join(names)}.",
-            persistence=given,
+            f"{what} has {len(values)} numbers for the {len(names)} faults {', '.join(names)}.",
+            **{what: given},
         )
     try:
         whole = tuple(operator.index(value) for value in values)
@@ -425,7 +491,7 @@ def _whole_numbers(given: Any, names: tuple[str, ...]) -> tuple[int, ...]:
         whole = (0,)
     if any(isinstance(value, bool) for value in values) or min(whole) < 1:
         raise DetectorError(
-            f"persistence={given!r} is not a whole number of samples from 1 on.",
-            persistence=given,
+            f"{what}={given!r} is not a whole number of samples from 1 on.",
+            **{what: given},
         )
     return whole

@@ -85,8 +85,9 @@ def estimate(
     log.flags.writeable = False
     ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out())])
     parts = np.split(log, ends[:-1], axis=1)
-    told: dict[str, Any] = dict(zip((*STEP_OUTPUTS[1:], "alarm"), parts, strict=False))
-    told["status"] = told["status"][:, 0].astype(np.int64)
+    told: dict[str, Any] = dict(zip(step.name_out()[1:], parts, strict=True))
+    for key in {"status", "mean_status"} & told.keys():
+        told[key] = told[key][:, 0].astype(np.int64)
     if "alarm" in told:
         told["alarm"] = told["alarm"] > 0.5
     return Estimate(observer, record, blamed=blamed, **told)

@@ -66,6 +66,8 @@ class Estimate:
         Bit mask of the step.
     alarm : (N, n_f) bool or None
         Alarms of a fault detector; None where an observer ran alone.
+    mean_lower, mean_upper : (N, n_f) or None, mean_status : (N,) int or None
+        Of a detector with a window m: means of the faults over k - m..k - 1, and the status.
     blamed : tuple of str
         Outputs without each of which the first void instant would not be void.
     """
@@ -80,6 +82,9 @@ class Estimate:
     f_upper: FloatArray
     status: NDArray[np.int64]
     alarm: BoolArray | None = None
+    mean_lower: FloatArray | None = None
+    mean_upper: FloatArray | None = None
+    mean_status: IntArray | None = None
     blamed: tuple[str, ...] = ()
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.files import replaced
+from obsynth.designs.core.observer import MEAN_OUTPUTS
 from obsynth.evaluate.errors import ReportError
 from obsynth.symbolic.arrays import FloatArray
 
@@ -37,6 +38,9 @@ def to_dataset(run: Any, attrs: Mapping[str, Any]) -> Any:
     data["status"] = (("time",), run.status)
     if run.alarm is not None:
         data["alarm"] = (("time", "fault"), run.alarm)
+    if run.mean_status is not None:
+        data |= {key: (("time", "fault"), getattr(run, key)) for key in MEAN_OUTPUTS[:2]}
+        data["mean_status"] = (("time",), run.mean_status)
     return xr.Dataset(data, coords=coords, attrs=dict(attrs))
 
 

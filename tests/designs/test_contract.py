@@ -20,7 +20,8 @@ from obsynth.designs.core.certificate import Certificate, Claim
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.files import CLAIMS
 from obsynth.designs.core.method import CONTRACTS, VERSION
-from obsynth.designs.core.observer import STEP_OUTPUTS
+from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
+from obsynth.designs.detection.detector import core_of
 
 ALONE = """
 import importlib, sys
@@ -424,12 +425,19 @@ def test_a_detector_stands_on_it_or_says_why_not(entry, name, observer):
         with pytest.raises(DetectorError, match="fault"):
             ob.FaultDetector(observer)
         return
-    detector = ob.FaultDetector(observer)
+    m = None if core_of(observer).mean_fault else 5
+    detector = ob.FaultDetector(observer, window=m)
     run = simulated(entry, detector)
     told = detector.detect(run)
     np.testing.assert_array_equal(told.alarm, run.alarm)
     np.testing.assert_array_equal(run.x_upper, run_of(name).x_upper)
     assert not any(told.false_alarms.values())
+    if m is not None:
+        valid = (run.mean_status & STATUS["fault_not_valid"]) == 0
+        before = np.cumsum(np.vstack([0 * run.f[:1], run.f]), axis=0)
+        mean = (before[m:-1] - before[: -m - 1]) / m
+        inside = (run.mean_lower[m:] <= mean + 1e-9) & (mean - 1e-9 <= run.mean_upper[m:])
+        assert valid.any() and inside[valid[m:]].all()
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

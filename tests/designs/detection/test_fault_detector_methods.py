@@ -67,10 +67,13 @@ def test_a_delay_of_the_bounds_that_is_forgotten_shows(interval):
 
 
 def test_interval_detector_in_c(interval, tmp_path):
-    project = ob.generate_c(ob.FaultDetector(interval, 2), tmp_path / "p", vectors=2000)
+    project = ob.generate_c(ob.FaultDetector(interval, 2, window=4), tmp_path / "p", vectors=2000)
     assert project.statuses[0] > 500
     if project.comparison is not None:
         assert project.comparison.vectors == 2000
+    header = next((project.folder / "include").glob("*.h")).read_text()
+    assert "mean_lower[1]; /* of the faults over the 4 steps before this one */" in header
+    assert "- **Means.**" in (project.folder / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -124,6 +127,8 @@ def test_a_mean_is_promised_as_such(bank):
     wide = ob.FaultDetector(bank)
     assert not any("in the steady state" in claim for claim in wide.guarantee.claims)
     assert "promised above inf" in str(wide)
+    with pytest.raises(DetectorError, match="window=3: filter_bank encloses a mean of theta1"):
+        ob.FaultDetector(bank, window=3)
 
 
 def test_a_mean_outlasts_its_fault(bank):

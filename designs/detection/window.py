@@ -1,0 +1,188 @@
+"""The mean of every fault over the last m instants, for any course of the fault.
+
+At call k, with X_j the returned sets of the states, F_j those of the faults, and P and D of a
+relation (`relations`), the mean of f over j = k-m..k-1 lies in
+
+    (P(X_k) - P(X_{k-m}) - sum_j D(X_j, u_j, F_j, W)) / m,
+
+met over the relations, with the mean of the F_j and with the declared range. Every operation is
+rounded outwards, and sums are formed anew at every call from what is remembered of m-1 instants.
+
+The mean is valid (bit 16 of its status not set) once m transitions in a row may be used: those
+between two calls that are initialised and not void, the first with an input that is finite and in
+its range where that matters. A missing reading (bit 32) only makes it wider. Its other bits are
+those of the m+1 calls together. A mean that is empty contradicts the assumptions: it is void, and
+the window begins anew.
+"""
+
+from dataclasses import dataclass, fields
+from functools import cached_property, reduce
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from obsynth.derive.rigour import outward
+from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.equations import Before, Equations
+from obsynth.designs.core.lifted import Lifted, Rounding, combine
+from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
+from obsynth.designs.core.step import HUGE
+from obsynth.designs.core.stepping import slices
+from obsynth.designs.detection.relations import relations
+from obsynth.symbolic import Plant
+from obsynth.symbolic.arrays import FloatArray
+
+_JOINED = tuple(name for name in STATUS if name != "fault_not_valid")
+_CHUNK = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The recursion of the means.
+
+    plant: discrete; where `moving` is False its rows are no truth, and the F_j alone are used
+    m: instants of the mean
+    delay: of the fault sets, 0 or 1
+    scheduled: whether measured scheduling is an input
+    half_widths: of states and faults that are to be expected, (n + n_f,)
+    """
+
+    plant: Plant
+    m: int
+    delay: int
+    moving: bool = True
+    scheduled: bool = False
+    half_widths: FloatArray | None = None
+    precision: str = "double"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is made of the fields, as symbols cannot be pickled."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @cached_property
+    def relations(self) -> tuple[list[int], Equations | None]:
+        """Faults of the relations, and their rows."""
+        return relations(self.plant, self.half_widths, self.m) if self.moving else ([], None)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of u, theta and the outputs of an observer's step that are read."""
+        plant, n, n_f = self.plant, len(self.plant.x), len(self.plant.f)
+        n_theta = sum(s.measured for s in plant.rho) if self.scheduled else 0
+        named = zip(STEP_OUTPUTS[3:], (n, n, n_f, n_f, 1), strict=True)
+        return {"u": len(plant.u), "theta": n_theta, **dict(named)}
+
+    @cached_property
+    def layout(self) -> dict[str, slice]:
+        """Where the parts of the memory are."""
+        found, of = self.relations[0], self.sizes
+        parts = (self.m - 1) * 2 * (of["f_lower"] + 2 * len(found))
+        kept = {"count": 1, "ready": 1, "since": len(_JOINED), "parts": parts}
+        kept |= {"known": of["u"] + of["theta"], "x": 2 * of["x_lower"]} if found else {}
+        kept |= {} if self.delay else {"f": 2 * of["f_lower"]}
+        return slices({f"mean_{name}": size for name, size in kept.items() if size})
+
+    @property
+    def first(self) -> FloatArray:
+        """The memory before the first call."""
+        memory = np.zeros(max(place.stop for place in self.layout.values()))
+        memory[self.layout["mean_since"]] = self.m + 1.0
+        return memory
+
+    @cached_property
+    def step(self) -> ca.Function:
+        """(memory, u, theta, x_lower, ..., f_upper, status) -> (memory, *MEAN_OUTPUTS)."""
+        found, equations = self.relations
+        memory = ca.SX.sym("memory", len(self.first))
+        ports = [ca.SX.sym(name, size) for name, size in self.sizes.items()]
+        u, theta, x_lower, x_upper, f_lower, f_upper, status = ports
+        part = {"known": ca.SX(0, 1), "parts": ca.SX(0, 1)}
+        part |= {name[5:]: memory[place] for name, place in self.layout.items()}
+        bit = {k: ca.fmod(ca.floor(status / value), 2) >= 1 for k, value in STATUS.items()}
+        good = ca.logic_not(ca.logic_or(bit["not_initialised"], bit["void"]))
+        declared = Ends.of(outward(self.plant.box("f").reshape(-1, 2), self.precision))
+        F = declared.where(bit["fault_not_valid"], declared.meet(Ends(f_lower, f_upper)))
+        earlier = F if self.delay else _unpacked(part["f"])
+        X, known, usable, now = Ends(x_lower, x_upper), ca.vertcat(u, theta), good, []
+        row: list[Any] = [earlier]
+        if equations is not None:
+            X = X.meet(Ends.of(equations.box[: equations.n]))
+            then = Before(_unpacked(part["x"]), earlier, part["known"])
+            r, q = Rounding(self.precision), len(found)
+            row += [equations.image(i, then, r) for i in range(2 * q)]
+            now = [equations.image(q + i, Before(X, F, known), r) for i in range(q)]
+            for i, (low, high) in enumerate(equations.known_box.tolist()):
+                inside = ca.logic_and(known[i] >= low, known[i] <= high)
+                usable = ca.logic_and(usable, inside)
+        newest = ca.vertcat(*(e.lower for e in row), *(e.upper for e in row))
+        parts = ca.vertcat(newest, part["parts"])
+        going = ca.logic_and(good, part["ready"] > 0.5)
+        count = ca.if_else(going, ca.fmin(part["count"] + 1, self.m), 0)
+        full = count > self.m - 0.5
+        mean = declared.meet(self._mean(parts, now))
+        void = ca.logic_and(full, mean.empty())
+        mean = mean.where(ca.logic_and(full, ca.logic_not(void)), declared)
+        word, since = STATUS["fault_not_valid"] * ca.logic_not(full), []
+        for i, name in enumerate(_JOINED):
+            age = ca.fmin(part["since"][i] + 1, self.m + 1)
+            since.append(ca.if_else(bit[name], 0, age))
+            flag = since[i] < self.m + 0.5
+            word += STATUS[name] * (ca.logic_or(flag, void) if name == "void" else flag)
+        moved = {"count": ca.if_else(void, 0, count), "ready": usable, "since": ca.vertcat(*since)}
+        kept = [ca.if_else(usable, known[i], 0) for i in range(known.numel())]
+        moved |= {"known": ca.vertcat(*kept), "x": ca.vertcat(X.lower, X.upper)}
+        moved |= {"f": ca.vertcat(F.lower, F.upper), "parts": parts[: -newest.numel()]}
+        following = ca.vertcat(*(moved[name[5:]] for name in self.layout))
+        results = ca.cse([following, _open(mean.lower), _open(mean.upper), word])
+        labels = ["memory", *self.sizes], ["next", *MEAN_OUTPUTS]
+        return ca.Function("window", [memory, *ports], [*map(ca.densify, results)], *labels)
+
+    def _mean(self, parts: ca.SX, now: list[Lifted]) -> Ends:
+        """Enclose the means from (F, D, P) of m instants, the newest first, and P of this one."""
+        rounding, n_f, q = Rounding(self.precision), len(self.plant.f), len(now)
+        rows = [_unpacked(part) for part in ca.vertsplit(parts, 2 * (n_f + 2 * q))]
+
+        def total(i: int) -> Lifted:
+            terms = [Lifted(row.lower[i], row.upper[i]) for row in rows]
+            return reduce(lambda a, b: combine("add", a, b, rounding=rounding), terms)
+
+        sums = [[total(j)] for j in range(n_f)]
+        for i, j in enumerate(self.relations[0]):
+            end = n_f + q + i
+            then = Lifted(rows[-1].lower[end], rows[-1].upper[end])
+            moved = combine("subtract", now[i], then, rounding=rounding)
+            sums[j].append(combine("subtract", moved, total(n_f + i), rounding=rounding))
+        m, ends = Lifted.number(float(self.m)), []
+        for told in sums:
+            means = [combine("divide", one, m, rounding=rounding) for one in told]
+            ends.append(reduce(Ends.meet, [Ends(mean.lower, mean.upper) for mean in means]))
+        return Ends(ca.vertcat(*(e.lower for e in ends)), ca.vertcat(*(e.upper for e in ends)))
+
+    def over(self, *columns: FloatArray) -> list[FloatArray]:
+        """Return the means of a run: mean_lower, mean_upper (N + 1, n_f), mean_status (N + 1,).
+
+        columns: u, theta, x_lower, x_upper, f_lower, f_upper (N + 1, ...), status (N + 1,)
+        """
+        N, memory, found = len(columns[-1]), self.first, []
+        rows = [np.asarray(c, dtype=float).reshape(N, -1).T for c in columns]
+        for start in range(0, N, _CHUNK):
+            stop = min(start + _CHUNK, N)
+            run: Any = self.step.mapaccum(stop - start)
+            moved, *means = run(memory, *(row[:, start:stop] for row in rows))
+            memory = np.array(moved)[:, -1]
+            found.append(np.vstack([np.array(mean) for mean in means]))
+        n_f, means = len(self.plant.f), np.hstack(found)
+        return [means[:n_f].T, means[n_f:-1].T, means[-1].astype(np.int64)]
+
+
+def _unpacked(ends: ca.SX) -> Ends:
+    """Return a box from its lower ends with the upper ones behind."""
+    half = ends.numel() // 2
+    return Ends(ends[:half], ends[half:])
+
+
+def _open(ends: ca.SX) -> ca.SX:
+    """Write infinities for ends that some unbounded set went into."""
+    entries = (ends[j] for j in range(ends.numel()))
+    return ca.vertcat(*(ca.if_else(ca.fabs(e) > HUGE, ca.sign(e) * ca.inf, e) for e in entries))
