@@ -11,7 +11,7 @@ from obsynth.evaluate.checked import scheduling_columns, step_function
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.truth import Call, dense, sample_time
-from obsynth.symbolic import Plant, Record
+from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.scenarios import gentle
 
@@ -23,11 +23,12 @@ BLOCK = 4096
 
 def estimate(
     observer: Observer | FaultDetector,
-    record: Record,
+    record: Any,
     *,
     guess: Any = None,
     x_range: Any = None,
     f_range: Any = None,
+    **reading: Any,
 ) -> Estimate:
     """Run an observer or a fault detector over what was measured.
 
@@ -35,14 +36,16 @@ def estimate(
     ----------
     observer : Observer or FaultDetector
         Of any method, for the plant of the record.
-    record : Record
+    record : Record, or whatever `read_record` reads
         Rows are instants one sample time apart; a missing reading is NaN and costs that reading
-        only. Measured scheduling signals are channels of their own names.
+        only, an instant at which nothing was measured all of them.
     guess : array_like (n,), optional
         Where the state is thought to be at the first instant; the nominal one by default.
     x_range, f_range : array_like (n, 2), (n_f, 2), optional
         Boxes that hold the first state and the first faults; the declared ranges by default, so
         that nothing is assumed of the start.
+    **reading
+        What `read_record` takes, ``map=``, ``time=``, ``jitter=`` and so on.
 
     Returns
     -------
@@ -51,6 +54,8 @@ def estimate(
 
     Raises
     ------
+    RecordError
+        The source cannot be read.
     SimulationError
         The record has other channels, or another sample time, than the observer's plant.
 
@@ -63,6 +68,8 @@ def estimate(
     (1.0, None)
     """
     model, step = observer.model, step_function(observer, observer.model)
+    if not isinstance(record, Record) or reading:
+        record = read_record(record, model, **reading)
     fits(model, record)
     start = gentle(model)
     memory = observer.memory0(
@@ -72,15 +79,7 @@ def estimate(
         y0=record.y[0],
     )
     names = [model.names("rho")[k] for k in scheduling_columns(step, model, "step")]
-    absent = [name for name in names if not any(name in g for g in record.names.values())]
-    if absent:
-        raise SimulationError(
-            f"{model.name} is scheduled by {absent[0]}, which the record {record.source!r} does "
-            "not hold: give it a channel of that name.",
-            symbol=absent[0],
-        )
-    theta = [record[name][:, None] for name in names]
-    rows = np.hstack([record.u, record.y, *theta])
+    rows = np.column_stack([record.u, record.y, *(record[name] for name in names)])
     log, blamed = _march(step, np.array(memory, dtype=float), rows, model.output_names)
     log.flags.writeable = False
     ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out())])
@@ -95,11 +94,13 @@ def estimate(
 
 def fits(model: Plant, record: Record) -> None:
     """Refuse a record with other channels, or other instants, than a plant has."""
-    for kind, names in (("u", model.names("u")), ("y", model.output_names)):
+    known = tuple(s.name for s in model.rho if s.measured)
+    for kind, names in (("u", model.names("u")), ("y", model.output_names), ("rho", known)):
         if record.names[kind] != tuple(names):
+            given, own = (", ".join(some) or "nothing" for some in (record.names[kind], names))
             raise SimulationError(
-                f"the record {record.source!r} has {', '.join(record.names[kind])} as {kind}; "
-                f"{model.name} has {', '.join(names)}: give its channels in that order.",
+                f"the record {record.source!r} has {given} as {kind}; {model.name} has {own}: "
+                "give its channels in that order.",
                 field=kind,
             )
     Ts, steps = sample_time(model), np.diff(record.time)
@@ -107,7 +108,7 @@ def fits(model: Plant, record: Record) -> None:
     if abs(steps[k] - Ts) > JITTER * Ts:
         raise SimulationError(
             f"the record {record.source!r} has {steps[k]:g} s from t = {record.time[k]:g} on; "
-            f"{model.name} is sampled every {Ts:g} s.",
+            f"{model.name} is sampled every {Ts:g} s. read_record makes instants of missing rows.",
             instant=k,
         )
 

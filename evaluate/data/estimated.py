@@ -4,7 +4,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -105,13 +104,18 @@ class Estimate:
         return self.record.y
 
     @property
+    def rho(self) -> FloatArray:
+        """Measured scheduling, (N, channels)."""
+        return np.asarray(self.record.rho)
+
+    @property
     def reference(self) -> FloatArray:
         """The channels that no observer reads, (N, channels)."""
         return self.record.reference
 
     @cached_property
     def names(self) -> Mapping[str, tuple[str, ...]]:
-        """Signal names by group: "x", "f", "u", "y", "reference"."""
+        """Signal names by group: "x", "f" and those of the record."""
         model = self.observer.model
         return {"x": model.names("x"), "f": model.names("f"), **self.record.names}
 
@@ -194,13 +198,9 @@ class Estimate:
                 ends = np.array([trace.lower, trace.upper])
                 f[:, : len(trace.t), j] = np.where(trace.valid, ends, f[:, : len(trace.t), j])
             known["f"] = (f[0], f[1])
-        own = self.names["reference"]
         if model.rho:
-            box = model.box("rho")
-            rho = np.repeat(box.T[:, None, :], len(self.t), axis=1)
-            for j, signal in enumerate(model.rho):
-                if signal.measured and signal.name in own:
-                    rho[:, :, j] = self.record[signal.name]
+            rho = np.repeat(model.box("rho").T[:, None, :], len(self.t), axis=1)
+            rho[:, :, [s.measured for s in model.rho]] = self.rho
             known["rho"] = (rho[0], rho[1])
         return allowed(model, **known)
 
@@ -328,7 +328,7 @@ class Estimate:
         lines += map(str, count_status(self.status))
         lines += list_voids(find_voids(self.status))
         lines += [str(self.refuted)] if self.refuted else []
-        return [*lines, *getattr(self.record, "notes", ())]
+        return [*lines, *self.record.notes]
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the estimate says as numbers for JSON; what is no finite number is None."""
@@ -350,7 +350,7 @@ class Estimate:
             "conflict": self.conflict.tolist(),
             "alarms": alarms,
             "refuted": None if refuted is None else {**vars(refuted), "said": str(refuted)},
-            "notes": list(getattr(self.record, "notes", ())),
+            "notes": list(self.record.notes),
         }
         return {key: _plain(value) for key, value in told.items()}
 
@@ -361,7 +361,7 @@ class Estimate:
         in the last row.
         """
         found = {"time": self.t}
-        for group in ("u", "y", "reference"):
+        for group in self.record.names:
             found |= zip(self.names[group], getattr(self, group).T, strict=True)
         late, gap = self.fault_delay, np.full(self.fault_delay, np.nan)
         for key, labels in self.observer.outputs.items():
@@ -373,8 +373,9 @@ class Estimate:
 
     def to_frame(self) -> Any:
         """Return a ``pandas.DataFrame``: rows are instants, see `columns`."""
-        frame = import_module("pandas").DataFrame(self.columns())
-        return frame.set_index("time")
+        import pandas as pd
+
+        return pd.DataFrame(self.columns()).set_index("time")
 
     def to_xarray(self) -> Any:
         """Return an ``xarray.Dataset`` as `Run.to_xarray` does; faults as the step gave them."""

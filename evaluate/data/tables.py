@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +55,11 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, FloatArray
             _write_text(beside, columns)
         return target
     try:
-        pa, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+        import pyarrow as pa
+        from pyarrow import parquet
     except ImportError:
         raise ReportError(
-            f"writing {target.name} needs pyarrow (pip install pyarrow); a name that ends with "
-            ".csv needs nothing.",
+            f"{target.name} needs pyarrow: pip install 'obsynth[data]', or give a name with .csv.",
             path=str(target),
         ) from None
     with replaced(target) as beside:

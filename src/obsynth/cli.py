@@ -135,6 +135,76 @@ def choose(
         _refuse(choice.reason)
 
 
+@app.command()
+def estimate(
+    design: Annotated[Path, typer.Argument(help="A design saved by obsynth, a JSON file.")],
+    record: Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")],
+    mapping: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
+    ] = None,
+    time_column: Annotated[str | None, typer.Option("--time", help="Column of the time.")] = None,
+    jitter: Annotated[float, typer.Option(help="How far stamps may be off, of Ts.")] = 0.05,
+    first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
+    until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
+    guess: Annotated[str | None, typer.Option(help="First state, numbers with commas.")] = None,
+    meter: Annotated[
+        list[str] | None, typer.Option("--compare", help="SIGNAL=CHANNEL,rate or level.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write, .csv or .parquet.")] = None,
+    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+) -> None:
+    """Run a saved observer over a record; exit 3 if the record refutes its assumptions."""
+    with _refusals():
+        import json
+
+        import obsynth
+
+        observer = obsynth.load(design)
+        columns = {name: _column(told) for name, told in _pairs("--map", mapping)}
+        given = obsynth.read_record(record, observer.model, columns, time_column, jitter=jitter)
+        state = None if guess is None else _numbers("--guess", guess.split(","))
+        told = obsynth.estimate(observer, given[first:until], guess=state)
+        meters: Any = {name: tuple(to.split(",")) for name, to in _pairs("--compare", meter)}
+        beside = [told.compare(None, **{name: pair}) for name, pair in meters.items()]
+        if out is not None:
+            told.write(out)
+        if report is not None:
+            told.report(report, **meters)
+    if as_json:
+        print(json.dumps({**told.to_dict(), "compare": [vars(one) for one in beside]}, indent=1))
+    else:
+        _console().print(_rich(told.summary()))
+        for one in beside:
+            _console().print(str(one), markup=False)
+    if told.refuted is not None:
+        print(f"obsynth: {told.refuted}", file=sys.stderr)
+        raise typer.Exit(code=3)
+
+
+def _pairs(option: str, given: list[str] | None) -> Iterator[tuple[str, str]]:
+    """Read NAME=VALUE."""
+    for text in given or ():
+        name, mark, value = text.partition("=")
+        if not mark:
+            _refuse(f"{option} {text!r} is not SIGNAL=...")
+        yield name, value
+
+
+def _column(told: str) -> Any:
+    """Read COLUMN[,SCALE[,OFFSET]]; nothing is an output that was not measured."""
+    name, *numbers = told.split(",")
+    return (name, *_numbers("--map", numbers)) if numbers else name or None
+
+
+def _numbers(option: str, given: list[str]) -> list[float]:
+    try:
+        return [float(number) for number in given]
+    except ValueError as error:
+        _refuse(f"{option}: {error}.")
+
+
 def _plant(given: str) -> Plant:
     """Return a plant by its name, or from the file of a plant or of a design."""
     import json

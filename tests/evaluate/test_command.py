@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -210,3 +211,91 @@ def test_choose_refuses_what_is_no_plant(chosen, tmp_path, text, refusal):
 def test_choose_refuses_a_continuous_plant_without_a_sample_time():
     result = runner.invoke(app, ["choose", "battery"])
     assert result.exit_code == 1 and "battery 1RC is a continuous plant: give Ts=" in said(result)
+
+
+RAW = Path(obsynth.symbolic.records.three_tank_leak.__code__.co_filename).with_suffix(".csv")
+
+
+@pytest.fixture(scope="module")
+def leaking(tmp_path_factory):
+    path = tmp_path_factory.mktemp("design") / "design.json"
+    obsynth.IntervalObserver().design(obsynth.plants.leaking_tanks()).save(path)
+    return path, obsynth.load(path)
+
+
+@pytest.fixture
+def design(leaking, monkeypatch):
+    """A saved design, whose proof is not waited for again."""
+    monkeypatch.setattr(obsynth, "load", {leaking[0]: leaking[1]}.__getitem__)
+    return leaking[0]
+
+
+def channels(**changed):
+    """The options that make the file's columns the signals of the plant."""
+    scale = f"{1 / 0.57!r},{-0.43 / 0.57!r}"
+    at = {"u1": f"u1,{scale}", "u3": f"u3,{scale}"}
+    at |= {
+        f"y{i}": f"y{i},1,-{rest}"
+        for i, rest in zip((1, 2, 3), (".160824", ".103167", ".156445"), strict=True)
+    }
+    return [part for name, told in (at | changed).items() for part in ("--map", f"{name}={told}")]
+
+
+def test_estimate_tells_what_estimate_tells(design, tmp_path):
+    """Mutants: the offset left out; the end of the record kept."""
+    files = tmp_path / "told.csv", tmp_path / "page.html"
+    rest = [
+        "--from",
+        "36",
+        "--to",
+        "200",
+        "--guess",
+        ".06,.2,.12",
+        "--compare",
+        "leak=leak_pulses,rate",
+    ]
+    rest += ["--out", str(files[0]), "--report", str(files[1])]
+    args = ["estimate", str(design), str(RAW), *channels(), *rest]
+    result = runner.invoke(app, [*args, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    record = obsynth.records.three_tank_leak()[: 200 - 36]
+    same = obsynth.estimate(obsynth.load(design), record, guess=[0.06, 0.2, 0.12])
+    assert told["instants"] == 164 and told["alarms"]["leak"] == {
+        "count": same.alarms()["leak"].size,
+        "first": 25,
+    }
+    assert told["widths"]["leak"]["median"] == pytest.approx(same.widths()["leak"]["median"])
+    assert told["compare"][0]["inside"] == 1.0 and told["refuted"] is None
+    assert len(files[0].read_text().splitlines()) == 165 and "Records" in files[1].read_text()
+    shown = runner.invoke(app, args)
+    assert (
+        shown.exit_code == 0
+        and "median half width" in shown.output
+        and "100 % inside" in shown.output
+    )
+
+
+def test_estimate_ends_with_3_where_the_record_refutes_the_assumptions(design):
+    """Mutant: 1, which is bad input."""
+    args = ["estimate", str(design), str(RAW), *channels(y2="y2,1,0.5"), "--from", "36", "--json"]
+    result = runner.invoke(app, args)
+    assert result.exit_code == 3 and json.loads(result.stdout)["refuted"]["instant"] == 0
+    assert "obsynth: the record refutes the assumptions at k = 0" in said(result)
+
+
+@pytest.mark.parametrize(
+    ("args", "refusal"),
+    [
+        (["--map", "y1"], "--map 'y1' is not SIGNAL=..."),
+        (["--map", "y1=y1,one"], "could not convert string to float: 'one'"),
+        (["--map", "y9=y1"], "names 'y9'"),
+        (["--guess", "1"], "guess has to be 3 finite numbers"),
+        (["--compare", "leak=leak_pulses"], "is no channel with 'rate'"),
+        (["--out", "told.txt"], "neither with .parquet nor .csv"),
+        (["--from", "216"], "two instants at least"),
+    ],
+)
+def test_estimate_refuses_bad_input(design, args, refusal):
+    result = runner.invoke(app, ["estimate", str(design), str(RAW), *args])
+    assert result.exit_code == 1 and refusal in said(result) and "Traceback" not in result.output
