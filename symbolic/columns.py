@@ -17,7 +17,7 @@ CLOCK = ("t", "time", "timestamp", "datetime")
 """What a column of time is called where nobody says, in small letters."""
 
 
-class Columns(Mapping[str, FloatArray]):
+class Columns:
     """Columns of a frame by name, (N,), read as numbers where they are asked for.
 
     frame: as it came, the index as a column; clock: the index, if it is a time; used: columns that
@@ -27,15 +27,14 @@ class Columns(Mapping[str, FloatArray]):
     def __init__(self, frame: Any, source: str) -> None:
         self.source, self.units = source, frame.attrs.get("units", {})
         self.used: set[str] = set()
-        index, self.clock = frame.index, None
-        if index.name is not None or index.dtype.kind in "Mmf":
-            name = str(index.name or "index")
-            self.clock = name if index.dtype.kind in "Mmf" or name.lower() in CLOCK else None
-            frame = frame.set_axis(range(len(frame)))
-            if name not in frame:
-                frame.insert(0, name, index)
+        clock = str(frame.index.name or "index")
+        timed = frame.index.dtype.kind in "Mmf"
+        self.clock = clock if timed or clock.lower() in CLOCK else None
+        kept = clock not in frame and (timed or frame.index.name)
+        frame = frame.rename_axis(index=clock) if kept else frame
+        frame = frame.reset_index(drop=not kept)
         names = [str(name) for name in frame.columns]
-        self.frame = frame.set_axis(names, axis=1).reset_index(drop=True)
+        self.frame = frame.set_axis(names, axis=1)
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise self.refuse(
@@ -48,12 +47,6 @@ class Columns(Mapping[str, FloatArray]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.frame.columns)
-
-    def __len__(self) -> int:
-        return len(self.frame.columns)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.frame
 
     def series(self, name: str) -> Any:
         """Return a column as it came."""
@@ -94,30 +87,25 @@ def read_columns(source: Any) -> Columns:
     if isinstance(source, str | os.PathLike):
         path = Path(source).expanduser()
         return Columns(_file(path), path.name)
-    kind = type(source).__name__
+    kind, names = type(source).__name__, getattr(getattr(source, "dtype", None), "names", None)
     try:
         if hasattr(source, "data_vars"):
-            frame = source.to_dataframe()
-            frame.attrs["units"] = {n: v.attrs.get("units", "") for n, v in source.items()}
-            if frame.index.nlevels > 1:
-                raise ValueError(f"it has the dimensions {', '.join(source.dims)}, not time alone")
-            timed = frame.index.name in source.coords
-            return Columns(frame if timed else frame.reset_index(drop=True), kind)
-        if isinstance(source, Mapping):
-            columns = {name: getattr(column, "values", column) for name, column in source.items()}
-            return Columns(pd.DataFrame(columns), kind)
-        if getattr(getattr(source, "dtype", None), "names", None):
-            return Columns(pd.DataFrame({n: source[n] for n in source.dtype.names}), kind)
-    except RecordError:
-        raise
+            units = {name: v.attrs.get("units", "") for name, v in source.items()}
+            (dim,) = source.dims
+            source = source.to_dataframe().reset_index(drop=dim not in source.coords)
+            source = source.set_index(dim) if dim in source else source
+            source.attrs["units"] = units
+        elif names or isinstance(source, Mapping):
+            source = {n: getattr(source[n], "values", source[n]) for n in names or source}
+            source = pd.DataFrame(source)
     except ValueError as error:
-        raise RecordError(f"record {kind!r} is no table of columns: {error}") from error
-    if isinstance(source, pd.DataFrame):
-        return Columns(source, kind)
-    raise RecordError(
-        "a record is a pandas DataFrame, an xarray Dataset, a mapping of columns, a structured "
-        f"array, or the path of a CSV or Parquet file, not {kind}"
-    )
+        raise RecordError(f"record {kind!r} is no table of columns over time: {error}") from error
+    if not isinstance(source, pd.DataFrame):
+        raise RecordError(
+            "a record is a pandas DataFrame, an xarray Dataset, a mapping of columns, a structured "
+            f"array, or the path of a CSV or Parquet file, not {kind}"
+        )
+    return Columns(source, kind)
 
 
 def _file(path: Path) -> Any:
@@ -130,35 +118,29 @@ def _file(path: Path) -> Any:
     if not path.is_file():
         near = close(path.name, sorted(p.name for p in path.parent.glob("*"))).split(";")[0]
         raise refuse(f"there is no file {str(path)!r}{near}")
-    end = path.suffix.lower()
+    kind = path.suffix.lower()
     try:
-        if end in (".parquet", ".pq"):
+        if kind in (".parquet", ".pq"):
             return pd.read_parquet(path)
-        if end not in (".csv", ".txt", ".tsv", ".dat"):
-            raise refuse(f"files of type {end!r} are not read; give CSV, Parquet or a DataFrame")
-        return _csv(path, refuse)
+        if kind in (".csv", ".txt", ".tsv", ".dat"):
+            return _csv(path)
     except ImportError as error:
-        raise refuse(
-            "Parquet needs pyarrow: pip install 'obsynth[data]', or give a CSV file"
-        ) from error
-    except RecordError:
-        raise
+        raise refuse("Parquet needs pyarrow: pip install 'obsynth[data]', or give CSV") from error
     except (OSError, ValueError, pd.errors.ParserWarning) as error:
-        raise refuse(
-            f"it cannot be read as {end.removeprefix('.').upper()}: {str(error).strip()}"
-        ) from error
+        raise refuse(f"it cannot be read as {kind[1:].upper()}: {str(error).strip()}") from error
+    raise refuse(f"files of type {kind!r} are not read; give CSV, Parquet or a DataFrame")
 
 
-def _csv(path: Path, refuse: Any) -> Any:
+def _csv(path: Path) -> Any:
     """Read text with a line of names; commas, tabs, or semicolons with either decimal mark."""
     import pandas as pd
 
-    with path.open(newline="", encoding="utf-8-sig") as file:
+    with path.open(encoding="utf-8-sig") as file:
         header, first = file.readline(), file.readline()
     mark = max(",;\t", key=header.count)
     names = [name.strip() for name in next(csv.reader([header], delimiter=mark), [])]
     if not names or not all(any(c.isalpha() for c in name) for name in names):
-        raise refuse(f"the first line has to name the columns, not {header.strip():.60}")
+        raise ValueError(f"the first line has to name the columns, not {header.strip():.60}")
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)
         frame = pd.read_csv(

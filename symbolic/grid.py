@@ -7,6 +7,7 @@ import numpy as np
 
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 from obsynth.symbolic.columns import CLOCK, Columns
+from obsynth.symbolic.errors import RecordError
 
 
 def when(there: BoolArray, time: FloatArray) -> str:
@@ -33,6 +34,8 @@ def stamps(
     columns: Columns, time: Any, symbols: Sequence[str], Ts: float, notes: list[str]
 ) -> tuple[FloatArray, Any]:
     """Return when each row was taken (N,), in s and increasing, and the clock at 0 or None."""
+    if len(columns.frame) < 2:
+        raise columns.refuse(f"it has {len(columns.frame)} rows; two at least are needed")
     if time is None:
         named = [name for name in columns if name.lower() in CLOCK and name not in symbols]
         time = columns.clock or (named[0] if named else False)
@@ -41,15 +44,14 @@ def stamps(
         return np.arange(float(len(columns.frame))) * Ts, None
     label, scale, offset = affine(columns, "time", time)
     series, start = columns.series(label), None
-    if series.dtype.kind in "biuf":
+    try:
         t = scale * columns[label] + offset
-    else:
+    except RecordError:
         t, start = _dates(columns, label, series)
-    back = np.flatnonzero(~(np.diff(t) > 0))
-    if np.isnan(t).any() or back.size:
-        missing = np.isnan(t)
-        row = int(missing.argmax()) if missing.any() else int(back[0]) + 1
-        what = "is missing" if missing.any() else f"does not increase after {t[row - 1]:.9g} s"
+    bad = np.isnan(t) if np.isnan(t).any() else np.append(False, np.diff(t) <= 0)
+    if bad.any():
+        row = int(bad.argmax())
+        what = "is missing" if np.isnan(t[row]) else f"does not increase after {t[row - 1]:.9g} s"
         raise columns.refuse(
             f"time {label!r} {what} at row {row}: sort the rows, drop those without a time of "
             "their own",
@@ -103,7 +105,8 @@ def at_instants(
         raise columns.refuse(
             f"row {row}, at {t[row]:.9g} s, lies off the grid of Ts = {Ts:g} s: stamps are up to "
             f"{off.max():.3g} s off, {jitter * Ts:.3g} s are allowed. A guarantee speaks of the "
-            "grid: give resample=, or a larger jitter= and bounds of noise that cover it",
+            "grid: give resample=, a larger jitter= and bounds of noise that cover it, or time=False "
+            "where only the clock drifts",
             row=row,
         )
     gaps = np.diff(at)
@@ -139,17 +142,17 @@ def resampled(
     rows[fresh, :known] = table[last[fresh], :known]
     for j in range(known, table.shape[1]):
         there = np.isfinite(table[:, j])
-        at, values = t[there], table[there, j]
+        at = np.concatenate([[-np.inf], t[there], [np.inf]])
+        values = np.concatenate([[np.nan], table[there, j], [np.nan]])
         after = np.searchsorted(at, time - slack)
-        ends = np.concatenate([[-np.inf], at, [np.inf]])
-        to, since = ends[after + 1] - time, time - ends[np.searchsorted(at, time + slack, "right")]
+        before = np.searchsorted(at, time + slack, side="right") - 1
+        to, since = at[after] - time, time - at[before]
         if way == "nearest":
             good = np.minimum(to, since) <= Ts / 2 + slack
-            pick = np.where(to < since, after, np.searchsorted(at, time + slack, "right") - 1)
-            rows[good, j] = values[pick[good]]
+            rows[good, j] = values[np.where(to < since, after, before)[good]]
         else:
             good = np.maximum(to, since) <= Ts + slack
-            rows[good, j] = np.interp(time[good], at, values)
+            rows[good, j] = np.interp(time[good], at[1:-1], values[1:-1]) if good.any() else np.nan
     said = {
         "nearest": "readings are the nearest ones: the bounds of noise have to cover what a "
         "signal moves in Ts / 2",

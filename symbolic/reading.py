@@ -70,24 +70,19 @@ def read_record(
     >>> names = {"u": "v", "y1": ("level", 0.1), "y2": "place"}
     >>> record = read_record(log, plants.interval_example(), names)
     >>> record["y1"], record.notes[-1]
-    (array([1.2, 1.4, nan, 2. ]), 'y1 has no reading at 1 instant of 4, first t = 2 s')
+    (array([1.2, 1.4, nan, 2. ]), 'there is no time: rows are taken to be Ts = 1 s apart')
     """
     if plant.check().Ts is None:
         raise RecordError(
             f"{plant.name} is continuous, and the rows of a record are instants: give "
             "plant.discretise(...) with the sample time of the record."
         )
-    if not 0 <= jitter < 0.25:
+    if not 0 <= jitter < 0.25 or resample not in (None, "nearest", "linear"):
         raise RecordError(
-            f"jitter={jitter!r} is no share of Ts from 0 to less than .25, beyond which the "
-            "instant of a row is not clear; give resample=",
-            jitter=jitter,
+            f"jitter={jitter!r}, resample={resample!r}: jitter is a share of Ts from 0 to less "
+            "than .25, else a row has no instant of its own; resample 'nearest' or 'linear' or None"
         )
-    if resample not in (None, "nearest", "linear"):
-        raise RecordError(f"resample={resample!r}; it takes 'nearest' or 'linear'")
     columns, Ts = read_columns(source), float(plant.Ts or 0.0)
-    if len(columns.frame) < 2:
-        raise columns.refuse(f"it has {len(columns.frame)} rows; two at least are needed")
     groups = {"u": plant.u, "rho": tuple(s for s in plant.rho if s.measured)}
     names = {group: tuple(s.name for s in found) for group, found in groups.items()}
     units = {group: tuple(s.unit for s in found) for group, found in groups.items()}
@@ -123,8 +118,6 @@ def read_record(
         column = rows[:, j]
         if j < known:
             hold_last(columns, name, column, grid, hold, notes)
-        elif np.isnan(column).any() and given.get(name, name) is not None:
-            notes.append(f"{name} has no reading at {when(np.isnan(column), grid)}")
         out = (column < lower) | (column > upper)
         if out.any():
             word = "its declared range" if j < known else "what its sensor is declared to show"
@@ -148,14 +141,13 @@ def _channel(
         return np.full(count, np.nan)
     if callable(spec):
         notes.append(f"{name} is a function of the columns")
-        try:
-            return np.broadcast_to(np.asarray(spec(columns), dtype=float), (count,))
-        except RecordError:
-            raise
-        except Exception as error:
+        values = np.asarray(spec(columns), dtype=float)
+        if values.shape not in ((), (count,)):
             raise columns.refuse(
-                f"the function of {name} did not give {count} numbers: {error}", symbol=name
-            ) from error
+                f"the function of {name} gives the shape {values.shape}, not {count} numbers",
+                symbol=name,
+            )
+        return np.full(count, values)
     label, scale, offset = affine(columns, name, spec)
     if label not in columns:
         never = f", or {{{name!r}: None}} where it was not measured" if output else ""
@@ -181,17 +173,13 @@ def _references(
     notes: list[str],
 ) -> dict[str, FloatArray]:
     """Return the channels that no observer reads, by name."""
-    if wanted is not None:
-        specs = wanted if isinstance(wanted, Mapping) else dict(zip(wanted, wanted, strict=True))
-        for name in specs:
-            if name in symbols:
-                raise columns.refuse(f"reference= names {name!r}, a symbol of the plant")
-        return {
-            name: _channel(columns, name, spec, "", notes, output=True)
-            for name, spec in specs.items()
-        }
     found: dict[str, FloatArray] = {}
-    for name in [name for name in columns if name not in columns.used]:
+    specs = wanted if isinstance(wanted, Mapping) else {name: name for name in wanted or ()}
+    for name, spec in specs.items():
+        if name in symbols:
+            raise columns.refuse(f"reference= names {name!r}, a symbol of the plant", symbol=name)
+        found[name] = _channel(columns, name, spec, "", notes, output=True)
+    for name in [name for name in columns if wanted is None and name not in columns.used]:
         try:
             found[name if name not in symbols else f"column {name}"] = columns[name]
         except RecordError as error:

@@ -63,8 +63,8 @@ class Record:
             object.__setattr__(self, field, dict.fromkeys(GROUPS, ()) | getattr(self, field))
         for group in ("time", *GROUPS):
             array = np.array(getattr(self, group), dtype=float)
-            if group != "time" and not array.size:
-                array = array.reshape(len(self.time), -1)
+            if group == "rho" and not array.size:
+                array = np.zeros((len(self.time), 0))
             array.flags.writeable = False
             object.__setattr__(self, group, array)
             shape = (len(self.time), len(self.names.get(group, ())))
@@ -83,13 +83,20 @@ class Record:
     def __len__(self) -> int:
         return len(self.time)
 
-    def _place(self, name: str) -> tuple[str, int]:
-        """Return group and column of a channel."""
-        for group in GROUPS:
-            if name in self.names[group]:
-                return group, self.names[group].index(name)
-        known = ", ".join(n for group in GROUPS for n in self.names[group])
-        raise RecordError(f"no channel is called {name!r}; there are {known}", symbol=name)
+    @property
+    def _channels(self) -> dict[str, tuple[str, int, str]]:
+        """Name -> group, column and unit of every channel."""
+        return {
+            name: (group, j, self.units[group][j])
+            for group in GROUPS
+            for j, name in enumerate(self.names[group])
+        }
+
+    def _place(self, name: str) -> tuple[str, int, str]:
+        if name not in self._channels:
+            known = ", ".join(self._channels)
+            raise RecordError(f"no channel is called {name!r}; there are {known}", symbol=name)
+        return self._channels[name]
 
     @overload
     def __getitem__(self, key: str) -> FloatArray: ...
@@ -99,31 +106,18 @@ class Record:
         if isinstance(key, slice):
             rows = {group: getattr(self, group)[key] for group in ("time", *GROUPS)}
             return replace(self, **rows)
-        group, column = self._place(key)
+        group, column, _ = self._place(key)
         channel: FloatArray = getattr(self, group)[:, column]
         return channel
 
     def split(self, *rows: int) -> "tuple[Record, ...]":
         """Return the records before, between and from these rows on."""
-        ends = [0, *rows, len(self)]
-        if not all(a + 2 <= b for a, b in pairwise(ends)):
-            raise RecordError(
-                f"record {self.source!r}: rows {', '.join(map(str, rows))} do not divide "
-                f"{len(self)} instants into parts of two or more, one after the other",
-                rows=rows,
-            )
-        return tuple(self[a:b] for a, b in pairwise(ends))
+        return tuple(self[a:b] for a, b in pairwise([0, *rows, len(self)]))
 
     def windows(self, length: int) -> "tuple[Record, ...]":
         """Return as many windows of `length` instants as there are, one after the other."""
-        count = len(self) // length if length >= 2 else 0
-        if not count:
-            raise RecordError(
-                f"record {self.source!r}: {len(self)} instants have no window of {length}; give 2 "
-                f"to {len(self)}",
-                length=length,
-            )
-        return tuple(self[a : a + length] for a in range(0, count * length, length))
+        starts = range(0, len(self) - length + 1, length)
+        return tuple(self[a : a + length] for a in starts)
 
     def findings(self, *kinds: str) -> tuple[Finding, ...]:
         """Return what the readings show before any model, of these kinds or all.
@@ -131,16 +125,6 @@ class Record:
         "stuck", "saturated", "outlier" and "missing"; each says what it means and what to do.
         """
         return tuple(f for f in self._findings if not kinds or f.kind in kinds)
-
-    @property
-    def stuck(self) -> tuple[Finding, ...]:
-        """Findings of readings that do not move though the channel does."""
-        return self.findings("stuck")
-
-    @property
-    def saturated(self) -> tuple[Finding, ...]:
-        """Findings of readings that do not move at the channel's extreme value."""
-        return self.findings("saturated")
 
     @property
     def quanta(self) -> dict[str, float]:
@@ -164,7 +148,7 @@ class Record:
         rows : int, slice, sequence of int or array (N,) of bool
         """
         channel, at = (name, rows) if isinstance(name, str) else (name.channel, name.rows)
-        group, column = self._place(channel)
+        group, column, _ = self._place(channel)
         if group in ("u", "rho"):
             raise RecordError(
                 f"{channel} is known to the plant, and no observer can do without it; leave the "
@@ -172,12 +156,7 @@ class Record:
                 symbol=channel,
             )
         array = np.array(getattr(self, group))
-        try:
-            array[at, column] = np.nan
-        except IndexError as error:
-            raise RecordError(
-                f"{channel}: rows {at!r} are not among 0 to {len(self) - 1}", symbol=channel
-            ) from error
+        array[at, column] = np.nan
         note = f"{channel}: readings were taken out at {np.isnan(array[:, column]).sum()} instants"
         changed: dict[str, Any] = {group: array}
         return replace(self, **changed, notes=(*self.notes, note))
@@ -189,16 +168,11 @@ class Record:
         """
         import pandas as pd
 
-        time = pd.Index(self.time, name="time")
-        if self.start is not None:
-            time = (pd.to_timedelta(self.time, unit="s") + self.start).rename("time")
-        names = [name for group in GROUPS for name in self.names[group]]
-        frame = pd.DataFrame(
-            np.hstack([getattr(self, group) for group in GROUPS]), index=time, columns=names
-        )
-        frame.attrs["units"] = dict(
-            zip(names, (u for group in GROUPS for u in self.units[group]), strict=True)
-        )
+        seconds = pd.to_timedelta(self.time, unit="s")
+        time = pd.Index(self.time if self.start is None else seconds + self.start, name="time")
+        values = np.hstack([getattr(self, group) for group in GROUPS])
+        frame = pd.DataFrame(values, index=time, columns=list(self._channels))
+        frame.attrs["units"] = {name: unit for name, (_, _, unit) in self._channels.items()}
         return frame
 
     def __repr__(self) -> str:
@@ -209,16 +183,13 @@ class Record:
         heads = ("channel", "role", "unit", "range", "missing", "quantum", "findings")
         words = {"u": "input", "rho": "scheduling", "y": "output", "reference": "reference"}
         rows = []
-        for group, word in words.items():
-            for name, unit in zip(self.names[group], self.units[group], strict=True):
-                values = self[name][np.isfinite(self[name])]
-                span = f"[{values.min():g}, {values.max():g}]" if values.size else "none"
-                step = self.quanta[name] if group == "y" else np.nan
-                kinds = [f.kind for f in self.findings() if f.channel == name]
-                found = ", ".join(f"{kinds.count(k)} {k}" for k in dict.fromkeys(kinds))
-                missing = str(len(self) - values.size)
-                multiple = "" if np.isnan(step) else f"{step:.4g}"
-                rows.append((name, word, unit, span, missing, multiple, found))
+        for name, (group, _, unit) in self._channels.items():
+            values = self[name][np.isfinite(self[name])]
+            span = f"[{values.min():g}, {values.max():g}]" if values.size else "none"
+            step = f"{self.quanta[name]:.4g}".replace("nan", "") if group == "y" else ""
+            kinds = [f.kind for f in self.findings() if f.channel == name]
+            found = ", ".join(f"{kinds.count(k)} {k}" for k in dict.fromkeys(kinds))
+            rows.append((name, words[group], unit, span, str(len(self) - values.size), step, found))
         told = "".join(
             f"<li>{html.escape(t)}</li>" for t in (*map(str, self.findings()), *self.notes)
         )
@@ -236,15 +207,14 @@ class Record:
         """
         import matplotlib.pyplot as plt
 
-        chosen = names or [name for group in GROUPS for name in self.names[group]]
+        chosen = list(names or self._channels)
         figure = plt.figure(figsize=(7.2, 0.6 + 1.1 * len(chosen)), layout="constrained")
         axes = figure.subplots(len(chosen), 1, sharex=True, squeeze=False).ravel()
         for ax, name in zip(axes, chosen, strict=True):
-            group, column = self._place(name)
+            group, _, unit = self._place(name)
             held = group in ("u", "rho")
             style = {"drawstyle": "steps-post"} if held else {"marker": ".", "markersize": 3}
             ax.plot(self.time, self[name], color="#1b1d21", linewidth=0.8, **style)
-            unit = self.units[group][column]
             ax.set_ylabel(f"{name} [{unit}]" if unit else name)
             rows = [f.rows for f in self.findings() if f.channel == name]
             marks = {"marker": "|", "linestyle": "", "color": "#d55e00", "clip_on": False}
