@@ -10,16 +10,9 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Readings of a channel that are none, or are not there.
+    """Rows at which a channel's readings are "stuck", "saturated", an "outlier" or "missing".
 
-    Parameters
-    ----------
-    kind : {"stuck", "saturated", "outlier", "missing"}
-    channel : str
-    rows : array of int
-        Which readings; ``record.without(finding)`` takes them out.
-    text : str
-        What was seen, what it means and what to do.
+    text: what was seen, what it means and what to do
     """
 
     kind: str
@@ -59,20 +52,25 @@ def find(name: str, y: FloatArray, time: FloatArray, inputs: FloatArray) -> Iter
         steps = np.abs(np.diff(u, prepend=u[0]))
         moved |= steps > 6 * np.nanquantile(steps, 0.9)
     odd = _outliers(y, step) & ~spikes & ~np.roll(spikes, 1)
-    yield from (_outlier(name, int(k), y, time) for k in np.flatnonzero(odd))
-    v = np.where(odd, np.nan, y)
-    for a, b, kind, why in _runs(v, step, moved):
-        what = {
-            "stuck": "the sensor or its transmission was stuck",
-            "saturated": "as this is its extreme value, the sensor was at its limit, or stuck",
-        }
+    for k in np.flatnonzero(odd):
         yield Finding(
-            kind,
+            "outlier",
+            name,
+            np.array([k]),
+            f"{name} reads {y[k]:g} at instant {k} (t = {time[k]:g} s), between {y[k - 1]:g} and "
+            f"{y[k + 1]:g}: far from both beside its usual differences. If it was no reading, take "
+            f"it out with record.without({name!r}, {k}); else bounds of noise have to cover it",
+        )
+    v = np.where(odd, np.nan, y)
+    for a, b, extreme, why in _runs(v, step, moved):
+        what = "as this is its extreme value, the sensor was at its limit, or stuck"
+        yield Finding(
+            "saturated" if extreme else "stuck",
             name,
             np.arange(a, b),
             f"{name} reads {v[a]:g} at all instants {a}..{b - 1} (t = {time[a]:g} to "
-            f"{time[b - 1]:g} s), {why}: {what[kind]}. These are no readings: take them out with "
-            f"record.without({name!r}, slice({a}, {b}))",
+            f"{time[b - 1]:g} s), {why}: {what if extreme else 'the sensor was stuck'}. These are "
+            f"no readings: take them out with record.without({name!r}, slice({a}, {b}))",
         )
     rows = np.flatnonzero(np.isnan(y))
     if rows.size:
@@ -83,17 +81,6 @@ def find(name: str, y: FloatArray, time: FloatArray, inputs: FloatArray) -> Iter
             f"{name} has no reading at {rows.size} of {len(y)} instants, first {rows[0]} (t = "
             f"{time[rows[0]]:g} s): observers do without it there, and bounds are wider",
         )
-
-
-def _outlier(name: str, k: int, y: FloatArray, time: FloatArray) -> Finding:
-    return Finding(
-        "outlier",
-        name,
-        np.array([k]),
-        f"{name} reads {y[k]:g} at instant {k} (t = {time[k]:g} s), between {y[k - 1]:g} and "
-        f"{y[k + 1]:g}: far from both beside its usual differences. If it was no reading, take it "
-        f"out with record.without({name!r}, {k}); else bounds of noise have to cover it",
-    )
 
 
 def _returns(v: FloatArray) -> FloatArray:
@@ -114,8 +101,8 @@ def _outliers(v: FloatArray, step: float) -> BoolArray:
     return found
 
 
-def _runs(v: FloatArray, step: float, moved: BoolArray) -> Iterator[tuple[int, int, str, str]]:
-    """Return the runs of equal readings that are none: first row, row after, kind, why."""
+def _runs(v: FloatArray, step: float, moved: BoolArray) -> Iterator[tuple[int, int, bool, str]]:
+    """Return runs of equal readings that are none: first row, row after, at an extreme, why."""
     d = np.diff(v)
     starts = np.concatenate([[0], np.flatnonzero(d != 0) + 1])
     lengths = np.diff(np.append(starts, len(v)))
@@ -148,4 +135,4 @@ def _runs(v: FloatArray, step: float, moved: BoolArray) -> Iterator[tuple[int, i
         elif all(free for _, free in ends) and cut > 4 * noise:
             why = "and comes and goes without slowing down"
         if why:
-            yield int(a), int(b), "saturated" if extreme else "stuck", why
+            yield int(a), int(b), extreme, why

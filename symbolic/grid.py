@@ -105,8 +105,8 @@ def at_instants(
         raise columns.refuse(
             f"row {row}, at {t[row]:.9g} s, lies off the grid of Ts = {Ts:g} s: stamps are up to "
             f"{off.max():.3g} s off, {jitter * Ts:.3g} s are allowed. A guarantee speaks of the "
-            "grid: give resample=, a larger jitter= and bounds of noise that cover it, or time=False "
-            "where only the clock drifts",
+            "grid: give resample=, or a larger jitter= and bounds of noise that cover it, or "
+            "time=False where only the clock drifts",
             row=row,
         )
     gaps = np.diff(at)

@@ -31,25 +31,24 @@ def read_record(
     Parameters
     ----------
     source : DataFrame, Dataset, mapping, structured array, or path
-        Named columns of pandas, xarray or NumPy, or a CSV or Parquet file; rows in order of time.
-        Empty cells and NaN are missing samples.
+        Named columns of pandas, xarray or NumPy, or a CSV or Parquet file; rows in order of time,
+        empty cells and NaN where samples are missing.
     plant : Plant
         Says which inputs, measured scheduling and outputs there are, in which units, and Ts.
     map : mapping of the plant's symbols, optional
-        To a column; to ``(column, scale)`` or ``(column, scale, offset)``, for
-        scale * column + offset; to a function of the columns (by name, as arrays); or an output
-        that was not measured to None. A symbol that is not here is a column of its own name.
-    time : str or tuple, optional
-        Column of the time in seconds, ``(column, scale)`` for other units; dates and durations
-        are read, too. By default the index or a column ``t`` or ``time``; False: rows are Ts apart.
+        To a column; to ``(column, scale, offset)``, for scale * column + offset; to a function of
+        the columns (arrays by name); or to None for an output that was not measured. By default
+        to the column of the same name.
+    time : str, tuple or False, optional
+        Column of the time in s, ``(column, scale)`` for other units; also of dates or durations.
+        By default the index or a column ``t`` or ``time``; False: rows are Ts apart.
     jitter : float
         How far stamps may lie off the plant's grid, as a share of Ts, less than .25.
     resample : {"nearest", "linear"}, optional
         Bring rows of other times to the grid: readings are the nearest ones, at most Ts / 2 away,
         or interpolated between rows at most Ts away; inputs are those of the last row.
     hold : bool
-        Whether a missing input takes its last value. If not, it stays missing, and observers
-        begin anew there.
+        Whether a missing input takes its last value; observers begin anew where it stays missing.
     reference : names of columns, or mapping like `map`, optional
         Channels that no observer reads, for comparison; by default all other columns of numbers.
 
