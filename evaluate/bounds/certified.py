@@ -10,8 +10,9 @@ from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.bounds.trajectory import Trajectory, explain
 from obsynth.symbolic.arrays import FloatArray
 
-ROOM = 1e-9
-"""By how much the least cost is looked for above that of the trajectory, relative."""
+ROOM = 1e-5
+"""By how much the least cost is looked for above that of the trajectory, relative: what misses the
+equations by nothing that counts may cost less than whatever meets them."""
 CONTRACTIONS = 2
 """Times at most that the intervals of parameters are cut before the bound is taken."""
 STALLED = 0.05
@@ -22,8 +23,8 @@ STALLED = 0.05
 class Least:
     """The least ``weights'bounds`` with which a record can be explained.
 
-    upper: of a trajectory, which needs its bounds itself
-    lower: certified; infinite where it is proved that nothing explains the record
+    upper: of a trajectory, which needs its bounds itself; infinite where none was found
+    lower: certified, at most the upper; infinite: proved that nothing explains the record
     problem: with the intervals of parameters that are left
     """
 
@@ -37,7 +38,7 @@ class Least:
     @property
     def upper(self) -> float:
         """Cost of the trajectory."""
-        return float(self.weights @ self.trajectory.bounds)
+        return _cost(self.weights, self.trajectory)
 
 
 def least(
@@ -46,17 +47,22 @@ def least(
     largest: FloatArray | None = None,
     start: FloatArray | None = None,
     contractions: int = CONTRACTIONS,
-    smallest: FloatArray | None = None,
 ) -> Least:
     """Look for the least ``weights'bounds``; bounds with weight zero up to the largest."""
-    found = explain(problem, weights, largest, start, smallest)
-    cost = float(weights @ found.bounds) * (1.0 + ROOM)
-    with np.errstate(divide="ignore"):
+    found = explain(problem, weights, largest, start)
+    upper = _cost(weights, found)
+    cost = upper * (1.0 + ROOM)
+    with np.errstate(divide="ignore", invalid="ignore"):
         top = np.where(weights > 0.0, cost / weights, np.inf)
     top = np.minimum(top, np.inf if largest is None else largest * (1.0 + ROOM))
     narrowed, linear, solution = below(problem, weights, top, cost, contractions)
-    lower = np.inf if solution is None else solution.certified
-    return Least(narrowed, weights, found, lower, linear, solution)
+    proved = np.inf if solution is None else max(solution.certified, 0.0)
+    return Least(narrowed, weights, found, min(proved, upper), linear, solution)
+
+
+def _cost(weights: FloatArray, found: Trajectory) -> float:
+    counted = weights > 0.0
+    return float(weights[counted] @ found.bounds[counted])
 
 
 def below(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.evaluate.bounds.attribution import Attribution, attribute
-from obsynth.evaluate.bounds.certified import Least, least
+from obsynth.evaluate.bounds.certified import CONTRACTIONS, Least, below, least
 from obsynth.evaluate.bounds.problem import Groups, Problem, pose
 from obsynth.evaluate.bounds.validation import Validation, validate
 from obsynth.evaluate.errors import BoundsError
@@ -18,6 +18,8 @@ from obsynth.symbolic.arrays import FloatArray
 
 SAFETY = 1.2
 """About beta^(-1/n) for beta = 5 % and 18 windows: see `LeastBounds.validate`."""
+BESIDE = 0.01
+"""By how much bounds are looked for above those that are asked for, relative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +94,16 @@ class LeastBounds:
         With the parameters held the bounds still explain the record, by the same trajectory.
         """
         problem = self.problem
+        if not np.isfinite(self.least.trajectory.bounds).all():
+            raise BoundsError(f"{problem.plant.name}: no bounds were found that are attained.")
         size = problem.sizes(self.safety * self.least.trajectory.bounds)
-        ends = np.column_stack([problem.middle - size, problem.middle + size])
-        ranges = dict(zip(problem.plant.names("w"), map(tuple, ends.tolist()), strict=True))
+        ranges = {
+            name: (middle - half, middle + half)
+            for name, middle, half, group in zip(
+                problem.plant.names("w"), problem.middle, size, problem.group, strict=True
+            )
+            if group < len(problem.groups)
+        }
         held = {name: (value, value) for name, value in self.params.items()}
         return problem.plant.with_ranges({**ranges, **held})
 
@@ -156,10 +165,21 @@ class LeastBounds:
         )
 
     def refutes(self, scale: float = 1.0, **bounds: float) -> bool:
-        """Tell whether bounds by group are refuted for certain: no trajectory needs so little."""
-        values = np.array([bounds.get(name, value) for name, value in self.bounds.items()])
-        problem = self.problem.scaled(scale * values)
-        return least(problem, np.ones(1), None, self.least.trajectory.v).lower > 1.0
+        """Tell whether bounds by group are refuted for certain: no trajectory needs so little.
+
+        Groups that are not named have the bounds that are attained.
+        """
+        given = np.array([*(self.bounds | bounds).values()])
+        if len(given) > len(self.bounds) or not (np.isfinite(given) & (given >= 0.0)).all():
+            raise BoundsError(
+                "refutes() takes a bound that is finite and not negative for each of the groups "
+                f"{', '.join(self.bounds)}, not {bounds}.",
+                groups=self.problem.groups,
+            )
+        one, top = np.ones(1), 1.0 + BESIDE
+        problem = self.problem.scaled(scale * given)
+        _, _, found = below(problem, one, np.array([top]), top, CONTRACTIONS)
+        return found is None or found.certified > 1.0
 
     def attribute(self, without: Sequence[str] = (), safety: float | None = None) -> Attribution:
         """Say where a contradiction lies: see `Attribution`.
@@ -275,13 +295,20 @@ def least_bounds(
     True
     """
     problem = pose(plant, record, free, groups)
+    if not problem.groups:
+        raise BoundsError(
+            f"{plant.name} has no disturbance whose bound is open: declare one, of the outputs at "
+            "least, plant.disturbances(name, bound=).",
+            symbol=None,
+        )
     factors = _by_group(problem, "weights", weights, 1.0)
     smallest = _by_group(problem, "least_of", least_of, 0.0)
     if not (factors >= 0.0).all() or not factors.any() or not (smallest >= 0.0).all():
         raise BoundsError("weights= and least_of= are not negative, and some weight is positive.")
     if not safety >= 1.0:
         raise BoundsError(f"safety= is a factor of at least 1, not {safety}.", safety=safety)
-    return LeastBounds(problem, record, float(safety), least(problem, factors, smallest=smallest))
+    problem = replace(problem, smallest=smallest)
+    return LeastBounds(problem, record, float(safety), least(problem, factors))
 
 
 def _by_group(

@@ -24,6 +24,8 @@ from obsynth.evaluate.bounds.relaxation import relax
 from obsynth.evaluate.errors import BoundsError
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
+_TOLERANCES = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -100,29 +102,35 @@ class Linear:
             upper=np.append(upper, np.full(count, np.inf)),
         )
         cost = np.append(np.zeros(len(lower)), np.ones(count))
-        found = np.zeros(self.noise.shape)
-        found[self.noise >= 0] = wider.minimise(cost, certify=False).z[len(lower) :]
+        found, z = np.zeros(self.noise.shape), wider.minimise(cost, certify=False).z
+        if not len(z):
+            raise BoundsError("where the bounds are too small was not found: no linear program.")
+        found[self.noise >= 0] = z[len(lower) :]
         total: FloatArray = found.sum(axis=2)
         return total
 
     def minimise(self, cost: FloatArray, certify: bool = True) -> Solution:
         """Return the least ``cost'z``."""
         upper, same = ~self.equal, self.equal
-        with np.errstate(all="ignore"):
-            found = linprog(
-                cost,
-                A_ub=self.A[upper] if upper.any() else None,
-                b_ub=self.b[upper] if upper.any() else None,
-                A_eq=self.A[same] if same.any() else None,
-                b_eq=self.b[same] if same.any() else None,
-                bounds=np.column_stack([self.lower, self.upper]),
-                method="highs",
-            )
-        if found.status not in (0, 2):
-            raise BoundsError(f"the linear program was not solved: {found.message}")
-        if found.status == 2:
-            proved = np.inf if self.empty() else -np.inf
-            return Solution(np.inf, proved, np.empty(0), np.empty(0))
+        for tolerance, presolve in ((1e-9, True), (1e-9, False), (1e-7, True), (1e-7, False)):
+            # what is as tight as a bound that is attained is called empty at times
+            with np.errstate(all="ignore"):
+                found = linprog(
+                    cost,
+                    A_ub=self.A[upper] if upper.any() else None,
+                    b_ub=self.b[upper] if upper.any() else None,
+                    A_eq=self.A[same] if same.any() else None,
+                    b_eq=self.b[same] if same.any() else None,
+                    bounds=np.column_stack([self.lower, self.upper]),
+                    method="highs",
+                    options=dict.fromkeys(_TOLERANCES, tolerance) | {"presolve": presolve},
+                )
+            if found.status == 0:
+                break
+            if certify and found.status == 2 and self.empty():
+                return Solution(np.inf, np.inf, np.empty(0), np.empty(0))
+        else:
+            return Solution(np.inf, -np.inf, np.empty(0), np.empty(0))
         multipliers = np.zeros(len(self.b))
         multipliers[upper] = np.maximum(-found.ineqlin.marginals, 0.0)
         multipliers[same] = -found.eqlin.marginals
@@ -144,7 +152,9 @@ class Linear:
         )
         cost = np.zeros(len(self.lower) + 1)
         cost[-1] = 1.0
-        return relaxed.minimise(cost).certified > 0.0
+        multipliers = relaxed.minimise(cost, certify=False).multipliers
+        relaxed.upper[-1] = 1.0  # a point of ours would be there, with nothing
+        return relaxed.certify(cost, multipliers) > 0.0
 
     def certify(self, cost: FloatArray, multipliers: FloatArray) -> float:
         """Return what multipliers prove, rounded down from exact rationals."""
@@ -186,7 +196,8 @@ class _Assembly:
         self.ends: list[FloatArray] = []
         self.columns: dict[int, IntArray] = {}
         self._place()
-        self.bounds = self._add(np.column_stack([np.zeros(len(largest)), largest]))
+        least = np.minimum(problem.smallest, largest)
+        self.bounds = self._add(np.column_stack([least, largest]))
 
     def done(self) -> Linear:
         given = self.program.constants

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import Program
+from obsynth.derive.rigour import middle_and_radius, up
 from obsynth.designs.core.equations import symbols
 from obsynth.evaluate.data.estimate import fits
 from obsynth.evaluate.errors import BoundsError
@@ -33,6 +34,7 @@ class Problem:
     shape, middle: of every disturbance, (n_w,)
     box: ranges of v, (n_v, 2); those of the disturbances play no part
     names: of v
+    smallest: what the bounds of groups are at least, (n_groups,); 0 by default
     """
 
     plant: Plant
@@ -45,6 +47,7 @@ class Problem:
     box: FloatArray
     names: tuple[str, ...]
     still: BoolArray = field(repr=False)
+    smallest: FloatArray | float = 0.0
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -76,9 +79,10 @@ class Problem:
         return len(self.y)
 
     def sizes(self, bounds: FloatArray) -> FloatArray:
-        """Return how large every disturbance may be for bounds of the groups, (n_w,)."""
-        sizes: FloatArray = self.shape * np.append(bounds, 1.0)[self.group]
-        return sizes
+        """Return how large every disturbance may be for bounds of the groups, up, (n_w,)."""
+        with np.errstate(invalid="ignore"):
+            sizes = self.shape * np.append(bounds, 1.0)[self.group]
+        return np.where(sizes > 0.0, up(sizes), 0.0)
 
     def window(self, first: int, last: int) -> "Problem":
         """Return the same for the instants ``first`` to ``last - 1``."""
@@ -91,11 +95,17 @@ class Problem:
             groups=("scale",),
             group=np.where(self.group < len(self.groups), 0, 1),
             shape=self.sizes(bounds),  # of those in no group it stays
+            smallest=0.0,
         )
 
     def fixed(self, **values: float) -> "Problem":
         """Return the problem with variables of v at values."""
         box = self.box.copy()
+        if unknown := set(values) - set(self.names):
+            raise BoundsError(
+                f"{min(unknown)!r} is none of {', '.join(self.names)} of {self.plant.name}.",
+                symbol=min(unknown),
+            )
         for name, value in values.items():
             box[self.names.index(name)] = value
         return replace(self, box=box)
@@ -182,11 +192,12 @@ def _grouped(
         )
     box = plant.box("w").reshape(-1, 2)
     group = np.array([place.get(name, len(given)) for name in names], dtype=np.int64)
-    radius = 0.5 * (box[:, 1] - box[:, 0])
-    middle = np.where(np.isfinite(radius), 0.5 * (box[:, 0] + box[:, 1]), 0.0)
+    middle, radius = middle_and_radius(*box.T)
+    radius = np.where(box[:, 0] == -box[:, 1], box[:, 1], radius)  # exact
     largest = np.array([radius[group == g].max() for g in group])
     with np.errstate(invalid="ignore", divide="ignore"):
-        shape = np.where(np.isfinite(largest) & (largest > 0.0), radius / largest, 1.0)
+        smaller = np.isfinite(largest) & (radius < largest)
+        shape = np.where(smaller, np.where(radius > 0.0, up(radius / largest), 0.0), 1.0)
     held = group == len(given)
     if not np.isfinite(radius[held]).all():
         name = names[int(np.flatnonzero(held & ~np.isfinite(radius))[0])]

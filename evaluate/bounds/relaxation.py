@@ -44,18 +44,20 @@ def relax(program: Program, nodes: Sequence[int], ranges: Mapping[int, Interval]
     """
     rows: list[Row] = []
     multiples: dict[int, tuple[float, int]] = {}
-    products: dict[tuple[int, ...], tuple[float, int]] = {}
+    products: dict[tuple[int, ...], tuple[Fraction, int]] = {}
     for index in nodes:
         node, ones = program.nodes[index], np.ones_like(ranges[index][0])
         multiple = _multiple(program, node, multiples)
         if multiple is None and node.op == "multiply":
             (c, a), (d, b) = (multiples.get(k, (1.0, k)) for k in node.args)
-            scale, first = products.setdefault(tuple(sorted((a, b))), (c * d, index))
-            ratio = c * d / scale
-            if first != index and Fraction(ratio) * Fraction(scale) == Fraction(c) * Fraction(d):
+            scale = Fraction(c) * Fraction(d)
+            known, first = products.setdefault(tuple(sorted((a, b))), (scale, index))
+            ratio = float(scale / known) if known else 0.0
+            if first != index and Fraction(ratio) * known == scale:
                 multiple = ratio, first
         if multiple is None:
-            rows += _operation(program, index, ranges)
+            with np.errstate(all="ignore"):
+                rows += _operation(program, index, ranges)
         else:
             factor, base = multiple
             multiples[index] = multiple
@@ -195,13 +197,11 @@ def _curve(z: int, a: int, known: _Known, ranges: Mapping[int, Interval]) -> lis
     convex, concave = second[0] >= 0.0, second[1] <= 0.0
     if known.bend:
         convex, concave = np.full((2, len(convex)), [[known.bend > 0], [known.bend < 0]])
-    with np.errstate(all="ignore"):
-        middle = 0.5 * ends[0] + 0.5 * ends[1]
-        rows = _chord(z, a, known, ends, convex, concave)
-        for point in (ends[0], middle, ends[1]):
-            rows += _tangent(z, a, known, ends, point, convex, concave)
-        rows += _band(z, a, known, ends, middle, convex | concave)
-    return rows
+    middle = 0.5 * ends[0] + 0.5 * ends[1]
+    rows = _chord(z, a, known, ends, convex, concave)
+    for point in (ends[0], middle, ends[1]):
+        rows += _tangent(z, a, known, ends, point, convex, concave)
+    return rows + _band(z, a, known, ends, middle, convex | concave)
 
 
 def _over(known: _Known, ends: Interval) -> list[Interval]:

@@ -18,14 +18,12 @@ class Trajectory:
 
     bounds: that it needs, (n_groups,); infinite where none was found that meets the equations
     v: (N, n_v)
-    gap: by how much the equations are not met, at most
-    where: for every group the instant and the disturbance that needs the most
+    gap: by how much the equations and rates are not met, at most
     """
 
     bounds: FloatArray
     v: FloatArray = field(repr=False)
     gap: float
-    where: tuple[tuple[int, str], ...]
 
 
 def explain(
@@ -33,18 +31,17 @@ def explain(
     weights: FloatArray,
     largest: FloatArray | None = None,
     start: FloatArray | None = None,
-    least: FloatArray | None = None,
 ) -> Trajectory:
     """Return a trajectory of small ``weights'bounds``, from (N, n_v) where a start is given.
 
-    largest, least: of the bounds, (n_groups,)
+    largest: of the bounds, (n_groups,)
     """
     search = Search.of(problem)
     bounds = ca.MX.sym("bounds", len(problem.groups))
     size = ca.DM(problem.shape) * ca.vertcat(bounds, 1.0)[problem.group.tolist()]
     room = ca.vec(ca.repmat(size, 1, len(problem)))
     top = np.full(len(problem.groups), np.inf) if largest is None else largest
-    bottom = np.zeros(len(problem.groups)) if least is None else least
+    bottom = np.minimum(problem.smallest, top)
     first = guess(problem) if start is None else start
     answer = search.minimise(
         ca.dot(ca.DM(weights), bounds),
@@ -88,10 +85,11 @@ class Search:
         equal.append(ca.vec(v[still, 1:] - v[still, :-1]))
         rates = [ca.MX(0, 1)]
         for j, signal in enumerate(problem.plant.f, problem.places["f"].start):
-            rate = 0.0 if signal.constant else signal.rate
-            if rate is not None:
-                moved = ca.vec(v[j, 1:] - v[j, :-1])
-                rates += [moved - rate, -moved - rate]
+            moved = ca.vec(v[j, 1:] - v[j, :-1])
+            if signal.constant:
+                equal.append(moved)
+            elif signal.rate is not None:
+                rates += [moved - signal.rate, -moved - signal.rate]
         off = v[problem.places["w"], :] - ca.repmat(ca.DM(problem.middle), 1, steps)
         return cls(problem, v, ca.vertcat(*equal), ca.vec(off), ca.vertcat(*rates))
 
@@ -123,6 +121,7 @@ class Search:
             },
             {
                 "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 400, "tol": 1e-9},
+                "ipopt.bound_relax_factor": 0.0,
                 "print_time": False,
                 "show_eval_warnings": False,
                 "error_on_fail": False,
@@ -177,13 +176,19 @@ def guess(problem: Problem) -> FloatArray:
 
 
 def closed(problem: Problem, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return v with disturbances that close the equations best, and what stays open, (N, n + m)."""
-    w = problem.places["w"]
+    """Return v with disturbances that close the equations best, and what stays open, (N, n + m).
+
+    Those whose bounds are not looked for stay inside of theirs.
+    """
+    w, path = problem.places["w"], v.copy()
+    free = (problem.group < len(problem.groups)) & (problem.shape > 0.0)
+    held = np.where(free, np.inf, problem.shape)
+    path[:, w] = np.clip(path[:, w], problem.middle - held, problem.middle + held)
     s = ca.MX.sym("v", v.shape[1])
     u = ca.MX.sym("u", problem.u.shape[1])
     both = ca.vertcat(*problem.equations(s, u))
     slope = ca.Function("slope", [s, u], [both, ca.jacobian(both, s)[:, w]])
-    path, left = v.copy(), np.zeros((len(v), both.numel()))
+    left = np.zeros((len(v), both.numel()))
     for k in range(len(v)):
         target = np.concatenate(
             [v[k + 1, : problem.n] if k + 1 < len(v) else np.full(problem.n, np.nan), problem.y[k]]
@@ -192,7 +197,7 @@ def closed(problem: Problem, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         for _ in range(2):
             value, E = (np.array(part) for part in slope(path[k], problem.u[k]))
             miss = (target - value.ravel())[rows]
-            path[k, w] += np.linalg.lstsq(E[rows], miss, rcond=1e-12)[0]
+            path[k, w] += np.linalg.lstsq(E[rows] * free, miss, rcond=1e-12)[0]
         value = np.array(slope(path[k], problem.u[k])[0]).ravel()
         left[k, rows] = (target - value)[rows]
     return path, left
@@ -202,14 +207,15 @@ def measured(problem: Problem, v: FloatArray) -> Trajectory:
     """Return a trajectory with the bounds that it needs itself."""
     path, left = closed(problem, v)
     off = np.abs(path[:, problem.places["w"]] - problem.middle)
-    names, bounds, where = problem.plant.names("w"), [], []
+    needed = np.zeros(len(problem.groups))
     for g in range(len(problem.groups)):
-        members = np.flatnonzero((problem.group == g) & (problem.shape > 0.0))
-        need = off[:, members] / problem.shape[members]
-        k, j = np.unravel_index(int(need.argmax()), need.shape)
-        bounds.append(float(need[k, j]) * (1.0 + 1e-12))
-        where.append((int(k), names[members[j]]))
-    gap = float(np.abs(left).max(initial=0.0))
+        members = (problem.group == g) & (problem.shape > 0.0)
+        needed[g] = (off[:, members] / problem.shape[members]).max(initial=0.0) * (1.0 + 1e-12)
+    f = path[:, problem.places["f"]]
+    rates = [0.0 if s.constant else s.rate or np.inf for s in problem.plant.f]
+    moved = (np.abs(np.diff(f, axis=0)) - rates).max(initial=0.0)
+    gap = max(float(np.abs(left).max(initial=0.0)), float(moved))
     size = float(np.abs(problem.y[np.isfinite(problem.y)]).max(initial=0.0))
-    needed = np.array(bounds) if gap <= CLOSED * (1.0 + size) else np.full(len(bounds), np.inf)
-    return Trajectory(needed, path, gap, tuple(where))
+    if not gap <= CLOSED * (1.0 + size):
+        needed[:] = np.inf
+    return Trajectory(np.maximum(needed, problem.smallest), path, gap)

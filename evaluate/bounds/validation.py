@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 from obsynth.evaluate.bounds.certified import least
 from obsynth.evaluate.bounds.problem import Problem
+from obsynth.evaluate.errors import BoundsError
 from obsynth.evaluate.table import Table
 from obsynth.symbolic.arrays import FloatArray
 
@@ -79,6 +80,8 @@ class Validation:
 
 def validate(problem: Problem, bounds: FloatArray, windows: int) -> Validation:
     """Return the factors of bounds that equal windows of the record need."""
+    if not 2 <= windows <= len(problem):
+        raise BoundsError(f"{windows} windows: give 2 to {len(problem)}.", windows=windows)
     edges = np.linspace(0, len(problem), windows + 1).round().astype(int)
     scaled = problem.scaled(bounds)
     found = [least(scaled.window(a, b), np.ones(1)) for a, b in pairwise(edges.tolist())]
