@@ -218,7 +218,8 @@ class Record:
             ax.set_ylabel(f"{name} [{unit}]" if unit else name)
             rows = [f.rows for f in self.findings() if f.channel == name]
             marks = {"marker": "|", "linestyle": "", "color": "#d55e00", "clip_on": False}
-            at = self.time[np.concatenate([np.zeros(0, dtype=int), *rows])]
-            ax.plot(at, 0 * at, transform=ax.get_xaxis_transform(), **marks)
+            if rows:
+                at = self.time[np.concatenate(rows)]
+                ax.plot(at, 0 * at, transform=ax.get_xaxis_transform(), **marks)
         axes[-1].set_xlabel("time [s]")
         return axes
