@@ -98,7 +98,7 @@ def at_instants(
             Ts=step,
         )
     at = np.rint((t - t[0]) / Ts).astype(np.int64)
-    rest = t - t[0] - at * Ts
+    rest = t - at * Ts
     off = np.abs(rest - (rest.max() + rest.min()) / 2)
     if off.max() > jitter * Ts + 4 * np.spacing(np.abs(t).max()):
         row = int(np.abs(rest - np.median(rest)).argmax())

@@ -134,6 +134,8 @@ def test_what_is_seen_and_assumed_is_noted():
     found = read(t=moved, options={"jitter": 0.05})
     assert np.array_equal(found.time, log()["t"])
     assert "stamps lie up to 0.02 s off the grid" in found.notes[0]
+    far = log()["t"] + np.array([0, 0.2, 0, 0, -0.02, 0])
+    assert np.array_equal(read(t=far, options={"jitter": 0.24}).time, log()["t"])
     assert read(time=False).notes == ("there is no time: rows are taken to be Ts = 0.5 s apart",)
     assert (
         "v runs over [0, 2] and leaves its declared range, [0, 1], at 1 instant of 6, first t = 1 s"
@@ -149,6 +151,7 @@ def test_what_is_seen_and_assumed_is_noted():
     assert same(read(t=[str(t) for t in log()["t"]]), read())
     minutes = read(t=log()["t"] / 60, time=("t", 60))
     np.testing.assert_allclose(minutes.time, log()["t"], rtol=1e-15)
+    assert read(time=("t", 1, 2.0)).time[0] == 2
 
 
 def test_measured_scheduling_is_held_like_an_input():
@@ -162,7 +165,11 @@ def test_measured_scheduling_is_held_like_an_input():
     assert record.names["rho"] == ("theta",) and record.names["reference"] == ("other",)
     assert record.u.shape == (3, 0) and record.units["rho"] == ("",)
     assert record["theta"].tolist() == [0, 0, 2] and record["other"].tolist() == [7, 8, 9]
-    assert "theta runs over [0, 2]" in record.notes[2]
+    span = "theta runs over [0, 2] and leaves its declared range, [0, 1], at 1 instant of 3"
+    assert record.notes[2] == f"{span}, first t = 2 s" and len(record.notes) == 3
+    frame = pd.DataFrame(data)
+    frame.attrs["units"] = {"y1": "bar"}  # where the plant has no unit, none is missed
+    assert ob.read_record(frame, plant, time=False).notes == record.notes
 
 
 def test_resampling_is_asked_for_and_said():
@@ -186,6 +193,11 @@ def test_resampling_is_asked_for_and_said():
     at = ob.read_record(data | {"v": (t >= 1.0) * 1.0}, TANK, resample="nearest")
     assert at["v"].tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
     assert not [note for note in at.notes if "between instants" in note]
+    # .564 is less than .064 + .5 in doubles, and no other row is near
+    rows = {"t": [0.064, 0.564, 2.064], "v": [0, 1, 0], "level": [1, 2, 3], "weight": [1, 1, 1]}
+    for way in ("nearest", "linear"):
+        record = ob.read_record(rows, TANK, resample=way)
+        np.testing.assert_array_equal(record["level"], [1, 2, np.nan, np.nan, 3])
     gone = ob.read_record(data, TANK, map={"level": None}, resample="linear")
     assert np.isnan(gone["level"]).all() and gone["weight"].tolist() == [1] * 8
     late = {name: column[:2] for name, column in log(t=0.08 + log()["t"]).items()}
@@ -208,6 +220,7 @@ REFUSED = [
     ),
     (read, {"map": {"v": None}}, "v is mapped to None; a column, .column, scale. or"),
     (read, {"map": {"level": ("level", "2")}}, "level is mapped to .'level', '2'.; a column"),
+    (read, {"map": {"level": ("level", np.inf)}}, "level is mapped to .'level', inf.; a column"),
     (read, {"map": {"level": lambda c: c["levle"]}}, "no column 'levle' .did you mean 'level'"),
     (
         read,
