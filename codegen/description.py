@@ -14,13 +14,7 @@ import numpy as np
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import STEP_INPUTS, Machine
-from obsynth.designs.core.observer import (
-    ALARM_OUTPUT,
-    FURTHER_OUTPUTS,
-    MEAN_OUTPUTS,
-    STEP_OUTPUTS,
-    Observer,
-)
+from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -120,14 +114,11 @@ class Description:
     model_hash: str
 
     @property
-    def alarms(self) -> bool:
-        """Whether the step is a fault detector's, with one alarm per fault."""
-        return bool(self.observer.step.n_out() > len(STEP_OUTPUTS))
-
-    @property
-    def means(self) -> bool:
-        """Whether it has means over a window behind the alarms."""
-        return bool(self.observer.step.n_out() > len(STEP_OUTPUTS) + 1)
+    def further(self) -> list[tuple[str, int]]:
+        """What a fault detector's step has behind the observer's outputs, with the lengths."""
+        step = self.observer.step
+        places = range(len(STEP_OUTPUTS), step.n_out())
+        return [(step.name_out(i), int(step.numel_out(i))) for i in places]
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -233,11 +224,11 @@ def _check_step(step: ca.Function, model: Plant, n_memory: int, n_theta: int) ->
     inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
     names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
     expected_in = (n_memory, len(model.u), len(model.output_names)) + (n_theta,) * bool(n_theta)
-    further = {ALARM_OUTPUT: n_f} | dict(zip(MEAN_OUTPUTS, (n_f, n_f, 1), strict=True))
     behind = outputs[len(STEP_OUTPUTS) :]
     behind = behind if behind in FURTHER_OUTPUTS else ()
+    lengths = (n_f, n_f, n_f, 1)[: len(behind)]
     results = (*STEP_OUTPUTS, *behind)
-    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1, *(further[name] for name in behind))
+    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1, *lengths)
     found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
     found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
     if len(inputs) != len(names) or len(outputs) != len(results):

@@ -115,9 +115,7 @@ def _values(
     signals |= {"x": description.x, "f": description.f}
     outputs = [("xhat", sizes["x"]), ("fhat", sizes["f"])]
     outputs += [(f"{kind}_{end}", sizes[kind]) for kind in "xf" for end in ("lower", "upper")]
-    outputs += [("alarm", sizes["f"])] if description.alarms else []
-    means = [("mean_lower", sizes["f"]), ("mean_upper", sizes["f"]), ("mean_status", 1)]
-    outputs += means if description.means else []
+    outputs += description.further
     start = nominal_values(observer.model, "x")
     return {
         "name": description.name,
@@ -149,8 +147,8 @@ def _values(
         "inputs": [kind for kind in ("u", "y", "theta") if signals[kind]],
         "library": kernel.library,
         "inexact": kernel.inexact,
-        "alarms": description.alarms,
-        "window": getattr(observer, "window", None) if description.means else None,
+        "alarms": bool(description.further),
+        "window": getattr(observer, "window", None),
         "outputs": [(name, length) for name, length in outputs if length],
         "example": _example(description),
         "count": vectors.count,

@@ -23,6 +23,8 @@ from obsynth.symbolic.convert import to_sx
 
 MOST = 3
 """Relations that are kept for a fault, the narrowest."""
+LONGEST = 100
+"""How often a state may enter a row of a step of higher order, about, to be written out."""
 _UNKNOWN = 1e9  # half width of a state of which nothing is known beforehand
 
 
@@ -51,7 +53,8 @@ def relations(
         at[s.symbol] = middle if s.nominal is None else float(s.nominal)
     numbers = np.array([at[s] for s in symbols])
     found = []
-    for j, (cx, row) in [(j, pair) for j in range(n_f) for pair in _combined(plant)]:
+    pairs = _combined(plant) if _is_short(plant) else []
+    for j, (cx, row) in [(j, pair) for j in range(n_f) for pair in pairs]:
         fault = plant.f[j].symbol
         slope = sp.diff(row, fault)
         if not slope.is_number:
@@ -72,6 +75,15 @@ def relations(
         return [], None
     rows = ca.vertcat(*(code[side] for side in (0, 1) for _, _, code in kept))
     return [j for _, j, _ in kept], Equations(plant, ca.Function("relations", ports, [rows]))
+
+
+def _is_short(plant: Plant) -> bool:
+    """Whether the rows can be written out: those of a step of order k grow with the power k - 1."""
+    if plant.step is None or plant.continuous is None:
+        return True
+    x, rows = {s.symbol for s in plant.x}, plant.continuous.equations[0]
+    most = max(sum(node in x for node in sp.preorder_traversal(row)) for row in rows)
+    return bool(most ** (plant.step.order - 1) <= LONGEST)
 
 
 def _combined(plant: Plant) -> list[tuple[sp.Expr, sp.Expr]]:

@@ -166,14 +166,14 @@ class Window:
         """
         N, memory, found = len(columns[-1]), self.first, []
         rows = [np.asarray(c, dtype=float).reshape(N, -1).T for c in columns]
-        for start in range(0, N, _CHUNK):
-            stop = min(start + _CHUNK, N)
-            run: Any = self.step.mapaccum(stop - start)
-            moved, *means = run(memory, *(row[:, start:stop] for row in rows))
-            memory = np.array(moved)[:, -1]
-            found.append(np.vstack([np.array(mean) for mean in means]))
-        n_f, means = len(self.plant.f), np.hstack(found)
-        return [means[:n_f].T, means[n_f:-1].T, means[-1].astype(np.int64)]
+        runs: Any = {n: self.step.mapaccum(n) for n in {min(N, _CHUNK), N % _CHUNK} if n}
+        for k in range(0, N, _CHUNK):
+            part = [row[:, k : k + _CHUNK] for row in rows]
+            moved, *means = map(np.array, runs[part[-1].size](memory, *part))
+            memory = moved[:, -1]
+            found.append(np.vstack(means))
+        n_f, told = len(self.plant.f), np.hstack(found)
+        return [told[:n_f].T, told[n_f:-1].T, told[-1].astype(np.int64)]
 
 
 def _unpacked(ends: ca.SX) -> Ends:

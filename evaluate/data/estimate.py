@@ -1,5 +1,6 @@
 """`estimate`: an observer on a record, and which readings contradict it."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -10,6 +11,7 @@ from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import scheduling_columns, step_function
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.trace import Trace
 from obsynth.evaluate.truth import Call, dense, sample_time
 from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
@@ -28,6 +30,7 @@ def estimate(
     guess: Any = None,
     x_range: Any = None,
     f_range: Any = None,
+    windows: Sequence[int] = (),
     **reading: Any,
 ) -> Estimate:
     """Run an observer or a fault detector over what was measured.
@@ -44,6 +47,8 @@ def estimate(
     x_range, f_range : array_like (n, 2), (n_f, 2), optional
         Boxes that hold the first state and the first faults; the declared ranges by default, so
         that nothing is assumed of the start.
+    windows : sequence of int, optional
+        Numbers m of instants, for the means of the faults over them: `Estimate.means`.
     **reading
         What `read_record` takes, ``map=``, ``time=``, ``jitter=`` and so on.
 
@@ -89,7 +94,25 @@ def estimate(
         told[key] = told[key][:, 0].astype(np.int64)
     if "alarm" in told:
         told["alarm"] = told["alarm"] > 0.5
-    return Estimate(observer, record, blamed=blamed, **told)
+    own = observer.observer if isinstance(observer, FaultDetector) else observer
+    theta = rows[:, record.u.shape[1] + record.y.shape[1] :]
+    means = {m: _means(FaultDetector(own, window=m), record, theta, told) for m in windows}
+    return Estimate(observer, record, blamed=blamed, means=means, **told)
+
+
+def _means(
+    detector: FaultDetector, record: Record, theta: FloatArray, told: Mapping[str, FloatArray]
+) -> dict[str, Trace]:
+    """Return the means of the faults over a detector's window."""
+    sets = (told[key] for key in STEP_OUTPUTS[3:])
+    said: list[Any] = detector.mean.over(record.u, theta, *sets) if detector.mean else []
+    lower, upper, status = said
+    found = {}
+    for j, s in enumerate(detector.model.f):
+        name, true = f"mean of {s.name} over {detector.window}", np.full(len(record), np.nan)
+        ends = lower[:, j], upper[:, j]
+        found[s.name] = Trace(name, s.unit, record.time, true, None, *ends, status=status)
+    return found
 
 
 def fits(model: Plant, record: Record) -> None:

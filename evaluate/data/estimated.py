@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,9 @@ class Estimate:
         Alarms of a fault detector; None where an observer ran alone.
     mean_lower, mean_upper : (N, n_f) or None, mean_status : (N,) int or None
         Of a detector with a window m: means of the faults over k - m..k - 1, and the status.
+    means : mapping of int to mapping of str to Trace
+        By the windows m that were asked for and the names of the faults: intervals of the means
+        over the m instants before that of the row, whatever the course of the fault.
     blamed : tuple of str
         Outputs without each of which the first void instant would not be void.
     """
@@ -85,6 +88,7 @@ class Estimate:
     mean_upper: FloatArray | None = None
     mean_status: IntArray | None = None
     blamed: tuple[str, ...] = ()
+    means: Mapping[int, Mapping[str, Trace]] = field(default_factory=dict)
 
     @property
     def time(self) -> FloatArray:
@@ -160,8 +164,12 @@ class Estimate:
         at = {name: np.flatnonzero(self.status & bit) for name, bit in STATUS.items()}
         return {name: int(k[0]) if k.size else None for name, k in at.items()}
 
+    @property
+    def _means(self) -> list[Trace]:
+        return [trace for told in self.means.values() for trace in told.values()]
+
     def widths(self) -> dict[str, dict[str, float]]:
-        """Half widths of every state and fault over the record.
+        """Half widths of every state and fault over the record, and of means of faults.
 
         Returns
         -------
@@ -170,9 +178,10 @@ class Estimate:
             which it is ``finite``, and the median as a share ``of_range`` of the half range.
         """
         found = {}
-        boxes = np.vstack([self.observer.model.box(k).reshape(-1, 2) for k in ("x", "f")])
-        for name, box in zip(self.estimated, boxes, strict=True):
-            trace = self[name]
+        kinds = ("x", *["f"] * (1 + len(self.means)))
+        boxes = np.vstack([self.observer.model.box(k).reshape(-1, 2) for k in kinds])
+        traces = [*(self[name] for name in self.estimated), *self._means]
+        for trace, box in zip(traces, boxes, strict=True):
             half = trace.half_width
             known = half[np.isfinite(half) & trace.valid]
             middle, most = (np.median(known), known.max()) if known.size else (np.inf, np.inf)
@@ -180,7 +189,7 @@ class Estimate:
             share = middle / size if 0 < size < np.inf else np.nan
             numbers = (middle, most, known.size / len(half), share)
             words = ("median", "largest", "finite", "of_range")
-            found[name] = dict(zip(words, map(float, numbers), strict=True))
+            found[trace.name] = dict(zip(words, map(float, numbers), strict=True))
         return found
 
     @cached_property
@@ -268,19 +277,23 @@ class Estimate:
         Returns
         -------
         dict of name to (count,) int
-            Instants of the fault, which is known `fault_delay` samples later.
+            Instants of the fault, which is known `fault_delay` samples later; of means of faults
+            those at which they are known.
         """
         if persistence < 1:
             raise SimulationError(f"persistence={persistence!r} is no number of samples from 1 on.")
         skip = sum(STATUS[name] for name in SKIPPED)
-        valid, void = self.status & skip == 0, self.status & STATUS["void"] > 0
-        kept = np.flatnonzero(valid | void)
-        order = np.arange(len(kept))
+        ends = zip(self.names["f"], self.f_lower.T, self.f_upper.T, strict=True)
+        told: list[Any] = [(*one, self.status, self.fault_delay) for one in ends]
+        told += [(t.name, t.lower, t.upper, t.status, 0) for t in self._means]
         found = {}
-        for name, low, high in zip(self.names["f"], self.f_lower.T, self.f_upper.T, strict=True):
+        for name, low, high, status, late in told:
+            valid = status & skip == 0
+            kept = np.flatnonzero(valid | (status & STATUS["void"] > 0))
+            order = np.arange(len(kept))
             hit = (((low > 0) | (high < 0)) & valid)[kept]
             since = order - np.maximum.accumulate(np.where(hit, -1, order))
-            at = kept[hit & (since >= persistence)] - self.fault_delay
+            at = kept[hit & (since >= persistence)] - late
             found[name] = at[at >= 0]
         return found
 
@@ -309,11 +322,12 @@ class Estimate:
     def summary(self) -> Table:
         """Widths of every state and fault, and when a fault was certain."""
         alarms, rows = self.alarms(), []
+        labels = {t.name: t.label for t in (*map(self.__getitem__, self.estimated), *self._means)}
         for name, width in self.widths().items():
             at = alarms.get(name)
             since = float(self.t[at[0]]) if at is not None and at.size else None
             share = width["of_range"]
-            rows.append([self[name].label, width["median"], width["largest"], width["finite"]])
+            rows.append([labels[name], width["median"], width["largest"], width["finite"]])
             rows[-1] += [None if np.isnan(share) else share, since]
         columns = ["signal", "median half width", "largest", "finite", "of the range"]
         title = f"{self.method} on {self.record.source}, {len(self.t)} instants"
@@ -369,6 +383,11 @@ class Estimate:
             if key[0] == "f":
                 array = np.vstack([array[late:], np.repeat(gap[:, None], array.shape[1], axis=1)])
             found |= zip(labels, array.reshape(len(self.t), -1).T, strict=True)
+        for m, means in self.means.items():
+            for name, trace in means.items():
+                labels = (f"{name}_mean_{m}_lower", f"{name}_mean_{m}_upper", f"mean_{m}_status")
+                told = np.array([trace.lower, trace.upper, trace.status], dtype=float)
+                found |= zip(labels, told, strict=True)
         return found
 
     def to_frame(self) -> Any:
