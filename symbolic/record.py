@@ -156,8 +156,9 @@ class Record:
                 symbol=channel,
             )
         array = np.array(getattr(self, group))
+        before = np.isnan(array).sum()
         array[at, column] = np.nan
-        note = f"{channel}: readings were taken out at {np.isnan(array[:, column]).sum()} instants"
+        note = f"{channel}: readings were taken out at {np.isnan(array).sum() - before} instants"
         changed: dict[str, Any] = {group: array}
         return replace(self, **changed, notes=(*self.notes, note))
 
