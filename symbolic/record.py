@@ -63,7 +63,7 @@ class Record:
             object.__setattr__(self, field, dict.fromkeys(GROUPS, ()) | getattr(self, field))
         for group in ("time", *GROUPS):
             array = np.array(getattr(self, group), dtype=float)
-            if group in ("reference", "rho") and not array.size:
+            if len(self.time) and not array.size:
                 array = np.zeros((len(self.time), 0))
             array.flags.writeable = False
             object.__setattr__(self, group, array)
