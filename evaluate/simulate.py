@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.observer import Observer
@@ -17,6 +18,7 @@ from obsynth.evaluate.checked import (
     step_function,
     vector,
 )
+from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.joint import joint
 from obsynth.evaluate.run import Run
@@ -118,39 +120,42 @@ def _loop(
 ) -> Run:
     """March plant and observer through the samples."""
     model, N = truth.model, scenario.steps
-    plant = Call(truth.function)
     function = step_function(observer, model)
-    step, theta = Call(dense(function)), scheduling_columns(function, model, "step")
-    plant_x, plant_u = plant.args[0], plant.args[1]
-    law = _feedback(scenario, truth.plant, plant, model.names("u")) if scenario.feedback else None
-    u = fields.setdefault("u", np.empty((N + 1, len(model.u))))
-    rho = fields["rho"]
-    pairs = zip(plant.args[2:], (fields["d"], fields["f"], fields["w"], rho), strict=True)
-    held = [(argument, array) for argument, array in pairs if argument.size]
+    theta = scheduling_columns(function, model, "step")
+    names = model.names("u")
+    u = fields.setdefault("u", np.zeros((N + 1, len(names))))
+    kinds = ("u", "d", "f", "w", "rho")
+    given, sizes = np.hstack([fields[kind] for kind in kinds]), [fields[k].shape[1] for k in kinds]
+    # both functions read one row of signals and write one row of results
+    row, places = np.empty(given.shape[1]), np.cumsum(sizes)[:-1]
+    signals = np.split(row, places)
+    whole, moving = compiled(dense(function), N + 1), compiled(truth.function, N + 1)
+    made = np.empty(sum(moving.numel_out(i) for i in range(2)))
+    state, following = np.empty(len(model.x)), made[: len(model.x)]
+    plant = Call(moving, [state, *signals], [following, made[len(model.x) :]])
+    memory, moved = (np.empty(whole.numel_in(0)) for _ in range(2))
+    told, ends = _results(whole)
+    scheduled = [np.empty(len(theta))] if theta else []
+    step = Call(whole, [memory, signals[0], plant.results[1], *scheduled], [moved, *ends])
+    law = _feedback(scenario, truth.plant, plant, names) if scenario.feedback else None
 
-    x = np.empty((N + 1, len(model.x)))
-    y = np.empty((N + 1, len(model.output_names)))
-    logs = [np.empty((N + 1, result.size)) for result in step.results[1:]]
-    plant_x[:] = vector(scenario.x0, model.names("x"), "x0")
+    x, y = np.empty((N + 1, len(state))), np.empty((N + 1, made.size - len(state)))
+    log = np.empty((N + 1, told.size))
+    state[:] = vector(scenario.x0, model.names("x"), "x0")
     for k in range(N + 1):
-        x[k] = plant_x
-        for argument, array in held:
-            argument[:] = array[k]
-        plant_u[:] = u[k] if law is None else law(k)
+        row[:] = given[k]
+        if law is not None:
+            signals[0][:] = u[k] = law(k)
         plant.evaluate()
-        y[k] = plant.results[1]
+        x[k], y[k] = state, plant.results[1]
         if k == 0:
-            step.args[0][:] = first_memory(observer, scenario, y[0], step.args[0].size)
-        u[k] = plant_u
-        step.args[1][:] = plant_u
-        step.args[2][:] = y[k]
+            memory[:] = first_memory(observer, scenario, y[0], memory.size)
         if theta:
-            step.args[3][:] = rho[k, theta]
+            scheduled[0][:] = signals[-1][theta]
         step.evaluate()
-        for log, result in zip(logs, step.results[1:], strict=True):
-            log[k] = result
-        step.args[0][:] = step.results[0]
-        plant_x[:] = plant.results[0]
+        log[k] = told
+        memory[:] = moved
+        state[:] = following
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
     fields["w"] = truth.remainders(fields, x)
@@ -164,5 +169,17 @@ def _loop(
         outside=(*truth.outside, *broken_assumptions(observer, scenario, truths)),
         t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
         truths=truths,
-        claims=dict(zip(function.name_out()[1:], logs, strict=True)),
+        claims=dict(zip(function.name_out()[1:], _parts(log, ends), strict=True)),
     )
+
+
+def _results(function: ca.Function) -> tuple[FloatArray, list[FloatArray]]:
+    """Return one row for all results of a step but the memory, and the parts of it."""
+    sizes = [function.numel_out(i) for i in range(1, function.n_out())]
+    row = np.empty(sum(sizes))
+    return row, np.split(row, np.cumsum(sizes)[:-1])
+
+
+def _parts(log: FloatArray, like: list[FloatArray]) -> list[FloatArray]:
+    """Take a log apart as its rows are."""
+    return np.split(log, np.cumsum([part.size for part in like])[:-1], axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import scheduling_columns, step_function
+from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.trace import Trace
@@ -143,7 +144,7 @@ def _march(
 
     Shapes: rows (N, n_u + n_y + n_theta), result (N, numbers of the outputs but the memory).
     """
-    step = dense(function)
+    step = compiled(dense(function), len(rows))
     sizes = [step.numel_in(i) for i in range(1, step.n_in())]
     given, moved = np.zeros(sum(sizes)), np.zeros(memory.size)
     told = np.zeros(sum(step.numel_out(i) for i in range(1, step.n_out())))
