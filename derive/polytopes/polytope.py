@@ -9,19 +9,17 @@ that the list is complete needs no further proof. Everything is computed in rati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from fractions import Fraction
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.rigour import smallest_above
+from obsynth.derive.rigour import Exact, above, exact, inverse, magnitude, nearest
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
 
-Vector = list[Fraction]
 _STARTS = 24
 
 
@@ -29,57 +27,39 @@ class Degenerate(Exception):
     """More than n faces meet in a vertex, so that edges cannot be followed without a choice."""
 
 
-def _solve(matrix: list[Vector]) -> list[Vector] | None:
-    """Invert a small matrix of rational numbers; None if it is singular."""
-    n = len(matrix)
-    rows = [[*row, *(Fraction(int(i == j)) for j in range(n))] for i, row in enumerate(matrix)]
-    for k in range(n):
-        pivot = next((i for i in range(k, n) if rows[i][k] != 0), None)
-        if pivot is None:
-            return None
-        rows[k], rows[pivot] = rows[pivot], rows[k]
-        head = rows[k][k]
-        rows[k] = [value / head for value in rows[k]]
-        for i in range(n):
-            factor = rows[i][k]
-            if i != k and factor != 0:
-                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-    return [row[n:] for row in rows]
+def _inverse(matrix: Exact) -> Exact | None:
+    """Invert a small matrix; None if it is singular."""
+    try:
+        return inverse(matrix)
+    except ObsynthError:
+        return None
 
 
-def _dot(a: Sequence[Fraction], b: Sequence[Fraction]) -> Fraction:
-    return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
-
-
-def walk_vertices(normals: list[Vector], offsets: Vector) -> dict[tuple[int, ...], Vector]:
-    """List the vertices of {x : normals x <= offsets}."""
-    start = _start(normals, offsets)
-    found: dict[tuple[int, ...], Vector] = {}
-    stack = [start]
+def walk_vertices(normals: Exact, offsets: Exact) -> dict[tuple[int, ...], Exact]:
+    """List the vertices of {x : normals x <= offsets}, shapes (m, n) and (m,)."""
+    found: dict[tuple[int, ...], Exact] = {}
+    stack = [_start(normals, offsets)]
     while stack:
         active = stack.pop()
         if active in found:
             continue
-        inverse = _solve([normals[i] for i in active])
-        if inverse is None:
+        edges = _inverse(normals[list(active)])
+        if edges is None:
             raise Degenerate
-        point = [_dot(row, [offsets[i] for i in active]) for row in inverse]
-        slacks = [b - _dot(a, point) for a, b in zip(normals, offsets, strict=True)]
-        if any(slack <= 0 for i, slack in enumerate(slacks) if i not in active):
+        point = edges @ offsets[list(active)]
+        slacks = offsets - normals @ point
+        others = [i for i in range(len(offsets)) if i not in active]
+        if any(slacks[i] <= 0 for i in others):
             raise Degenerate
         found[active] = point
-        for position, leaving in enumerate(active):
-            along = [-row[position] for row in inverse]
-            steps: list[tuple[Fraction, int]] = []
-            for i, normal in enumerate(normals):
-                rise = _dot(normal, along)
-                if i not in active and rise > 0:
-                    steps.append((slacks[i] / rise, i))
+        for along, leaving in zip(-edges.T, active, strict=True):
+            rises = normals @ along
+            steps = [(slacks[i] / rises[i], i) for i in others if rises[i] > 0]
             if not steps:
                 raise DerivationError(
                     "the half-spaces do not bound a polytope: an edge leads to infinity. Add "
                     "bounds of every coordinate",
-                    direction=tuple(float(v) for v in along),
+                    direction=tuple(nearest(along).tolist()),
                 )
             length, entering = min(steps)
             if sum(1 for step, _ in steps if step == length) > 1:
@@ -88,32 +68,30 @@ def walk_vertices(normals: list[Vector], offsets: Vector) -> dict[tuple[int, ...
     return found
 
 
-def _start(normals: list[Vector], offsets: Vector) -> tuple[int, ...]:
+def _start(normals: Exact, offsets: Exact) -> tuple[int, ...]:
     """Faces of some vertex, from a linear program in doubles, checked exactly."""
     from scipy.optimize import linprog
 
-    matrix = np.array([[float(v) for v in row] for row in normals])
-    right = np.array([float(v) for v in offsets])
-    n = matrix.shape[1]
+    matrix, right = nearest(normals), nearest(offsets)
     rng = np.random.default_rng(0)
     for _ in range(_STARTS):
-        result = linprog(rng.normal(size=n), matrix, right, bounds=(None, None), method="highs-ds")
+        goal = rng.normal(size=matrix.shape[1])
+        result = linprog(goal, matrix, right, bounds=(None, None), method="highs-ds")
         if result.status in (2, 3):
             what = "is empty" if result.status == 2 else "is not bounded"
             raise DerivationError(f"the polytope of these {len(right)} half-spaces {what}")
         if result.x is None:
             continue
         active = _independent(matrix, np.argsort(right - matrix @ result.x, kind="stable"))
-        inverse = None if active is None else _solve([normals[i] for i in active])
-        if active is None or inverse is None:
+        edges = None if active is None else _inverse(normals[list(active)])
+        if active is None or edges is None:
             continue
-        point = [_dot(row, [offsets[i] for i in active]) for row in inverse]
-        if all(_dot(a, point) <= b for a, b in zip(normals, offsets, strict=True)):
+        if (normals @ (edges @ offsets[list(active)]) <= offsets).all():
             return active
     raise Degenerate
 
 
-def _independent(matrix: NDArray[np.float64], order: NDArray[np.intp]) -> tuple[int, ...] | None:
+def _independent(matrix: FloatArray, order: NDArray[np.intp]) -> tuple[int, ...] | None:
     chosen: list[int] = []
     for i in order.tolist():
         rows = matrix[[*chosen, i]]
@@ -171,11 +149,8 @@ class Polytope:
 
     def contains(self, point: ArrayLike) -> bool:
         """Whether a point satisfies all inequalities, in exact arithmetic."""
-        x = [Fraction(float(v)) for v in np.ravel(np.asarray(point, dtype=float))]
-        return all(
-            sum(Fraction(float(a)) * v for a, v in zip(row, x, strict=True)) <= Fraction(float(b))
-            for row, b in zip(self.normals, self.offsets, strict=True)
-        )
+        x = exact(np.ravel(np.asarray(point, dtype=float)))
+        return bool((exact(self.normals) @ x <= exact(self.offsets)).all())
 
     @property
     def volume(self) -> float:
@@ -236,31 +211,22 @@ def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope
         )
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
         raise DerivationError("normals and offsets of half-spaces have to be finite numbers")
-    exact = [[Fraction(float(v)) for v in row] for row in A]
-    right = [Fraction(float(v)) for v in b]
-    rng = np.random.default_rng(0)
-    size = Fraction(float(np.abs(b).max(initial=0.0)) or 1.0)
-    shares = [Fraction(1 + int(v)) for v in rng.integers(0, 2**20, len(b))]
-    lengths = [sum((abs(v) for v in row), Fraction(0)) for row in exact]
-    longest = max(lengths) or Fraction(1)
+    faces, right = exact(A), exact(b)
+    shares = exact(1 + np.random.default_rng(0).integers(0, 2**20, len(b)))
+    lengths = magnitude(faces).sum(axis=1)
+    # at full length a face moves by a share of the size
+    moves = shares * exact(float(np.abs(b).max(initial=0.0)) or 1.0) * lengths / 2**20
+    longest = max(lengths) or 1
     for nudge in (0.0, *_NUDGES):
-        unit = Fraction(nudge) * Fraction(1, 2**20) * size
-        moved = [
-            r + unit * share * length / longest
-            for r, share, length in zip(right, shares, lengths, strict=True)
-        ]
         try:
-            corners = list(walk_vertices(exact, moved).values())
+            found = walk_vertices(faces, right + exact(nudge) * moves / longest)
         except Degenerate:
             continue
-        vertices = np.array([[float(v) for v in corner] for corner in corners])
-        errors = [
-            [abs(Fraction(float(d)) - e) for d, e in zip(row, corner, strict=True)]
-            for row, corner in zip(vertices, corners, strict=True)
-        ]
-        radius = [max(column) for column in zip(*errors, strict=True)]
+        corners = np.array(list(found.values()))
+        vertices = nearest(corners)
+        radius = above(magnitude(exact(vertices) - corners).max(axis=0))
         order = np.lexsort(vertices.T[::-1])
-        return Polytope(A, b, vertices[order], np.array([smallest_above(r) for r in radius]))
+        return Polytope(A, b, vertices[order], radius)
     raise DerivationError(
         "the vertices of these half-spaces could not be told apart: the polytope is flat or "
         "nearly so. Describe it in fewer coordinates",
@@ -312,16 +278,9 @@ def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
         ) from error
     normals = np.unique(hull.equations[:, :-1], axis=0)
     kept = points[hull.vertices]
-    offsets = []
-    for row in normals:
-        a = [Fraction(float(v)) for v in row]
-        largest = max(
-            sum((x * Fraction(float(y)) for x, y in zip(a, p, strict=True)), Fraction(0))
-            for p in points[_foremost(points, row)]
-        )
-        offsets.append(smallest_above(largest))
+    furthest = [max(exact(points[_foremost(points, row)]) @ exact(row)) for row in normals]
     order = np.lexsort(kept.T[::-1])
-    return Polytope(normals, np.array(offsets), kept[order], np.zeros(n))
+    return Polytope(normals, above(np.array(furthest)), kept[order], np.zeros(n))
 
 
 def _foremost(points: FloatArray, normal: FloatArray) -> NDArray[np.int64]:
