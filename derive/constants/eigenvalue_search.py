@@ -22,6 +22,7 @@ import numpy as np
 from obsynth.derive.constants.interval_matrix import sign_patterns
 from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
 from obsynth.derive.intervals.ranges import Status
+from obsynth.derive.intervals.search.batch import Batch
 from obsynth.derive.rigour import (
     UNIT_ROUNDOFF,
     down,
@@ -31,7 +32,7 @@ from obsynth.derive.rigour import (
     rotate,
     up,
 )
-from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+from obsynth.symbolic.arrays import FloatArray, IntArray
 
 EIGENVALUE_BUDGETS = {"fast": 500, "normal": 20_000, "tight": 400_000}
 _MOST_NUMBERS = 2_000_000
@@ -88,20 +89,10 @@ class Maximum:
 
 
 @dataclass(frozen=True, eq=False)
-class _Boxes:
+class _Boxes(Batch):
     lower: FloatArray
     upper: FloatArray
     bound: FloatArray
-
-    def take(self, which: IntArray | BoolArray) -> "_Boxes":
-        return _Boxes(self.lower[:, which], self.upper[:, which], self.bound[which])
-
-    def join(self, other: "_Boxes") -> "_Boxes":
-        return _Boxes(
-            np.concatenate([self.lower, other.lower], axis=1),
-            np.concatenate([self.upper, other.upper], axis=1),
-            np.concatenate([self.bound, other.bound]),
-        )
 
 
 def interval_bound(field: SymmetricField, centre: FloatArray, radius: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ its parts are far larger than the whole, and interval bounds do not see that the
 A tree is the sorted tuple of the subtrees at its root; the single node is ().
 """
 
+from collections.abc import Iterator
 from fractions import Fraction
-from itertools import combinations_with_replacement
 from math import factorial
 from typing import Any
 
@@ -38,28 +38,15 @@ def trees(order: int) -> list[Tree]:
     """List the rooted trees with a number of nodes."""
     if order == 1:
         return [()]
-    found: set[Tree] = set()
-    for sizes in _partitions(order - 1, order - 1):
-        found |= {tuple(sorted(forest)) for forest in _forests(sizes)}
-    return sorted(found)
+    return sorted({grown for tree in trees(order - 1) for grown in _grown(tree)})
 
 
-def _partitions(total: int, largest: int) -> list[list[int]]:
-    if total == 0:
-        return [[]]
-    return [
-        [first, *rest]
-        for first in range(min(total, largest), 0, -1)
-        for rest in _partitions(total - first, first)
-    ]
-
-
-def _forests(sizes: list[int]) -> list[tuple[Tree, ...]]:
-    result: list[tuple[Tree, ...]] = [()]
-    for size in sorted(set(sizes)):
-        choices = list(combinations_with_replacement(trees(size), sizes.count(size)))
-        result = [(*done, *choice) for done in result for choice in choices]
-    return result
+def _grown(tree: Tree) -> Iterator[Tree]:
+    """Add a node to a tree, at every node of it."""
+    yield tuple(sorted((*tree, ())))
+    for k, child in enumerate(tree):
+        for grown in _grown(child):
+            yield tuple(sorted((*tree[:k], grown, *tree[k + 1 :])))
 
 
 def _nodes(tree: Tree) -> int:

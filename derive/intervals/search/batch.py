@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -151,8 +152,21 @@ class Problem:
         return Entries(self.program, np.concatenate([values, self.gradient], axis=1))
 
 
+class Batch:
+    """A dataclass of arrays with one member per element of their last axis."""
+
+    def take(self, which: BoolArray | IntArray) -> Self:
+        """Return some of the members."""
+        return type(self)(*(array[..., which] for array in vars(self).values()))
+
+    def join(self, other: Self) -> Self:
+        """Return these members and others."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return type(self)(*(np.concatenate(pair, axis=-1) for pair in pairs))
+
+
 @dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(Batch):
     """A batch of boxes.
 
     goal: 2 e for the smallest value of the expression e, 2 e + 1 for the largest
@@ -164,19 +178,6 @@ class Rows:
     lower: FloatArray
     upper: FloatArray
     bound: FloatArray
-
-    def take(self, which: BoolArray | IntArray) -> "Rows":
-        """Return some of the rows."""
-        return Rows(self.goal[which], self.lower[:, which], self.upper[:, which], self.bound[which])
-
-    def join(self, other: "Rows") -> "Rows":
-        """Return these rows and others."""
-        return Rows(
-            np.concatenate([self.goal, other.goal]),
-            np.concatenate([self.lower, other.lower], axis=1),
-            np.concatenate([self.upper, other.upper], axis=1),
-            np.concatenate([self.bound, other.bound]),
-        )
 
     def put(self, which: IntArray, other: "Rows") -> "Rows":
         """Return these rows with some of them replaced."""
@@ -191,7 +192,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class RowRanges:
+class RowRanges(Batch):
     """Value and gradient of every row's goal: of the expression or of its negative.
 
     lower, upper: natural enclosure of the value
@@ -205,16 +206,6 @@ class RowRanges:
     slope_lower: FloatArray
     slope_upper: FloatArray
     rough: BoolArray
-
-    def take(self, which: IntArray) -> "RowRanges":
-        """Return some of the rows."""
-        return RowRanges(
-            self.lower[which],
-            self.upper[which],
-            self.slope_lower[:, which],
-            self.slope_upper[:, which],
-            self.rough[which],
-        )
 
 
 def enclose_rows(problem: Problem, rows: Rows, slopes: bool) -> RowRanges:
