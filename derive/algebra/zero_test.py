@@ -8,6 +8,7 @@ from typing import Any
 
 import sympy as sp
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.algebra.secants import quotients
 from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, simplified, size
 
@@ -150,17 +151,9 @@ def _groups(terms: list[sp.Expr], values: list[list[Any]]) -> list[list[sp.Expr]
 
     What does not vanish by itself stays in one part.
     """
-    parts: list[tuple[list[int], set[sp.Expr]]] = []
-    for k, term in enumerate(terms):
-        joined: tuple[list[int], set[sp.Expr]] = ([k], _functions(term))
-        rest = []
-        for part in parts:
-            if part[1] & joined[1] or not part[1] | joined[1]:
-                joined = (part[0] + joined[0], part[1] | joined[1])
-            else:
-                rest.append(part)
-        parts = [*rest, joined]
-    alone = [part for part, _ in parts if _vanish([values[k] for k in part])]
+    # terms without a function belong together
+    parts = connected(_functions(term) or {1} for term in terms)
+    alone = [part for part in parts if _vanish([values[k] for k in part])]
     settled = {k for part in alone for k in part}
     left = [k for k in range(len(terms)) if k not in settled]
     return [[terms[k] for k in part] for part in ([*alone, left] if left else alone)]

@@ -12,6 +12,7 @@ from itertools import product
 
 import numpy as np
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.rigour import UNIT_ROUNDOFF, largest_eigenvalue, perron_bound, up
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
@@ -47,18 +48,8 @@ def augment(matrix: FloatArray) -> FloatArray:
 def sign_patterns(coupled: BoolArray, most: int = MOST_SIGNS) -> FloatArray | None:
     """List the sign vectors that can make a difference."""
     k = len(coupled)
-    free: list[int] = []
-    seen = np.zeros(k, dtype=bool)
-    for start in range(k):
-        if seen[start]:
-            continue
-        seen[start] = True
-        stack = [start]
-        while stack:
-            for other in np.flatnonzero(coupled[stack.pop()] & ~seen).tolist():
-                seen[other] = True
-                free.append(other)
-                stack.append(other)
+    groups = connected(np.flatnonzero(row).tolist() for row in coupled | np.eye(k, dtype=bool))
+    free = [other for group in groups for other in group[1:]]
     if len(free) > most:
         return None
     patterns = np.ones((1 << len(free), k))

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.matrix_maximum import EntryRanges, matrix_maximum
 from obsynth.derive.errors import DerivationError, UnboundedError
@@ -50,19 +51,12 @@ def is_rounding(entry: sp.Expr, coefficient: float) -> bool:
 
 def connected_groups(sizes: FloatArray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """Collect rows and columns that hang together."""
-    groups: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
-    left = set(np.flatnonzero(sizes.any(axis=1)).tolist())
-    while left:
-        rows = {min(left)}
-        while True:
-            columns = np.flatnonzero(sizes[sorted(rows)].any(axis=0))
-            more = set(np.flatnonzero(sizes[:, columns].any(axis=1)).tolist())
-            if more == rows:
-                break
-            rows = more
-        left -= rows
-        groups.append((tuple(sorted(rows)), tuple(columns.tolist())))
-    return groups
+    groups = sorted(connected(np.flatnonzero(row).tolist() for row in sizes))
+    return [
+        (tuple(rows), tuple(np.flatnonzero(sizes[rows].any(axis=0)).tolist()))
+        for rows in groups
+        if sizes[rows].any()
+    ]
 
 
 def largest_value(

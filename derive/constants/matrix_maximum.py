@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum, largest_over_box
 from obsynth.derive.constants.interval_matrix import augment, eigenvalue_over_interval
 from obsynth.derive.constants.symmetric_field import SymmetricField
@@ -94,7 +95,7 @@ def matrix_maximum(
     kept = np.flatnonzero(size > _TINY * largest).tolist()
     places = [entries.places[k] for k in kept]
     best: Maximum | None = None
-    for block in _blocks(len(fixed), places, fixed):
+    for block in _blocks(places, fixed):
         inside = [k for k in kept if entries.places[k][0] in block]
         level = -np.inf if best is None else best.attained
         found = _block(entries, ranges, fixed, hull, block, inside, level, rtol, effort)
@@ -116,24 +117,14 @@ def matrix_maximum(
     )
 
 
-def _blocks(size: int, places: list[tuple[int, int]], fixed: FloatArray) -> list[list[int]]:
+def _blocks(places: list[tuple[int, int]], fixed: FloatArray) -> list[list[int]]:
     """Collect sets of rows that entries couple, those with the widest reach first."""
     linked = fixed != 0.0
     for i, j in places:
         linked[i, j] = linked[j, i] = True
-    blocks: list[list[int]] = []
-    seen: set[int] = set()
-    for start in range(size):
-        if start in seen:
-            continue
-        block, stack = {start}, [start]
-        while stack:
-            new = set(np.flatnonzero(linked[stack.pop()]).tolist()) - block
-            block |= new
-            stack += sorted(new)
-        seen |= block
-        blocks.append(sorted(block))
-    return sorted(blocks, key=len, reverse=True)
+    np.fill_diagonal(linked, True)
+    blocks = connected(np.flatnonzero(row).tolist() for row in linked)
+    return sorted(sorted(blocks), key=len, reverse=True)
 
 
 def _larger(a: Maximum, b: Maximum, rtol: float) -> Maximum:

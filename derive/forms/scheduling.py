@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.zero_test import prove_zero
 from obsynth.derive.errors import DerivationError, UnboundedError
@@ -201,7 +202,9 @@ def _scalars(
         return position[expression]
 
     direct: set[Entry] = set()
-    for group in _groups(parts):
+    places = list(parts)
+    for together in connected(monomials for _, monomials in parts.values()):
+        group = sorted(places[k] for k in together)
         monomials = list(dict.fromkeys(m for place in group for m in parts[place][1]))
         independent = [place for place in group if place in basis]
         if len(monomials) <= len(independent):
@@ -254,21 +257,6 @@ def _monomials(entry: sp.Expr, known: set[sp.Symbol]) -> tuple[sp.Expr, dict[sp.
         else:
             found[monomial] = found.get(monomial, sp.Integer(0)) + coefficient
     return constant, {m: c for m, c in found.items() if c != 0}
-
-
-def _groups(parts: Mapping[Entry, tuple[sp.Expr, dict[sp.Expr, sp.Expr]]]) -> list[list[Entry]]:
-    """Entries connected through common monomials."""
-    groups: list[tuple[list[Entry], set[sp.Expr]]] = []
-    for place, (_, monomials) in parts.items():
-        joined: tuple[list[Entry], set[sp.Expr]] = ([place], set(monomials))
-        rest = []
-        for group in groups:
-            if group[1] & joined[1]:
-                joined = (group[0] + joined[0], group[1] | joined[1])
-            else:
-                rest.append(group)
-        groups = [*rest, joined]
-    return [sorted(group) for group, _ in groups]
 
 
 def _compose(dependence: AffineDependence, affine: Mapping[Entry, Affine]) -> Affine:

@@ -14,6 +14,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.algebra.connected import connected
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.entries import jacobian_entries
@@ -182,19 +183,6 @@ class JacobianPolytope:
         return "\n".join([*lines, *(f"  {group}" for group in self.groups)])
 
 
-def groups_of(supports: Sequence[Sequence[str]]) -> list[tuple[int, ...]]:
-    """Join scalars that share variables, directly or through others."""
-    groups: list[tuple[set[str], list[int]]] = []
-    for k, names in enumerate(supports):
-        joined, members = set(names), [k]
-        for group in [g for g in groups if g[0] & joined]:
-            groups.remove(group)
-            joined |= group[0]
-            members += group[1]
-        groups.append((joined, members))
-    return sorted(tuple(sorted(members)) for _, members in groups)
-
-
 def jacobian_polytope(
     split_or_model: Split | Plant,
     wrt: Literal["states", "inputs"] = "states",
@@ -246,9 +234,8 @@ def jacobian_polytope(
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     entries = jacobian_entries(model, part, wrt)
     basis = basis_entries(bounds)
-    supports = [entries.support(place) for place in basis]
     groups = []
-    for members in groups_of(supports):
+    for members in sorted(map(tuple, connected(map(entries.support, basis)))):
         places = tuple(basis[k] for k in members)
         some = entries.take([entries.places.index(place) for place in places])
         groups.append(_group(members, places, bounds, some, (rtol, effort, most_vertices)))
