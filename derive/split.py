@@ -18,7 +18,7 @@ from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.rigour import rational, round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.plant import Plant
 
 LinearForm = Literal["frozen", "terms", "jacobian"]
@@ -85,16 +85,7 @@ class Split:
     @cached_property
     def _g_function(self) -> ca.Function:
         kinds = ["x", "u"] + [k for k in ("p", "rho") if self.model.names(k)]
-        columns: list[ca.SX] = []
-        symbols: dict[sp.Symbol, ca.SX] = {}
-        for kind in kinds:
-            elements = [ca.SX.sym(name) for name in self.model.names(kind)]
-            columns.append(ca.vertcat(*elements) if elements else ca.SX(0, 1))
-            signals = getattr(self.model, kind)
-            symbols.update({s.symbol: e for s, e in zip(signals, elements, strict=True)})
-        labels = [f"g of {name}" for name in self.model.names("x")]
-        value = ca.vertcat(*to_sx(list(self.g), symbols, labels))
-        return ca.Function("g", columns, [value], kinds, ["g"])
+        return sx_function("g", {k: _symbols(self.model, k) for k in kinds}, {"g": self.g})
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is needed to derive the split again, as JSON-able data.

@@ -101,6 +101,24 @@ def to_sx(
     return rows
 
 
+def column(items: Sequence[ca.SX]) -> ca.SX:
+    """Stack scalars densely; of none, a column without entries."""
+    return ca.densify(ca.vertcat(*items)) if items else ca.SX(0, 1)
+
+
+def sx_function(
+    name: str, inputs: Mapping[str, Sequence[sp.Symbol]], outputs: Mapping[str, sp.Matrix]
+) -> ca.Function:
+    """Make a CasADi function of named columns of symbols with named matrices as outputs."""
+    given = {kind: [ca.SX.sym(str(s)) for s in symbols] for kind, symbols in inputs.items()}
+    table = {s: e for kind in inputs for s, e in zip(inputs[kind], given[kind], strict=True)}
+    values = []
+    for label, matrix in outputs.items():
+        entries = to_sx(list(matrix.T), table, [label] * len(matrix))
+        values.append(ca.reshape(column(entries), *matrix.shape))
+    return ca.Function(name, list(map(column, given.values())), values, list(inputs), list(outputs))
+
+
 class _Walker:
     """The tree walk with its memory of sub-expressions already converted."""
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sympy.core.relational import Relational
 from sympy.logic.boolalg import And, Not, Or
 
-from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.convert import column, to_sx
 from obsynth.symbolic.discretise import PREFIX, Step, composed
 from obsynth.symbolic.errors import ObsynthError, PlantError
 from obsynth.symbolic.signals import KINDS
@@ -285,22 +285,22 @@ def build_sx(plant: Plant, constants: Literal["value", "symbol"]) -> SxModel:
         signals += plant.constants
     else:
         rows = [row.xreplace(values) for row in rows]
-    flat = [item for column in columns.values() for item in column]
+    flat = [item for items in columns.values() for item in items]
     n = len(plant.x)
     labels = [f"dynamics row {k}" for k in range(1, n + 1)]
     labels += [f"outputs row {k}" for k in range(1, len(rows) - n + 1)]
     symbols = dict(zip((signal.symbol for signal in signals), flat, strict=True))
     found = to_sx(rows, symbols, labels)
 
-    function = ca.Function("rows", [_column(flat)], [ca.densify(_column(found))])
+    function = ca.Function("rows", [column(flat)], [column(found)])
     box = np.array([(signal.lower, signal.upper) for signal in signals])
     centre = [0.0 if signal.nominal is None else signal.nominal for signal in signals]
     points = sample_box(box, around=centre)
     check_parity(rows, list(symbols), lambda point: np.array(function(point)), points, labels)
 
-    stacked = {kind: _column(items) for kind, items in columns.items()}
+    stacked = {kind: column(items) for kind, items in columns.items()}
     name = _identifier(plant.name)
-    return SxModel(name=name, rhs=_column(found[:n]), y=_column(found[n:]), **stacked)
+    return SxModel(name=name, rhs=column(found[:n]), y=column(found[n:]), **stacked)
 
 
 def _composed(model: SxModel, plant: Plant, step: Step) -> SxModel:
@@ -314,7 +314,3 @@ def _composed(model: SxModel, plant: Plant, step: Step) -> SxModel:
 def _identifier(name: str) -> str:
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
     return plain if plain[:1].isalpha() else f"plant_{plain}".strip("_")
-
-
-def _column(items: list[ca.SX]) -> ca.SX:
-    return ca.vertcat(*items) if items else ca.SX(0, 1)

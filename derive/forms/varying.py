@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import sympy as sp
 
@@ -17,7 +16,6 @@ from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import round_number
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
 _DIGITS = 6
@@ -231,15 +229,6 @@ class VaryingForm(Blocks):
                 )
             values[i, j] = round_number(entry)[0]
         return self.layout.unfold(name, values)
-
-
-def casadi_elements(model: Plant) -> dict[sp.Symbol, ca.SX]:
-    """Every signal of a plant as it stands in ``model.sx()``."""
-    sx = model.sx()
-    kinds = ("x", "u", "d", "f", "w", "p", "rho")
-    elements = ca.vertsplit(ca.vertcat(*[getattr(sx, kind) for kind in kinds]))
-    symbols = [s.symbol for kind in kinds for s in getattr(model, kind)]
-    return dict(zip(symbols, elements, strict=True))
 
 
 def prove_rows(

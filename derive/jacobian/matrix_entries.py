@@ -7,7 +7,6 @@ exactly before it is rounded once.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,7 +22,7 @@ from obsynth.derive.intervals.search.batch import Problem
 from obsynth.derive.rigour import enclose_number, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.convert import column, to_sx
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
@@ -78,8 +77,8 @@ class MatrixEntries:
         return replace(
             self,
             exact=exact,
-            values=_column([self.values[int(k)] for k in which]),
-            variables=_column([self.variables[k] for k in kept]),
+            values=column([self.values[int(k)] for k in which]),
+            variables=column([self.variables[k] for k in kept]),
             names=tuple(self.names[k] for k in kept),
             symbols=tuple(self.symbols[k] for k in kept),
             box=self.box[kept],
@@ -200,12 +199,12 @@ def matrix_entries(
     values = to_sx(rows, columns | held, labels)
     return MatrixEntries(
         exact,
-        _column(values),
-        _column(list(columns.values())),
+        column(values),
+        column(list(columns.values())),
         tuple(s.name for s in signals),
         tuple(columns),
         np.array([(s.lower, s.upper) for s in signals], dtype=float).reshape(-1, 2),
-        _column(list(held.values())),
+        column(list(held.values())),
         [enclose_number(number) for number in numbers],
         model,
     )
@@ -214,10 +213,6 @@ def matrix_entries(
 def _expanded(expression: sp.Expr) -> sp.Expr:
     # denominators stay whole: written out, 1/(1 + (a - b)^2) has no bound over a box
     return sp.Add(*expand_terms(expression))
-
-
-def _column(items: Sequence[Any]) -> ca.SX:
-    return ca.densify(ca.vertcat(*items)) if items else ca.SX(0, 1)
 
 
 def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:

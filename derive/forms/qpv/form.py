@@ -10,11 +10,12 @@ import casadi as ca
 import sympy as sp
 
 from obsynth.derive.forms.qpv.augment import Augmented
-from obsynth.derive.forms.varying import Layout, VaryingForm, Vertices, casadi_elements, short
+from obsynth.derive.forms.varying import Layout, VaryingForm, Vertices, short
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.display import aligned, html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.signals import KINDS
 
 _DYNAMICS = {"c": "1", "A": "x", "N": "xx", "M": "ux", "B": "u", "D": "d", "B_f": "f", "G": "w"}
 _OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset": "1"}
@@ -171,23 +172,11 @@ class QPV(VaryingForm):
         casadi.Function
             (x, u, d, f, w, p, rho) -> (rhs, y), x the augmented and f the remaining faults.
         """
-        model, table = self.model, casadi_elements(self.model)
-        # a loss of effectiveness is no signal of the plant
-        table |= {s.symbol: ca.SX.sym(s.name) for s in self.plant.states if s.symbol not in table}
-        groups = {kind: getattr(model, kind) for kind in ("x", "u", "d", "f", "w", "p", "rho")}
+        groups = {kind: getattr(self.model, kind) for kind in KINDS}
         groups |= {"x": self.plant.states, "f": self.plant.faults}
-        columns = [
-            ca.vertcat(ca.SX(0, 1), *[table[s.symbol] for s in part]) for part in groups.values()
-        ]
-        rhs = to_sx(list(self.plant.rows), table, list(self.names))
-        outputs = to_sx(list(self.plant.outputs), table, list(model.output_names))
-        return ca.Function(
-            "qpv",
-            columns,
-            [ca.densify(ca.vertcat(*rhs)), ca.densify(ca.vertcat(*outputs))],
-            list(groups),
-            ["rhs", "y"],
-        )
+        inputs = {kind: [s.symbol for s in part] for kind, part in groups.items()}
+        outputs = {"rhs": sp.Matrix(self.plant.rows), "y": sp.Matrix(self.plant.outputs)}
+        return sx_function("qpv", inputs, outputs)
 
     def __repr__(self) -> str:
         return f"QPV({self.model.name!r}, states {', '.join(self.names)}, N {self.form_of_N})"

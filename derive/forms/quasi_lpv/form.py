@@ -21,8 +21,8 @@ from obsynth.derive.forms.quasi_lpv.polytopic import (
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
 from obsynth.derive.forms.quasi_lpv.terms import Centre
 from obsynth.derive.forms.scheduling import Lift, SchedulingVariable
-from obsynth.derive.forms.varying import Layout, VaryingForm, casadi_elements, short
-from obsynth.symbolic.convert import to_sx
+from obsynth.derive.forms.varying import Layout, VaryingForm, short
+from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.display import aligned, html_table
 from obsynth.symbolic.plant import Plant
 
@@ -204,16 +204,10 @@ class QuasiLPV(VaryingForm):
         casadi.Function
             (x, u, p, rho, d, f, w) -> (A, B, offset, C).
         """
-        kinds, sx = ("x", "u", "p", "rho", "d", "f", "w"), self.model.sx()
-        columns, table = [getattr(sx, kind) for kind in kinds], casadi_elements(self.model)
-        names = ("A", "B", "offset", "C")
-        values = []
-        for name in names:
-            block = self.block(name)
-            entries = to_sx(list(block.T), table, [name] * len(block))
-            column = ca.vertcat(*entries) if entries else ca.SX(0, 1)
-            values.append(ca.densify(ca.reshape(column, *block.shape)))
-        return ca.Function("quasi_lpv", columns, values, list(kinds), list(names))
+        kinds = ("x", "u", "p", "rho", "d", "f", "w")
+        inputs = {kind: [s.symbol for s in getattr(self.model, kind)] for kind in kinds}
+        outputs = {name: self.block(name) for name in ("A", "B", "offset", "C")}
+        return sx_function("quasi_lpv", inputs, outputs)
 
     def __repr__(self) -> str:
         return f"QuasiLPV({self.model.name!r}, {len(self.scheduling)} scheduling variables)"

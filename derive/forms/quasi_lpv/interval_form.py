@@ -1,7 +1,7 @@
 """The elementwise interval form of a quasi-linear model, ready to be evaluated."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import enclose_number, rational
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.convert import to_sx
+from obsynth.symbolic.convert import column, sx_function, to_sx
 from obsynth.symbolic.plant import Plant
 
 Bounds = tuple[FloatArray, FloatArray]
@@ -47,7 +47,6 @@ class IntervalForm:
     how: dict[str, NDArray[np.object_]]
     minimum: dict[str, FloatArray]
     maximum: dict[str, FloatArray]
-    _program: dict[str, Program] = field(default_factory=dict, repr=False)
 
     @property
     def A_lower(self) -> sp.Matrix:
@@ -122,18 +121,14 @@ class IntervalForm:
                     symbol=str(known.argument),
                     value=float(value),
                 )
-        if "bounds" not in self._program:
-            self._program["bounds"] = Program.from_casadi(self._columns())
-        column = point[:, None]
-        low, high = evaluate(self._program["bounds"], column, column)
-        result, start = {}, 0
-        for block in _BLOCKS:
-            shape = self.lower[block].shape
-            size = shape[0] * shape[1]
-            first, second = slice(start, start + size), slice(start + size, start + 2 * size)
-            result[block] = (low[first, 0].reshape(shape), high[second, 0].reshape(shape))
-            start += 2 * size
-        return result
+        low, high = evaluate(self._program, point[:, None], point[:, None])
+        shapes = [self.lower[block].shape for block in _BLOCKS]
+        sizes = np.cumsum([n * k for n, k in shapes for _ in "lu"])
+        lower, upper = np.split(low[:, 0], sizes)[:-1:2], np.split(high[:, 0], sizes)[1::2]
+        return {
+            block: (a.reshape(shape, order="F"), b.reshape(shape, order="F"))
+            for block, shape, a, b in zip(_BLOCKS, shapes, lower, upper, strict=True)
+        }
 
     def function(self) -> ca.Function:
         """Return the bounds as a CasADi function for run time, without outward rounding.
@@ -144,37 +139,18 @@ class IntervalForm:
             (y) -> (A_lower, A_upper, B_lower, B_upper, offset_lower, offset_upper, inside), where
             inside is 1 for arguments in the domain and 0 elsewhere.
         """
-        columns, symbols = self._arguments()
-        inside = ca.SX(1)
-        for known, element in zip(self.known, symbols, strict=True):
-            if np.isfinite(known.lower):
-                inside = ca.logic_and(inside, element >= known.lower)
-            if np.isfinite(known.upper):
-                inside = ca.logic_and(inside, element <= known.upper)
-        matrices = []
-        names = []
-        table = dict(zip(self.arguments, symbols, strict=True))
-        for block in _BLOCKS:
-            for side, matrix in (("lower", self.lower[block]), ("upper", self.upper[block])):
-                labels = [f"{block}_{side}"] * len(matrix)
-                entries = to_sx(list(matrix.T), table, labels)
-                matrices.append(ca.reshape(_column(entries), *matrix.shape))
-                names.append(f"{block}_{side}")
-        return ca.Function(
-            "interval_form", [columns], [*matrices, inside], ["y"], [*names, "inside"]
-        )
+        ends = [sp.And(k.lower <= k.argument, k.argument <= k.upper) for k in self.known]
+        inside = sp.Piecewise((1, sp.And(*ends)), (0, True))
+        outputs = self._outputs() | {"inside": sp.Matrix([inside])}
+        return sx_function("interval_form", {"y": self.arguments}, outputs)
 
-    def _arguments(self) -> tuple[ca.SX, list[ca.SX]]:
-        symbols = [ca.SX.sym(str(a)) for a in self.arguments]
-        return _column(symbols), symbols
+    def _outputs(self) -> dict[str, sp.Matrix]:
+        sides = {"lower": self.lower, "upper": self.upper}
+        return {f"{block}_{side}": sides[side][block] for block in _BLOCKS for side in sides}
 
-    def _columns(self) -> ca.Function:
-        columns, symbols = self._arguments()
-        table = dict(zip(self.arguments, symbols, strict=True))
-        rows = [e for b in _BLOCKS for side in (self.lower, self.upper) for e in side[b]]
-        return ca.Function(
-            "bounds", [columns], [_column(to_sx(rows, table, ["a bound"] * len(rows)))]
-        )
+    @cached_property
+    def _program(self) -> Program:
+        return Program.from_casadi(sx_function("bounds", {"y": self.arguments}, self._outputs()))
 
     def __str__(self) -> str:
         what = ", ".join(map(str, self.arguments))
@@ -193,10 +169,6 @@ class IntervalForm:
             sp.latex(m.applyfunc(lambda e: e.evalf(6))) for m in (self.A_lower, self.A_upper)
         )
         return f"$\\displaystyle {lower} \\le A \\le {upper}$"
-
-
-def _column(items: list[Any]) -> ca.SX:
-    return ca.densify(ca.vertcat(*items)) if items else ca.SX(0, 1)
 
 
 def make_interval_form(
@@ -264,5 +236,5 @@ def _extremes(
     rows = to_sx(list(matrix), table, ["a bound"] * len(matrix))
     if not rows:
         return np.zeros(matrix.shape), np.zeros(matrix.shape)
-    found = bound_ranges(_column(rows), _column(symbols), domain, rtol=rtol, effort=effort)
+    found = bound_ranges(column(rows), column(symbols), domain, rtol=rtol, effort=effort)
     return found.lower.reshape(matrix.shape), found.upper.reshape(matrix.shape)
