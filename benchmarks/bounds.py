@@ -107,8 +107,8 @@ def entries_of(case: str) -> list[Any]:
 
     plant, kind = plant_of(case), CASES[case][0]
     if kind == "values":
-        return [jacobian_entries(scaled(plant), None, "inputs")]
-    return [jacobian_entries(plant, None, w) for w in ("states", "inputs")[: 1 + bool(plant.u)]]
+        return [jacobian_entries(scaled(plant), "inputs")]
+    return [jacobian_entries(plant, w) for w in ("states", "inputs")[: 1 + bool(plant.u)]]
 
 
 def typed_of(case: str) -> list[tuple[Any, Any, Any]]:

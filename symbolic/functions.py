@@ -25,7 +25,22 @@ _TANHC = (
 )
 
 
-class phi1(sp.Function):  # type: ignore[misc]
+class _Quotient(sp.Function):  # type: ignore[misc]
+    """What a numerator over x is continued to; ``numerator`` is a function of x."""
+
+    nargs = 1
+
+    def _eval_is_extended_real(self) -> bool | None:
+        return True if self.args[0].is_extended_real else None
+
+    def _eval_evalf(self, prec: int) -> sp.Expr | None:
+        x = self.args[0]._eval_evalf(prec + 60)
+        if x is None or not x.is_number:
+            return None
+        return (self.numerator(x) / x)._eval_evalf(prec)
+
+
+class phi1(_Quotient):
     """(exp(x) - 1)/x, continued by 1 at x = 0.
 
     Examples
@@ -34,7 +49,10 @@ class phi1(sp.Function):  # type: ignore[misc]
     1
     """
 
-    nargs = 1
+    @staticmethod
+    def numerator(x: sp.Expr) -> sp.Expr:
+        """Return exp(x) - 1."""
+        return sp.exp(x) - 1
 
     @classmethod
     def eval(cls, x: sp.Expr) -> sp.Expr | None:
@@ -46,17 +64,8 @@ class phi1(sp.Function):  # type: ignore[misc]
         x = self.args[0]
         return sp.Piecewise(((sp.exp(x) - phi1(x)) / x, sp.Ne(x, 0)), (sp.Rational(1, 2), True))
 
-    def _eval_is_extended_real(self) -> bool | None:
-        return True if self.args[0].is_extended_real else None
 
-    def _eval_evalf(self, prec: int) -> sp.Expr | None:
-        x = self.args[0]._eval_evalf(prec + 60)
-        if x is None or not x.is_number:
-            return None
-        return ((sp.exp(x) - 1) / x)._eval_evalf(prec)
-
-
-class tanhc(sp.Function):  # type: ignore[misc]
+class tanhc(_Quotient):
     """tanh(x)/x, continued by 1 at x = 0.
 
     Examples
@@ -65,7 +74,7 @@ class tanhc(sp.Function):  # type: ignore[misc]
     1
     """
 
-    nargs = 1
+    numerator = sp.tanh
 
     @classmethod
     def eval(cls, x: sp.Expr) -> sp.Expr | None:
@@ -79,15 +88,6 @@ class tanhc(sp.Function):  # type: ignore[misc]
         x = self.args[0]
         slope = (1 - sp.tanh(x) ** 2 - tanhc(x)) / x
         return sp.Piecewise((slope, sp.Ne(x, 0)), (0, True))
-
-    def _eval_is_extended_real(self) -> bool | None:
-        return True if self.args[0].is_extended_real else None
-
-    def _eval_evalf(self, prec: int) -> sp.Expr | None:
-        x = self.args[0]._eval_evalf(prec + 60)
-        if x is None or not x.is_number:
-            return None
-        return (sp.tanh(x) / x)._eval_evalf(prec)
 
 
 def _patched(x: ca.SX, numerator: ca.SX, variable: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:

@@ -240,40 +240,18 @@ def exact_number(value: Any, what: str) -> sp.Expr:
 
 
 def make_signals(
-    role: Role,
-    names: str | Sequence[str],
-    *,
-    limits: Any = None,
-    bound: Any = None,
-    nominal: Any = None,
-    unit: Any = "",
-    rate: Any = None,
-    constant: Any = False,
-    measured: Any = True,
-    of: Sequence[str | None] | None = None,
-    value: Any = None,
-    tolerance: Any = None,
+    role: Role, names: str | Sequence[str], *, limits: Any = None, **keywords: Any
 ) -> tuple[Signal, ...]:
-    """Make the signals of one declaration.
+    """Make the signals of one declaration, with keywords of `_one`.
 
     Every keyword is one value for all symbols or a list with one per symbol;
     ``limits`` is one pair or a list of pairs.
     """
     found = expand_names(names, str(role))
-    if limits is not None and bound is not None:
+    if limits is not None and keywords.get("bound") is not None:
         raise PlantError(f"{role} {found[0]}: give bound= or range=, not both", symbol=found[0])
-    columns = {
-        "limits": _pairs(limits, found),
-        "bound": per_symbol(bound, found, "bound"),
-        "nominal": per_symbol(nominal, found, "nominal"),
-        "unit": per_symbol(unit, found, "unit"),
-        "rate": per_symbol(rate, found, "rate"),
-        "constant": per_symbol(constant, found, "constant"),
-        "measured": per_symbol(measured, found, "measured"),
-        "of": [None] * len(found) if of is None else list(of),
-        "value": per_symbol(value, found, "value"),
-        "tolerance": per_symbol(tolerance, found, "tolerance"),
-    }
+    columns = {word: per_symbol(value, found, word) for word, value in keywords.items()}
+    columns["limits"] = _pairs(limits, found)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     return tuple(_one(role, name, **row) for name, row in zip(found, rows, strict=True))
 
@@ -282,16 +260,16 @@ def _one(
     role: Role,
     name: str,
     *,
-    limits: Any,
-    bound: Any,
-    nominal: Any,
-    unit: Any,
-    rate: Any,
-    constant: Any,
-    measured: Any,
-    of: str | None,
-    value: Any,
-    tolerance: Any,
+    limits: Any = None,
+    bound: Any = None,
+    nominal: Any = None,
+    unit: Any = "",
+    rate: Any = None,
+    constant: Any = False,
+    measured: Any = True,
+    of: str | None = None,
+    value: Any = None,
+    tolerance: Any = None,
 ) -> Signal:
     who = f"{role} {name}"
     one_line(unit, f"{who}: unit=", LONGEST_UNIT, symbol=name)

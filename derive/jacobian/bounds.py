@@ -332,14 +332,13 @@ def jacobian_bounds(
         raise DerivationError(
             f"wrt={wrt!r} is not known; choose one of {', '.join(map(repr, COLUMNS))}", wrt=wrt
         )
-    joint = wrt == "joint"
-    if joint and isinstance(split_or_model, Split):
+    joint, is_split = wrt == "joint", isinstance(split_or_model, Split)
+    if joint and is_split:
         raise DerivationError("wrt='joint' is of a plant: a split has linear outputs", wrt=wrt)
-    part = split_or_model if isinstance(split_or_model, Split) else None
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     refuse_jumps(model.check(), outputs=joint)
-    entries = jacobian_entries(model, part, wrt)
-    function = "d[f; h]" if joint else "dg" if part is not None else "df"
+    entries = jacobian_entries(split_or_model, wrt)
+    function = "d[f; h]" if joint else "dg" if is_split else "df"
     kinds = COLUMNS[wrt]
     ranges = entries.ranges(rtol, effort, f"{function}/d{''.join(kinds)}")
     rows = len(model.x) + (len(model.output_names) if joint else 0)

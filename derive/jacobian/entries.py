@@ -28,12 +28,14 @@ _GAIN = 0.9
 _POINTS = 16
 
 
-def jacobian_entries(model: Plant, part: Split | None, wrt: str) -> MatrixEntries:
+def jacobian_entries(split_or_model: Split | Plant, wrt: str) -> MatrixEntries:
     """Collect the entries of a Jacobian that are not structurally zero.
 
     wrt: "states" or "inputs" of the right-hand side; "joint" of it and the outputs below it, by
         states and disturbances
     """
+    part = split_or_model if isinstance(split_or_model, Split) else None
+    model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     kinds = COLUMNS[wrt]
     kind = kinds[0]
     sx = model.sx(constants="symbol")

@@ -96,9 +96,7 @@ def principal_family(
     (2, ('c1(C_A, T)',))
     """
     bounds = jacobian_bounds(split_or_model, wrt, rtol, effort)
-    part = split_or_model if isinstance(split_or_model, Split) else None
-    model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
-    entries, family = jacobian_entries(model, part, wrt), bounds.family
+    entries, family = jacobian_entries(split_or_model, wrt), bounds.family
     basis = basis_entries(bounds)
     count = len(basis)
     if not 0 <= keep <= count:

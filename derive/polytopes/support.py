@@ -230,9 +230,7 @@ def jacobian_polytope(
     (2, 'exact')
     """
     bounds = jacobian_bounds(split_or_model, wrt, min(rtol, 1e-6), effort)
-    part = split_or_model if isinstance(split_or_model, Split) else None
-    model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
-    entries = jacobian_entries(model, part, wrt)
+    entries = jacobian_entries(split_or_model, wrt)
     basis = basis_entries(bounds)
     groups = []
     for members in sorted(map(tuple, connected(map(entries.support, basis)))):

@@ -11,6 +11,7 @@ from obsynth.derive.rigour import ExactMatrix
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 
+Numbers = NDArray[np.complex128]
 _RANK_TOLERANCE = 1e-9
 
 
@@ -66,17 +67,13 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     return Decoupling(E, T, Pi, q, residual, bool(projector))
 
 
-def _rank(matrix: FloatArray) -> int:
+def scaled_rank(matrix: FloatArray | Numbers) -> int:
+    """Rank of a matrix with columns of size one."""
     if matrix.size == 0:
         return 0
     size = np.linalg.norm(matrix, axis=0)
     scaled = matrix / np.where(size > 0.0, size, 1.0)
     return int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE))
-
-
-def listed(names: list[str] | tuple[str, ...]) -> str:
-    """Join names."""
-    return ", ".join(names)
 
 
 def unknown_input_condition(split: Split) -> Decoupling:
@@ -90,13 +87,13 @@ def unknown_input_condition(split: Split) -> Decoupling:
         return decouple(C, D)
     names, states = model.names("d"), model.names("x")
     CD = C @ D
-    rank_D, rank_CD = _rank(D), _rank(CD)
+    rank_D, rank_CD = scaled_rank(D), scaled_rank(CD)
     if rank_D < q:
         dead = [names[j] for j in range(q) if not D[:, j].any()]
         what = (
-            f"{listed(dead)} enters no equation"
+            f"{', '.join(dead)} enters no equation"
             if dead
-            else f"{listed(names)} act on the states in the same way and cannot be told apart"
+            else f"{', '.join(names)} act on the states in the same way and cannot be told apart"
         )
         raise StructureError(
             f"rank(D) = {rank_D} for {q} unknown inputs: {what}; merge or remove them",
@@ -110,11 +107,12 @@ def unknown_input_condition(split: Split) -> Decoupling:
         lost = _null_vectors(CD)
         symbols = [s for j, s in enumerate(names) if np.abs(lost[j]).max() > 1e-6]
         acts = [states[i] for i in range(n) if np.abs(D[i] @ lost).max() > 1e-9]
+        outputs = ", ".join(model.output_names)
         more = f"; {q} unknown inputs need at least {q} outputs" if m < q else ""
         raise StructureError(
-            f"rank(C D) = {rank_CD} but rank(D) = {q}: the unknown input {listed(symbols)} acts "
-            f"on {listed(acts)}, and no output ({listed(model.output_names)}) shows it one step "
-            f"later{more}. Measure {acts[0]}, or treat {symbols[0]} as a bounded disturbance",
+            f"rank(C D) = {rank_CD} but rank(D) = {q}: the unknown input {', '.join(symbols)} acts "
+            f"on {', '.join(acts)}, and no output ({outputs}) shows it one step later{more}. "
+            f"Measure {acts[0]}, or treat {symbols[0]} as a bounded disturbance",
             condition="rank(C D) = rank(D)",
             rank_D=rank_D,
             rank_CD=rank_CD,
@@ -133,7 +131,6 @@ def _null_vectors(matrix: FloatArray) -> FloatArray:
     return np.asarray(vectors[chosen].T)
 
 
-Modes = NDArray[np.complex128]
 _STARTS = 2
 _RANDOM = 64
 _HIDDEN = 1e-9
@@ -172,21 +169,21 @@ def augmented_pair(
     return np.vstack([top, np.hstack([np.zeros((n_f, n)), keep])]), np.hstack([split.C, split.D_f])
 
 
+def _stays(mode: complex, discrete: bool) -> bool:
+    return abs(mode) >= 1.0 - _MODE_TOLERANCE if discrete else mode.real >= -_MODE_TOLERANCE
+
+
 def _modes(matrix: FloatArray, n: int, discrete: bool) -> tuple[list[complex], list[complex]]:
     """Eigenvalues that do not decay, and the others; the faults' own mode is exact."""
     values = [complex(v) for v in np.linalg.eigvals(matrix[:n, :n])]
-    stays = [
-        v
-        for v in values
-        if (abs(v) >= 1.0 - _MODE_TOLERANCE if discrete else v.real >= -_MODE_TOLERANCE)
-    ]
+    stays = [v for v in values if _stays(v, discrete)]
     decays = [v for v in values if v not in stays]
     if len(matrix) > n:
         stays.insert(0, complex(1.0 if discrete else 0.0))
     return stays, decays
 
 
-def _hidden(matrix: FloatArray, outputs: FloatArray, mode: complex) -> tuple[float, Modes]:
+def _hidden(matrix: FloatArray, outputs: FloatArray, mode: complex) -> tuple[float, Numbers]:
     """Smallest singular value of [mode I - A; C] with scaled columns, and the null vectors."""
     pencil = np.vstack([mode * np.eye(len(matrix)) - matrix, outputs.astype(complex)])
     size = np.linalg.norm(pencil, axis=0)
@@ -227,7 +224,7 @@ def detectability(split: Split, bounds: JacobianBounds) -> Detectability:
 
 def _undetectable(
     mode: complex,
-    null: Modes,
+    null: Numbers,
     states: tuple[str, ...],
     faults: tuple[str, ...],
     index: int,
@@ -252,9 +249,9 @@ def _undetectable(
     )
     hidden = f" together with {motion}" if motion else ""
     return StructureError(
-        f"the {kind} {listed(blamed)} cannot be detected: a motion of {blamed[0]}{hidden} (mode "
-        f"{value}, which does not decay) leaves the outputs {listed(outputs)} unchanged once the "
-        f"unknown inputs are removed (vertex {index + 1} of the Jacobian family). Measure "
+        f"the {kind} {', '.join(blamed)} cannot be detected: a motion of {blamed[0]}{hidden} (mode "
+        f"{value}, which does not decay) leaves the outputs {', '.join(outputs)} unchanged once "
+        f"the unknown inputs are removed (vertex {index + 1} of the Jacobian family). Measure "
         f"{moving[0] if moving else blamed[0]} as well, or declare {blamed[0]} differently",
         condition="detectability",
         symbols=tuple(blamed),
@@ -298,12 +295,9 @@ def pair_margin(A: FloatArray, C: FloatArray, discrete: bool) -> tuple[float, co
     """Distance of a pair from a hidden mode that does not decay."""
     margin, where = 1.0, None
     for mode in np.linalg.eigvals(A).tolist():
-        stays = abs(mode) >= 1.0 - _MODE_TOLERANCE if discrete else mode.real >= -_MODE_TOLERANCE
-        if not stays:
+        if not _stays(mode, discrete):
             continue
-        pencil = np.vstack([mode * np.eye(len(A)) - A, C.astype(complex)])
-        size = np.linalg.norm(pencil, axis=0)
-        value = float(np.linalg.svd(pencil / np.where(size > 0.0, size, 1.0), compute_uv=False)[-1])
+        value, _ = _hidden(A, C, mode)
         if value < margin or where is None:
             margin, where = min(value, margin), complex(mode)
     return margin, where

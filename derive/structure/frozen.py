@@ -152,7 +152,7 @@ def rank(rows: Sequence[Sequence[Any]]) -> int:
     return found
 
 
-def transfer(frozen: Frozen, at: float) -> tuple[list[list[Any]], int]:
+def transfer(frozen: Frozen, at: float) -> list[list[Any]]:
     """Transfer matrix from unknown inputs and faults to the outputs, at one real number."""
     import flint
 
@@ -160,9 +160,9 @@ def transfer(frozen: Frozen, at: float) -> tuple[list[list[Any]], int]:
     inputs = frozen.D.row_join(frozen.B_f)
     direct = frozen.C_d.row_join(frozen.D_f)
     if not inputs.cols:
-        return [[] for _ in range(frozen.C.rows)], 0
+        return [[] for _ in range(frozen.C.rows)]
     identity = flint.arb_mat(n, n, [at if i == j else 0 for i in range(n) for j in range(n)])
     solved = (identity - balls(frozen.A)).solve(balls(inputs))
     value = balls(frozen.C) * solved + balls(direct)
-    rows = [[value[i, j] for j in range(value.ncols())] for i in range(value.nrows())]
-    return rows, frozen.D.cols
+    rows: list[list[Any]] = value.tolist()
+    return rows

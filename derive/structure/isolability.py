@@ -167,7 +167,7 @@ def fault_isolability(model: Plant) -> FaultIsolability:
     points = freeze(plant) if n_f or q else []
 
     with precision():
-        tables = [transfer(frozen, at)[0] for frozen, at in zip(points, _FREQUENCIES, strict=False)]
+        tables = [transfer(frozen, at) for frozen, at in zip(points, _FREQUENCIES, strict=False)]
 
         def normal_rank(faults: tuple[int, ...]) -> int:
             columns = [*range(q), *(q + k for k in faults)]

@@ -5,17 +5,15 @@ from html import escape
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
+from obsynth.derive.structure.conditions import Numbers, scaled_rank
 from obsynth.symbolic.arrays import FloatArray
 
-Numbers = NDArray[np.complex128]
 Signals = Literal["unknown", "all"]
 _TOLERANCE = 1e-10
 _ROUNDING = 1e-12
-_RANK_TOLERANCE = 1e-9
 
 
 def system_zeros(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> Numbers:
@@ -191,10 +189,7 @@ def separable_faults(split: Split, M: FloatArray) -> tuple[tuple[str, ...], int,
         for z in (1.37 + 0.61j, -0.83 + 1.29j):
             pencil = z * np.eye(len(split.A)) - split.A - M
             transfer = split.C @ np.linalg.solve(pencil, inputs[:, columns]) + direct[:, columns]
-            size = np.linalg.norm(transfer, axis=0)
-            scaled = transfer / np.where(size > 0.0, size, 1.0)
-            if scaled.size:
-                found = max(found, int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE)))
+            found = max(found, scaled_rank(transfer))
         return found
 
     every = list(range(count))

@@ -1,7 +1,6 @@
 """Coefficients of quadratic systems: every monomial of every row to its matrix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import sympy as sp
 
@@ -13,15 +12,8 @@ from obsynth.derive.forms.qpv.form import QPVLayout
 _KINDS = ("states", "inputs", "unknown inputs", "faults", "disturbances")
 
 
-@dataclass(frozen=True, eq=False)
-class _Monomial:
-    """A product of powers of signals with its coefficient, as positions by kind."""
-
-    coefficient: sp.Expr
-    positions: tuple[tuple[int, ...], ...]
-
-    def degrees(self) -> tuple[int, ...]:
-        return tuple(len(p) for p in self.positions)
+Monomial = tuple[sp.Expr, tuple[tuple[int, ...], ...]]
+"""A coefficient, and the positions of the signals that it is multiplied by, kind by kind."""
 
 
 def read_coefficients(
@@ -42,29 +34,24 @@ def read_coefficients(
     def add(row: int, column: int, value: sp.Expr) -> None:
         found[(row, column)] = found.get((row, column), sp.Integer(0)) + value
 
-    for i, row in enumerate(plant.rows):
+    named = zip((*names, *model.output_names), (*plant.rows, *plant.outputs), strict=True)
+    for i, (name, row) in enumerate(named):
+        dynamics = i < len(names)
         for term in expand_terms(row):
-            for monomial in _monomials(term, groups, names[i]):
-                for column, share in _columns(monomial, layout, form_of_N):
-                    add(i, column, share * monomial.coefficient)
-                if not _columns(monomial, layout, form_of_N):
-                    raise _too_high(term, groups, names[i], monomial, "dynamics")
-    for k, row in enumerate(plant.outputs):
-        name = model.output_names[k]
-        for term in expand_terms(row):
-            for monomial in _monomials(term, groups, name):
-                if sum(monomial.degrees()) > 1:
-                    raise _too_high(term, groups, name, monomial, "outputs")
-                for column, share in _columns(monomial, layout, form_of_N):
-                    add(len(plant.rows) + k, column, share * monomial.coefficient)
+            for coefficient, positions in _monomials(term, groups, name):
+                columns = _columns(positions, layout, form_of_N)
+                if not columns or not (dynamics or sum(map(len, positions)) <= 1):
+                    raise _too_high(term, groups, name, positions, dynamics)
+                for column, share in columns:
+                    add(i, column, share * coefficient)
     return {place: value for place, value in found.items() if sp.expand(value) != 0}
 
 
-def _monomials(term: sp.Expr, groups: Sequence[Sequence[sp.Symbol]], row: str) -> list[_Monomial]:
+def _monomials(term: sp.Expr, groups: Sequence[Sequence[sp.Symbol]], row: str) -> list[Monomial]:
     generators = [symbol for group in groups for symbol in group]
     present = [s for s in generators if term.has(s)]
     if not present:
-        return [_Monomial(term, ((),) * len(groups))]
+        return [(term, ((),) * len(groups))]
     try:
         polynomial = sp.Poly(term, *present)
     except sp.PolynomialError as error:
@@ -81,34 +68,28 @@ def _monomials(term: sp.Expr, groups: Sequence[Sequence[sp.Symbol]], row: str) -
             tuple(k for k, s in enumerate(group) for _ in range(power.get(s, 0)))
             for group in groups
         )
-        result.append(_Monomial(coefficient, positions))
+        result.append((coefficient, positions))
     return result
 
 
-def _columns(monomial: _Monomial, layout: QPVLayout, form_of_N: str) -> list[tuple[int, sp.Expr]]:
+def _columns(
+    positions: tuple[tuple[int, ...], ...], layout: QPVLayout, form_of_N: str
+) -> list[tuple[int, sp.Expr]]:
     """Columns of the stacked matrix for a monomial, with the share of its coefficient."""
     one, half = sp.Integer(1), sp.Rational(1, 2)
-    states, inputs = monomial.positions[:2]
-    match monomial.degrees():
-        case (0, 0, 0, 0, 0):
+    states, inputs = positions[:2]
+    match states, inputs, sum(map(len, positions)):
+        case (), (), 0:
             return [(layout.start("c"), one)]
-        case (1, 0, 0, 0, 0):
-            return [(layout.start("A") + states[0], one)]
-        case (2, 0, 0, 0, 0):
-            a, b = states
+        case (a, b), (), 2:
             if a == b or form_of_N == "upper":
                 return [(layout.quadratic(a, b), one)]
             return [(layout.quadratic(a, b), half), (layout.quadratic(b, a), half)]
-        case (1, 1, 0, 0, 0):
-            return [(layout.start("M") + inputs[0] * layout.states + states[0], one)]
-        case (0, 1, 0, 0, 0):
-            return [(layout.start("B") + inputs[0], one)]
-        case (0, 0, 1, 0, 0):
-            return [(layout.start("D") + monomial.positions[2][0], one)]
-        case (0, 0, 0, 1, 0):
-            return [(layout.start("B_f") + monomial.positions[3][0], one)]
-        case (0, 0, 0, 0, 1):
-            return [(layout.start("G") + monomial.positions[4][0], one)]
+        case (a,), (j,), 2:
+            return [(layout.start("M") + j * layout.states + a, one)]
+        case _, _, 1:
+            pairs = zip(("A", "B", "D", "B_f", "G"), positions, strict=True)
+            return [(layout.start(block) + at[0], one) for block, at in pairs if at]
     return []
 
 
@@ -130,23 +111,23 @@ def _too_high(
     term: sp.Expr,
     groups: Sequence[Sequence[sp.Symbol]],
     row: str,
-    monomial: _Monomial,
-    where: str,
+    positions: tuple[tuple[int, ...], ...],
+    dynamics: bool,
 ) -> StructureError:
     parts = []
-    for kind, group, positions in zip(_KINDS, groups, monomial.positions, strict=True):
-        if positions:
-            listed = ", ".join(dict.fromkeys(str(group[k]) for k in positions))
-            parts.append(f"{len(positions)} in the {kind} {listed}")
-    total = sum(monomial.degrees())
-    if where == "outputs":
+    for kind, group, own in zip(_KINDS, groups, positions, strict=True):
+        if own:
+            listed = ", ".join(dict.fromkeys(str(group[k]) for k in own))
+            parts.append(f"{len(own)} in the {kind} {listed}")
+    total = sum(map(len, positions))
+    if not dynamics:
         allowed = "outputs have to be affine in states and signals"
     else:
         allowed = (
             "there is place for 1, x, x x, x u, u and for unknown inputs, faults and disturbances "
             "on their own"
         )
-        if monomial.degrees()[3] and sum(monomial.degrees()) > 1:
+        if positions[3] and total > 1:
             allowed += "; a fault that multiplies others has to become a state (augment=)"
     return StructureError(
         f"the row of {row} has the term {term} of degree {total} ({'; '.join(parts)}); {allowed}",

@@ -102,7 +102,7 @@ def test_points_catch_what_a_missing_proof_lets_through(monkeypatch):
         "TR8",
         lambda e, **options: right(e, **options).subs(plant.x[1].symbol, plant.x[0].symbol),
     )
-    typed = jacobian_entries.jacobian_entries(plant, None, "states")
+    typed = jacobian_entries.jacobian_entries(plant, "states")
     assert any(entry.has(sp.sin(plant.x[0].symbol)) for entry in typed.exact.values())
 
 
@@ -118,7 +118,7 @@ def test_robot_arms_as_typed():
 
 
 def test_forms_are_kept_where_sums_are_no_better():
-    entries = jacobian_entries.jacobian_entries(quadrotor(), None, "states")
+    entries = jacobian_entries.jacobian_entries(quadrotor(), "states")
     thrust = entries.exact[(3, 8)]
     assert thrust.count_ops() < 40
     function = ca.Function("f", [entries.variables, entries.constants], [entries.values])

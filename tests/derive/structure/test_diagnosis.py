@@ -381,8 +381,8 @@ def test_ranks_that_forget_the_unknown_inputs_fail(monkeypatch):
     whole = isolability.transfer
 
     def forgetful(frozen, at):
-        rows, q = whole(frozen, at)
-        return [[0 if k < q else value for k, value in enumerate(row)] for row in rows], q
+        q = frozen.D.cols
+        return [[0 if k < q else v for k, v in enumerate(row)] for row in whole(frozen, at)]
 
     monkeypatch.setattr(isolability, "transfer", forgetful)
     assert fault_isolability(varga()).detectable.all()
