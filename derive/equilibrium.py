@@ -1,6 +1,6 @@
 """Equilibria: where a plant stays for given inputs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -217,10 +217,8 @@ def operating_point(model: Plant, at: Any = None) -> Equilibrium:
             raise DerivationError(
                 f"at= is an Equilibrium or a pair (x, u); given was {at!r}", given=at
             ) from error
-        residual = float("nan")
-        point = Equilibrium(
-            x, u, residual, operating_values(model, "p"), operating_values(model, "rho")
-        )
+        rest = (operating_values(model, kind) for kind in ("p", "rho"))
+        point = Equilibrium(x, u, np.nan, *rest)
     for kind, values in (("x", point.x), ("u", point.u)):
         names = model.names(kind)
         if values.shape != (len(names),) or not np.isfinite(values).all():
@@ -230,14 +228,6 @@ def operating_point(model: Plant, at: Any = None) -> Equilibrium:
                 symbols=names,
             )
     if np.isnan(point.residual):
-        function = model.function()
-        sx = model.sx()
-        zero = {k: np.zeros(getattr(sx, k).numel()) for k in ("d", "f", "w")}
-        value = np.array(
-            function(point.x, point.u, zero["d"], zero["f"], zero["w"], point.p, point.rho)[0]
-        ).ravel()
-        rest = value - point.x if model.Ts is not None else value
-        point = Equilibrium(
-            point.x, point.u, float(np.abs(rest).max(initial=0.0)), point.p, point.rho
-        )
+        left = np.array(_residual_functions(model)[0](point.x, point.u, point.p, point.rho))
+        point = replace(point, residual=float(np.abs(left).max(initial=0.0)))
     return point

@@ -70,6 +70,8 @@ def with_ranges(self: "Plant", ranges: Mapping[str, tuple[float, float]]) -> "Pl
         if signal["role"] == "parameter":
             inside = value is not None and lower <= value <= upper
             signal["nominal"] = value if inside else 0.5 * (lower + upper)
+        elif signal["nominal"] is not None and not lower <= signal["nominal"] <= upper:
+            signal["nominal"] = None
     return type(self).from_dict(data)
 
 

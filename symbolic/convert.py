@@ -28,28 +28,9 @@ _RELATIONS = {
 
 
 def nearest_double(number: sp.Expr) -> float:
-    """Return the double nearest to an exact real number.
+    """Return the double nearest to an exact real number, rounded from 40 digits if irrational.
 
-    Parameters
-    ----------
-    number : sympy.Expr
-        An expression without symbols.
-
-    Returns
-    -------
-    float
-        Correctly rounded for rationals and doubles; other constants are rounded from
-        40 digits.
-
-    Raises
-    ------
-    PlantError
-        The number is not real, not finite or beyond the range of doubles.
-
-    Examples
-    --------
-    >>> nearest_double(sp.Rational(1, 3))
-    0.3333333333333333
+    PlantError where it is not real, not finite or beyond the range of doubles.
     """
     try:
         if isinstance(number, sp.Rational):
@@ -65,33 +46,9 @@ def nearest_double(number: sp.Expr) -> float:
 def to_sx(
     expressions: Sequence[sp.Expr], symbols: Mapping[sp.Symbol, ca.SX], labels: Sequence[str]
 ) -> list[ca.SX]:
-    """Convert SymPy expressions to SX.
+    """Convert SymPy expressions to SX scalars; labels are what the rows are called in messages.
 
-    Parameters
-    ----------
-    expressions : sequence of sympy.Expr
-        The rows.
-    symbols : mapping of sympy.Symbol to casadi.SX
-        The SX scalar each symbol becomes.
-    labels : sequence of str
-        What each row is called in messages.
-
-    Returns
-    -------
-    list of casadi.SX
-        One scalar per row.
-
-    Raises
-    ------
-    PlantError
-        A symbol without an SX counterpart, or a function without a CasADi form; the
-        message names it and the row.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> to_sx([sp.sqrt(x) + sp.Abs(x)], {x: ca.SX.sym("x")}, ["row 1"])
-    [SX((sqrt(x)+fabs(x)))]
+    PlantError names a symbol without an SX counterpart, or a function without a CasADi form.
     """
     walker = _Walker(symbols)
     rows = []

@@ -64,30 +64,13 @@ def check_parity(
     points: NDArray[np.float64],
     labels: Sequence[str],
 ) -> None:
-    """Compare expressions with numbers computed from their other form.
+    """Compare expressions with numbers computed from their other form, (k,) -> (rows,).
 
-    Parameters
-    ----------
-    expressions : sequence of sympy.Expr
-        The rows.
-    symbols : sequence of sympy.Symbol, length k
-        The symbols the columns of ``points`` belong to.
-    derived : callable
-        Maps one point (k,) to the values (rows,) of the other form.
-    points : array (count, k)
-        Where to compare. A point at which both forms are undefined is passed over.
-    labels : sequence of str
-        Names of the rows, for messages.
+    points: where, (count, k), in the order of the symbols; one at which neither form is defined is
+        passed over
+    labels: names of the rows
 
-    Raises
-    ------
-    ParityError
-        A row differs by more than ``TOLERANCE``, or is defined in one form only.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> check_parity([x**2], [x], lambda v: v * v, np.array([[0.5], [2.0]]), ["row 1"])
+    ParityError where a row differs by more than `TOLERANCE`, or is defined in one form only.
     """
     for point in points:
         values = np.ravel(derived(point))

@@ -108,32 +108,12 @@ class _Unsupported(str):
 def from_tape(
     function: ca.Function, arguments: Sequence[Sequence[sp.Symbol]], labels: Sequence[str]
 ) -> list[sp.Expr]:
-    """Convert the scalar outputs of an SX function to SymPy.
+    """Convert the scalar outputs of an SX function of dense columns to SymPy.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        An SX function of dense columns with scalar outputs.
-    arguments : sequence of sequences of sympy.Symbol
-        The symbols of every input, entry by entry.
-    labels : sequence of str
-        What each output is called in messages.
+    arguments: the symbols of every input, entry by entry
+    labels: what each output is called in messages
 
-    Returns
-    -------
-    list of sympy.Expr
-        One per output.
-
-    Raises
-    ------
-    PlantError
-        An operation without a SymPy form; the message names it and the output.
-
-    Examples
-    --------
-    >>> z = ca.SX.sym("z")
-    >>> from_tape(ca.Function("f", [z], [z * ca.sin(z)]), [[sp.Symbol("x")]], ["row 1"])
-    [x*sin(x)]
+    PlantError names an operation without a SymPy form, and the output.
     """
     work: dict[int, Any] = {}
     results: list[sp.Expr] = [sp.Integer(0)] * function.n_out()

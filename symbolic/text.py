@@ -52,30 +52,7 @@ class TextError(PlantError):
 
 
 def read_text(text: str, symbols: Mapping[str, sp.Symbol]) -> sp.Expr:
-    """Read an expression.
-
-    Parameters
-    ----------
-    text : str
-        An expression of the language above.
-    symbols : mapping of str to sympy.Symbol
-        The names that may stand in it.
-
-    Returns
-    -------
-    sympy.Expr
-
-    Raises
-    ------
-    TextError
-        Not an expression; ``position`` says where.
-
-    Examples
-    --------
-    >>> h = sp.Symbol("h", real=True)
-    >>> read_text("-1/2*sqrt(h) + 0.1", {"h": h})
-    0.1 - sqrt(h)/2
-    """
+    """Read an expression with names of symbols in it; TextError says where it is none."""
     return _Reader(text, symbols).read()
 
 

@@ -79,10 +79,7 @@ def largest_value(
             f"({failure.operation}); scale the states, or keep their ranges smaller",
             entries=rows,
             operation=failure.operation,
-            sub_box={
-                name: (float(failure.lower[k]), float(failure.upper[k]))
-                for k, name in enumerate(entries.names)
-            },
+            sub_box=failure.box(entries.names),
         )
     return Maximum(
         float(found.upper[0]),

@@ -257,6 +257,11 @@ class Failure:
     lower: FloatArray
     upper: FloatArray
 
+    def box(self, names: Sequence[str]) -> dict[str, tuple[float, float]]:
+        """Return the sub-box by the names of all variables."""
+        ends = zip(self.lower.tolist(), self.upper.tolist(), strict=True)
+        return dict(zip(names, ends, strict=True))
+
 
 @dataclass(frozen=True, eq=False)
 class Ranges:

@@ -111,11 +111,8 @@ class MatrixEntries:
         boxes, lines = {}, []
         for failure in found.failures:
             place = self.places[failure.index]
-            box = {
-                name: (float(failure.lower[k]), float(failure.upper[k]))
-                for k, name in enumerate(self.names)
-                if name in self.support(place)
-            }
+            whole = failure.box(self.names)
+            box = {name: whole[name] for name in self.support(place)}
             name = f"{what}[{place[0] + 1},{place[1] + 1}]"
             where = ", ".join(f"{s} in [{lo:.9g}, {hi:.9g}]" for s, (lo, hi) in box.items())
             shown = f" = {self.exact[place]}" if size(self.exact[place]) <= _SHORT else ""

@@ -123,18 +123,8 @@ def with_ranges(
     plant: Plant, box: Sequence[Sequence[float]] | FloatArray, kind: str = "x"
 ) -> Plant:
     """Return a copy of a plant whose states, or signals of another kind, have other ranges."""
-    data = plant.to_dict()
-    ranges = dict(zip(plant.names(kind), np.asarray(box, dtype=float).tolist(), strict=True))
-    signals = []
-    for entry in data["signals"]:
-        if entry["name"] in ranges:
-            low, high = ranges[entry["name"]]
-            nominal = entry.get("nominal")
-            if nominal is not None and not low <= nominal <= high:
-                nominal = None
-            entry = {**entry, "lower": low, "upper": high, "nominal": nominal}
-        signals.append(entry)
-    return Plant.from_dict({**data, "signals": signals})
+    ranges = zip(plant.names(kind), np.asarray(box, dtype=float).tolist(), strict=True)
+    return plant.with_ranges({name: (low, high) for name, (low, high) in ranges})
 
 
 def _signed_power(node: sp.Mul) -> tuple[sp.Expr, sp.Expr, sp.Expr] | None:

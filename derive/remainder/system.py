@@ -73,11 +73,7 @@ class System:
         )
         if found.failures:
             failure = found.failures[0]
-            labels = (*self.names, *self.held, "time in the step")
-            sub_box = {
-                label: (float(failure.lower[k]), float(failure.upper[k]))
-                for k, label in enumerate(labels)
-            }
+            sub_box = failure.box((*self.names, *self.held, "time in the step"))
             where = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in sub_box.items())
             raise UnboundedError(
                 f"{what} has no finite bound in the row of {self.names[failure.index]} "
