@@ -1,6 +1,6 @@
 """Lipschitz, one-sided Lipschitz and quadratic inner-boundedness constants, guaranteed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -172,14 +172,9 @@ def lipschitz(
 
 def _inner(ball: Maximum, shift: float) -> InnerBound:
     margin = 4.0 * UNIT_ROUNDOFF * (ball.upper**2 + shift**2)
-    beta = Maximum(
-        ball.upper**2 - shift**2 + margin,
-        max(ball.attained, 0.0) ** 2 - shift**2 - margin,
-        ball.at,
-        ball.status,
-        ball.method,
-        ball.boxes,
-    )
+    upper = ball.upper**2 - shift**2 + margin
+    attained = max(ball.attained, 0.0) ** 2 - shift**2 - margin
+    beta = replace(ball, upper=upper, attained=attained)
     return InnerBound(beta, 2.0 * shift, ball.upper)
 
 

@@ -1,7 +1,7 @@
 """The pieces of a majorant: one row of g, or rows that share states."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -139,14 +139,8 @@ def row_majorant(
 
 def scaled(found: Maximum, factor: float) -> Maximum:
     """Return a maximum of at most 1 times a factor."""
-    return Maximum(
-        min(1.0, found.upper * factor * UP),
-        found.attained * factor / UP,
-        found.at,
-        found.status,
-        found.method,
-        found.boxes,
-    )
+    upper = min(1.0, found.upper * factor * UP)
+    return replace(found, upper=upper, attained=found.attained * factor / UP)
 
 
 def largest_together(
@@ -168,11 +162,4 @@ def largest_together(
     chosen = matrix_entries(scaled, entries.model)
     ranges = EntryRanges.of(chosen, min(rtol, 1e-6), effort, "scaled dg/dx")
     norm = matrix_maximum(chosen, ranges, np.zeros((2 * n, 2 * n)), None, rtol, effort)
-    return Maximum(
-        norm.upper**2 * UP,
-        max(norm.attained, 0.0) ** 2 / UP,
-        norm.at,
-        norm.status,
-        norm.method,
-        norm.boxes,
-    )
+    return replace(norm, upper=norm.upper**2 * UP, attained=max(norm.attained, 0.0) ** 2 / UP)

@@ -14,6 +14,7 @@ For a discrete plant ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form:
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -59,32 +60,18 @@ class Extended:
         if not self.free:
             return np.zeros(size)
         given = sp.Matrix(*L0.shape, [sp.Rational(v) for v in L0.ravel().tolist()])
-        C = self.output_slopes()
-        left = (sp.eye(size) - given * C) * self.L0
+        left = (sp.eye(size) - given * self.output_slopes()) * self.L0
         found = np.zeros(size)
-        for (i, j), value in _items(left):
-            middle, error = round_number(sp.nsimplify(value) if value.is_Float else value)
-            found[i] += (abs(middle) + error) * largest[j]
+        for i, j in np.ndindex(*left.shape):
+            if (value := left[i, j]) != 0:
+                middle, error = round_number(sp.nsimplify(value) if value.is_Float else value)
+                found[i] += (abs(middle) + error) * largest[j]
         return np.asarray(found * (1.0 + 2.0**-40))
 
     def output_slopes(self) -> sp.Matrix:
         """Return the constant slopes of the picked outputs, zero in other rows, (m, N)."""
-        symbols = [s.symbol for s in self.plant.x]
-        C = sp.zeros(len(self.plant.output_names), len(symbols))
-        for i in self.picked:
-            row = substitute(self.plant.output[i], self.plant.constant_values)
-            C[i, :] = sp.Matrix([[sp.expand(sp.diff(row, s)) for s in symbols]])
-        return C
-
-
-def _items(matrix: sp.Matrix) -> list[tuple[tuple[int, int], sp.Expr]]:
-    """Return the entries that are not zero, with their places."""
-    return [
-        ((i, j), matrix[i, j])
-        for i in range(matrix.shape[0])
-        for j in range(matrix.shape[1])
-        if matrix[i, j] != 0
-    ]
+        rows = [substitute(row, self.plant.constant_values) for row in self.plant.output]
+        return _slopes(rows, self.plant.x, self.picked)
 
 
 def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] = ()) -> Extended:
@@ -159,28 +146,12 @@ def _assembled(
 ) -> Plant:
     """Return the plant of these states, disturbances, rows and outputs; inputs are the model's."""
     made = Plant(model.name)
-    made.add_signals(
-        [replace(s, role=Role.STATE, rate=None, of=None, constant=False) for s in states]
-    )
+    plain: dict[str, Any] = {"rate": None, "of": None, "constant": False, "value": None}
+    made.add_signals([replace(s, role=Role.STATE, **plain) for s in states])
     made.add_signals(list(model.u))
-    made.add_signals(
-        [replace(s, role=Role.INPUT, constant=False, value=None) for s in model.rho if s.measured]
-    )
-    made.add_signals(
-        [
-            replace(
-                s,
-                role=Role.DISTURBANCE,
-                rate=None,
-                of=None,
-                constant=False,
-                nominal=None,
-                value=None,
-                measured=True,
-            )
-            for s in noise
-        ]
-    )
+    made.add_signals([replace(s, role=Role.INPUT, **plain) for s in model.rho if s.measured])
+    plain |= {"nominal": None, "measured": True}
+    made.add_signals([replace(s, role=Role.DISTURBANCE, **plain) for s in noise])
     made.dynamics(rows, Ts=model.exact_Ts)
     made.outputs(outputs, names=list(model.output_names))
     return made
@@ -317,7 +288,7 @@ def _simple(row: sp.Expr, pivot: sp.Expr, weight: float, rank: int) -> sp.Expr:
     return sp.Rational(weight).limit_denominator(_LARGEST_DENOMINATOR)
 
 
-def _slopes(outputs: list[sp.Expr], states: list[Signal], picked: Sequence[int]) -> sp.Matrix:
+def _slopes(outputs: list[sp.Expr], states: Sequence[Signal], picked: Sequence[int]) -> sp.Matrix:
     C = sp.zeros(len(outputs), len(states))
     for i in picked:
         C[i, :] = sp.Matrix([[sp.expand(sp.diff(outputs[i], s.symbol)) for s in states]])

@@ -346,8 +346,7 @@ def _prove(
     model: Plant,
 ) -> dict[Entry, str]:
     """Show that every varying entry is the affine function that it is said to be."""
-    kinds = ("x", "u", "p", "rho", "d", "f", "w")
-    box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    box = {s.symbol: (s.lower, s.upper) for s in model.signals}
     methods = {}
     for place, expression in entries.exact.items():
         constant, terms = affine[place]

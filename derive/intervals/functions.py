@@ -7,6 +7,7 @@ vectorised versions to four.
 """
 
 from collections.abc import Callable
+from functools import reduce
 
 import numpy as np
 
@@ -86,9 +87,7 @@ def power_const(a: Interval, exponent: Interval) -> Interval:
     base_lo, base_hi = a
     p_lo, p_hi = exponent
     corners = [np.power(base, p) for base in (base_lo, base_hi) for p in (p_lo, p_hi)]
-    lo = np.minimum(np.minimum(corners[0], corners[1]), np.minimum(corners[2], corners[3]))
-    hi = np.maximum(np.maximum(corners[0], corners[1]), np.maximum(corners[2], corners[3]))
-    lo, hi = widen((lo, hi), ULPS)
+    lo, hi = widen((reduce(np.minimum, corners), reduce(np.maximum, corners)), ULPS)
     outside = base_lo < 0.0
     return np.where(outside, np.nan, np.maximum(lo, 0.0)), np.where(outside, np.nan, hi)
 
@@ -103,9 +102,7 @@ def power(a: Interval, b: Interval) -> Interval:
 def arctangent2(y: Interval, x: Interval) -> Interval:
     """Enclose atan2(y, x); the whole circle when the box meets the cut behind the origin."""
     corners = [np.arctan2(v, h) for v in y for h in x]
-    lo = np.minimum(np.minimum(corners[0], corners[1]), np.minimum(corners[2], corners[3]))
-    hi = np.maximum(np.maximum(corners[0], corners[1]), np.maximum(corners[2], corners[3]))
-    lo, hi = widen((lo, hi), ULPS)
+    lo, hi = widen((reduce(np.minimum, corners), reduce(np.maximum, corners)), ULPS)
     cut = ~((x[0] > 0.0) | (y[0] > 0.0) | (y[1] < 0.0))
     circle = float(up(np.array(np.pi)))
     return np.where(cut, -circle, lo), np.where(cut, circle, hi)

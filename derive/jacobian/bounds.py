@@ -51,8 +51,7 @@ def refuse_jumps(model: Plant, outputs: bool = False) -> None:
     surface agree, provably, on every surface by itself, with all switches that it moves together.
     A step of a discretisation is as continuous as the derivatives, wherever it evaluates them.
     """
-    kinds = ("x", "u", "d", "f", "w", "p", "rho")
-    box = {s.symbol: (s.lower, s.upper) for k in kinds for s in getattr(model, k)}
+    box = {s.symbol: (s.lower, s.upper) for s in model.signals}
     shown = [*zip(model.output_names, model.output, strict=True)] if outputs else []
     if model.continuous is not None:
         model, step = model.continuous, model
@@ -347,9 +346,8 @@ def jacobian_bounds(
 
 
 def _assemble(entries: MatrixEntries, ranges: Ranges, shape: tuple[int, int]) -> JacobianBounds:
-    filled = {
-        name: np.zeros(shape) for name in ("min", "max", "attained_min", "attained_max", "gap")
-    }
+    names = ("min", "max", "attained_min", "attained_max", "gap")
+    filled = {name: np.zeros(shape) for name in names}
     where = np.full((*shape, 2, len(entries.names)), np.nan)
     # NumPy would fill with plain text
     status = np.array([Status.EXACT] * (shape[0] * shape[1]), dtype=object).reshape(shape)
@@ -366,9 +364,8 @@ def _assemble(entries: MatrixEntries, ranges: Ranges, shape: tuple[int, int]) ->
             low, high = enclose_number(entries.exact[place])
             reached, gap = (high, low), 2.0 * (high - low)
         bounds[place] = (low, high)
-        filled["min"][place], filled["max"][place] = low, high
-        filled["attained_min"][place], filled["attained_max"][place] = reached
-        filled["gap"][place] = gap
+        for name, value in zip(names, (low, high, *reached, gap), strict=True):
+            filled[name][place] = value
         where[place][0], where[place][1] = ranges.points_lower[k], ranges.points_upper[k]
         status[place] = judged[k]
     basis, dependences = find_dependences(
@@ -377,11 +374,7 @@ def _assemble(entries: MatrixEntries, ranges: Ranges, shape: tuple[int, int]) ->
     family = build_family(shape, basis, dependences, bounds, supports)
     varying = sum(1 for place in entries.places if supports[place])
     return JacobianBounds(
-        min=filled["min"],
-        max=filled["max"],
-        attained_min=filled["attained_min"],
-        attained_max=filled["attained_max"],
-        gap=filled["gap"],
+        **filled,
         attained_at=where,
         status=status,
         variables=entries.names,

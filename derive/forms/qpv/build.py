@@ -97,6 +97,5 @@ def prove_quadratic(plant: Augmented, layout: QPVLayout, matrix: sp.Matrix) -> F
     column = [sp.Integer(1), *x, *(a * b for a in x for b in x), *(v * a for v in u for a in x)]
     column += [*u, *rest]
     names = (*(s.name for s in plant.states), *model.output_names)
-    kinds = ("u", "p", "rho", "d", "f", "w")
-    signals = [*plant.states, *(s for k in kinds for s in getattr(model, k))]
+    signals = (*plant.states, *model.signals)
     return prove_rows(matrix, column, (*plant.rows, *plant.outputs), names, signals)

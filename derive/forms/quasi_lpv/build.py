@@ -153,6 +153,4 @@ def prove_form(
     back = deviations(model, centre)
     signals = [s.symbol for kind in "xudfw" for s in getattr(model, kind)]
     column = [*(back.get(s, s) for s in signals), sp.Integer(1)]
-    kinds = ("x", "u", "p", "rho", "d", "f", "w")
-    every = [s for kind in kinds for s in getattr(model, kind)]
-    return prove_rows(matrix, column, rows, row_names(model), every)
+    return prove_rows(matrix, column, rows, row_names(model), model.signals)

@@ -52,9 +52,7 @@ def bound_elements(
 class _Bounder:
     def __init__(self, model: Plant, known: Sequence[Known], more: Sequence[Signal]) -> None:
         self.model, self.more = model, more
-        kinds = ("x", "u", "p", "rho", "d", "f", "w")
-        signals = {s.symbol: s for kind in kinds for s in getattr(model, kind)}
-        signals |= {s.symbol: s for s in more}
+        signals = {s.symbol: s for s in (*model.signals, *more)}
         self.exact = {k.signal: k.ends[0] for k in known if k.exact}
         self.ends: dict[sp.Symbol, Ends | None] = {}
         for symbol, signal in signals.items():

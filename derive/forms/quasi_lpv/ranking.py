@@ -33,10 +33,8 @@ class Widths:
 
     def __init__(self, model: Plant, back: Mapping[sp.Symbol, sp.Expr], effort: str) -> None:
         self.model, self.back, self.effort = model, back, effort
-        kinds = ("x", "u", "p", "rho", "d", "f", "w")
-        signals = [s for k in kinds for s in getattr(model, k)]
-        self.bounded = {s.symbol: s.bounded for s in signals}
-        box = {s.symbol: (s.lower, s.upper) for s in signals}
+        self.bounded = {s.symbol: s.bounded for s in model.signals}
+        box = {s.symbol: (s.lower, s.upper) for s in model.signals}
         centre = {s: float((s - back[s]) if s in back else 0) for s in box}
         self.inside = {s for s, (low, high) in box.items() if low <= centre[s] <= high}
         self.known: dict[sp.Expr, float] = {}
