@@ -182,56 +182,43 @@ class QPV(VaryingForm):
         return f"QPV({self.model.name!r}, states {', '.join(self.names)}, N {self.form_of_N})"
 
     def __str__(self) -> str:
-        return qpv_text(self)
+        time = "x+" if self.model.Ts is not None else "x'"
+        lines = [
+            f"{self.model.name}: {time} = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + ...; "
+            f"x = ({', '.join(self.names)}), N {self.form_of_N}"
+        ]
+        x, u = sp.Matrix([s.symbol for s in self.plant.states]), [s.symbol for s in self.model.u]
+        for i, name in enumerate(self.names):
+            products = (s * (part[i, :] * x)[0] for s, part in zip(u, self.M, strict=True))
+            parts = [p for p in ((x.T * self.N[i] * x)[0], sum(products, sp.Integer(0))) if p != 0]
+            if parts:
+                listed = " + ".join(sp.sstr(short(p)) for p in parts).replace("+ -", "- ")
+                lines.append(f"  {name}: {listed}")
+        lines += [f"  scheduling {v}" for v in self.scheduling]
+        lines.append(str(self.proof))
+        return "\n".join(lines)
 
     def _repr_latex_(self) -> str:
-        return f"$${qpv_latex(self)}$$"
+        blocks: list[tuple[str, sp.Matrix]] = [("c", self.c), ("A", self.A)]
+        blocks += [(f"N_{{{i + 1}}}", part) for i, part in enumerate(self.N)]
+        blocks += [(f"M_{{{j + 1}}}", part) for j, part in enumerate(self.M)]
+        blocks += [("B", self.B), ("D", self.D), ("B_f", self.B_f), ("G", self.G)]
+        blocks += [("C", self.C), ("D_f", self.D_f), ("H", self.H)]
+        rows = [
+            f"{name} &= {sp.latex(sp.Matrix(part).applyfunc(short))}"
+            for name, part in blocks
+            if any(entry != 0 for entry in part)
+        ]
+        return f"$${aligned(rows)}$$"
 
     def _repr_html_(self) -> str:
-        return qpv_html(self)
-
-
-def qpv_text(form: QPV) -> str:
-    """Return a quadratic form as plain text."""
-    time = "x+" if form.model.Ts is not None else "x'"
-    lines = [
-        f"{form.model.name}: {time} = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + ...; "
-        f"x = ({', '.join(form.names)}), N {form.form_of_N}"
-    ]
-    x, u = sp.Matrix([s.symbol for s in form.plant.states]), [s.symbol for s in form.model.u]
-    for i, name in enumerate(form.names):
-        products = (s * (part[i, :] * x)[0] for s, part in zip(u, form.M, strict=True))
-        parts = [p for p in ((x.T * form.N[i] * x)[0], sum(products, sp.Integer(0))) if p != 0]
-        if parts:
-            listed = " + ".join(sp.sstr(short(p)) for p in parts).replace("+ -", "- ")
-            lines.append(f"  {name}: {listed}")
-    lines += [f"  scheduling {v}" for v in form.scheduling]
-    lines.append(str(form.proof))
-    return "\n".join(lines)
-
-
-def qpv_latex(form: QPV) -> str:
-    r"""Return the matrices of a quadratic form as LaTeX."""
-    blocks: list[tuple[str, sp.Matrix]] = [("c", form.c), ("A", form.A)]
-    blocks += [(f"N_{{{i + 1}}}", part) for i, part in enumerate(form.N)]
-    blocks += [(f"M_{{{j + 1}}}", part) for j, part in enumerate(form.M)]
-    blocks += [("B", form.B), ("D", form.D), ("B_f", form.B_f), ("G", form.G)]
-    blocks += [("C", form.C), ("D_f", form.D_f), ("H", form.H)]
-    rows = [
-        f"{name} &= {sp.latex(sp.Matrix(part).applyfunc(short))}"
-        for name, part in blocks
-        if any(entry != 0 for entry in part)
-    ]
-    return aligned(rows)
-
-
-def qpv_html(form: QPV) -> str:
-    """Return a quadratic form for a notebook."""
-    states = [(s.name, str(s.role), f"{s.lower:.6g}", f"{s.upper:.6g}") for s in form.plant.states]
-    scheduling = "".join(f"<li>{escape(str(v))}</li>" for v in form.scheduling)
-    head, *_ = qpv_text(form).split("\n")
-    return (
-        f"<p><b>{escape(head)}</b></p><div>$${escape(qpv_latex(form), quote=False)}$$</div>"
-        f"{html_table(('state', 'role', 'min', 'max'), states)}"
-        f"<ul>{scheduling}<li>{escape(str(form.proof))}</li></ul>"
-    )
+        states = [
+            (s.name, str(s.role), f"{s.lower:.6g}", f"{s.upper:.6g}") for s in self.plant.states
+        ]
+        scheduling = "".join(f"<li>{escape(str(v))}</li>" for v in self.scheduling)
+        head, *_ = str(self).split("\n")
+        return (
+            f"<p><b>{escape(head)}</b></p><div>{escape(self._repr_latex_(), quote=False)}</div>"
+            f"{html_table(('state', 'role', 'min', 'max'), states)}"
+            f"<ul>{scheduling}<li>{escape(str(self.proof))}</li></ul>"
+        )

@@ -7,7 +7,8 @@ import sympy as sp
 
 from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, Ranging, linear_layout
+from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, linear_layout
+from obsynth.derive.forms.quasi_lpv.interval_form import Ranging
 from obsynth.derive.forms.quasi_lpv.options import Option
 from obsynth.derive.forms.quasi_lpv.ranking import choose
 from obsynth.derive.forms.quasi_lpv.terms import (

@@ -12,7 +12,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from obsynth.derive.forms.measured import read_measured
-from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, make_interval_form
+from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, Ranging, make_interval_form
 from obsynth.derive.forms.quasi_lpv.polytopic import (
     CentredForm,
     PolytopicForm,
@@ -20,7 +20,7 @@ from obsynth.derive.forms.quasi_lpv.polytopic import (
 )
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
 from obsynth.derive.forms.quasi_lpv.terms import Centre
-from obsynth.derive.forms.scheduling import Lift, SchedulingVariable
+from obsynth.derive.forms.scheduling import SchedulingVariable
 from obsynth.derive.forms.varying import Layout, VaryingForm, short
 from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.display import aligned, html_table
@@ -37,20 +37,12 @@ def linear_layout(model: Plant) -> Layout:
     return Layout((dynamics, outputs), (widths["x"], len(model.output_names)), widths)
 
 
-@dataclass(frozen=True, eq=False)
-class Ranging:
-    """How ranges of the entries of a form are found.
-
-    matrix: the stacked matrix with symbols in place of the lifted secants
-    lifts: these symbols, with the ranges of the derivatives whose means they are
-    rtol: wanted gap
-    effort: of the interval engine
-    """
-
-    matrix: sp.Matrix
-    lifts: tuple[Lift, ...]
-    rtol: float
-    effort: str
+_LONGEST = 60
+UNMEASURED_NOTE = (
+    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
+    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
+    "for every value (vertices, interval)."
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,7 +186,7 @@ class QuasiLPV(VaryingForm):
             used = {s for block in blocks.values() for s in block.free_symbols}
             used |= {s for lift in way.lifts for s in lift.meaning.free_symbols}
             known = tuple(k for k in known if k.signal in used)
-        return make_interval_form(blocks, self.model, known, way.lifts, way.rtol, way.effort)
+        return make_interval_form(blocks, self.model, known, way)
 
     def function(self) -> ca.Function:
         """Return the matrices as a CasADi function.
@@ -213,113 +205,88 @@ class QuasiLPV(VaryingForm):
         return f"QuasiLPV({self.model.name!r}, {len(self.scheduling)} scheduling variables)"
 
     def __str__(self) -> str:
-        return form_text(self)
+        names = self.model.names("x")
+        lines = [self._title()]
+        for block, columns in (("A", names), ("B", self.model.names("u"))):
+            place = self.layout.place(block)
+            matrix = self.scheduled[place]
+            for i, row in enumerate(names):
+                entries = [
+                    f"{column}: {sp.sstr(short(matrix[i, j]))}"
+                    for j, column in enumerate(columns)
+                    if matrix[i, j] != 0
+                ]
+                if entries:
+                    lines.append(f"  {block}, row of {row}: {'; '.join(entries)}")
+        offset = self.scheduled[self.layout.place("offset")]
+        if any(e != 0 for e in offset):
+            listed = ", ".join(sp.sstr(short(e)) for e in offset)
+            lines.append(f"  offset: ({listed})")
+        lines.append("scheduling" if self.scheduling else "no scheduling: the form is linear")
+        lines += [f"  {v}" for v in self.scheduling]
+        lines += self.notes()
+        return "\n".join(lines)
+
+    def _title(self) -> str:
+        time = "x+" if self.model.Ts is not None else "x'"
+        if self.centre.is_origin:
+            return f"{self.model.name}: {time} = A x + B u + ... + offset"
+        return f"{self.model.name}: {time} = A (x - x_c) + B (u - u_c) + ... + offset"
+
+    def notes(self) -> list[str]:
+        """List what a user has to know: choices, terms left over, measurement, proof."""
+        result = []
+        for ranking in self.ranking:
+            if ranking.total > 1:
+                result.append(f"row of {ranking.row}: {ranking.total} ways, chosen is")
+                result.append(f"  {ranking.alternatives[0]}")
+        for row, term, reason in self.unfactored:
+            text = sp.sstr(short(term))
+            text = text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+            result.append(f"the term {text} in the row of {row} stays in the offset: {reason}")
+        lost = self.unmeasured
+        if lost:
+            result.append(f"unmeasured scheduling: {', '.join(str(v.symbol) for v in lost)}")
+            result.append(UNMEASURED_NOTE)
+        result.append(str(self.proof))
+        return result
 
     def _repr_latex_(self) -> str:
-        return f"$${form_latex(self)}$$"
+        rows = []
+        for name, label in (("A", "A"), ("B", "B"), ("offset", "r")):
+            matrix = self.scheduled[self.layout.place(name)]
+            if matrix.cols and any(e != 0 for e in matrix):
+                rows.append(f"{label} &= {sp.latex(sp.Matrix(matrix).applyfunc(short))}")
+        for v in self.scheduling:
+            own = "" if v.symbol == v.expression else f"= {sp.latex(short(v.expression))} "
+            rows.append(f"{sp.latex(v.symbol)} &{own}\\in [{v.lower:.6g},\\, {v.upper:.6g}]")
+        return f"$${aligned(rows)}$$"
 
     def _repr_html_(self) -> str:
-        return form_html(self)
-
-
-_LONGEST = 60
-UNMEASURED_NOTE = (
-    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
-    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
-    "for every value (vertices, interval)."
-)
-
-
-def form_text(form: QuasiLPV) -> str:
-    """Return a form as plain text."""
-    names = form.model.names("x")
-    lines = [_title(form)]
-    for block, columns in (("A", names), ("B", form.model.names("u"))):
-        place = form.layout.place(block)
-        matrix = form.scheduled[place]
-        for i, row in enumerate(names):
-            entries = [
-                f"{column}: {sp.sstr(short(matrix[i, j]))}"
-                for j, column in enumerate(columns)
-                if matrix[i, j] != 0
-            ]
-            if entries:
-                lines.append(f"  {block}, row of {row}: {'; '.join(entries)}")
-    offset = form.scheduled[form.layout.place("offset")]
-    if any(e != 0 for e in offset):
-        listed = ", ".join(sp.sstr(short(e)) for e in offset)
-        lines.append(f"  offset: ({listed})")
-    lines.append("scheduling" if form.scheduling else "no scheduling: the form is linear")
-    lines += [f"  {v}" for v in form.scheduling]
-    lines += notes(form)
-    return "\n".join(lines)
-
-
-def notes(form: QuasiLPV) -> list[str]:
-    """List what a user has to know about a form: choices, terms left over, measurement, proof."""
-    result = []
-    for ranking in form.ranking:
-        if ranking.total > 1:
-            result.append(f"row of {ranking.row}: {ranking.total} ways, chosen is")
-            result.append(f"  {ranking.alternatives[0]}")
-    for row, term, reason in form.unfactored:
-        text = sp.sstr(short(term))
-        text = text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
-        result.append(f"the term {text} in the row of {row} stays in the offset: {reason}")
-    lost = form.unmeasured
-    if lost:
-        result.append(f"unmeasured scheduling: {', '.join(str(v.symbol) for v in lost)}")
-        result.append(UNMEASURED_NOTE)
-    result.append(str(form.proof))
-    return result
-
-
-def _title(form: QuasiLPV) -> str:
-    time = "x+" if form.model.Ts is not None else "x'"
-    if form.centre.is_origin:
-        return f"{form.model.name}: {time} = A x + B u + ... + offset"
-    return f"{form.model.name}: {time} = A (x - x_c) + B (u - u_c) + ... + offset"
-
-
-def form_latex(form: QuasiLPV) -> str:
-    r"""Return the matrices of a form in their scheduling variables, as LaTeX."""
-    rows = []
-    for name, label in (("A", "A"), ("B", "B"), ("offset", "r")):
-        matrix = form.scheduled[form.layout.place(name)]
-        if matrix.cols and any(e != 0 for e in matrix):
-            rows.append(f"{label} &= {sp.latex(sp.Matrix(matrix).applyfunc(short))}")
-    for v in form.scheduling:
-        own = "" if v.symbol == v.expression else f"= {sp.latex(short(v.expression))} "
-        rows.append(f"{sp.latex(v.symbol)} &{own}\\in [{v.lower:.6g},\\, {v.upper:.6g}]")
-    return aligned(rows)
-
-
-def form_html(form: QuasiLPV) -> str:
-    """Return a form for a notebook: matrices, scheduling table, ranking, notes."""
-    heads = ("variable", "function", "min", "max", "range", "known on line")
-    variables = [
-        (
-            str(v.symbol),
-            sp.sstr(short(v.expression)),
-            f"{v.lower:.8g}",
-            f"{v.upper:.8g}",
-            v.status.word,
-            "measured" if v.measured else f"needs {', '.join(v.unmeasured)}",
+        heads = ("variable", "function", "min", "max", "range", "known on line")
+        variables = [
+            (
+                str(v.symbol),
+                sp.sstr(short(v.expression)),
+                f"{v.lower:.8g}",
+                f"{v.upper:.8g}",
+                v.status.word,
+                "measured" if v.measured else f"needs {', '.join(v.unmeasured)}",
+            )
+            for v in self.scheduling
+        ]
+        ranked = [
+            (r.row, str(k + 1), a.ways, f"{a.inflation:.4g}", ", ".join(a.unmeasured))
+            for r in self.ranking
+            if r.total > 1
+            for k, a in enumerate(r.alternatives)
+        ]
+        listed = "".join(f"<li>{escape(note)}</li>" for note in self.notes())
+        table = html_table(heads, variables) if variables else ""
+        columns = ("row", "rank", "term by divisor", "inflation", "unmeasured")
+        ranking = html_table(columns, ranked) if ranked else ""
+        latex = escape(self._repr_latex_(), quote=False)
+        return (
+            f"<p><b>{escape(self._title())}</b></p><div>{latex}</div>{table}"
+            f"<ul>{listed}</ul>{ranking}"
         )
-        for v in form.scheduling
-    ]
-    ranked = [
-        (r.row, str(k + 1), a.ways, f"{a.inflation:.4g}", ", ".join(a.unmeasured))
-        for r in form.ranking
-        if r.total > 1
-        for k, a in enumerate(r.alternatives)
-    ]
-    listed = "".join(f"<li>{escape(note)}</li>" for note in notes(form))
-    table = html_table(heads, variables) if variables else ""
-    columns = ("row", "rank", "term by divisor", "inflation", "unmeasured")
-    ranking = html_table(columns, ranked) if ranked else ""
-    latex = escape(form_latex(form), quote=False)
-    return (
-        f"<p><b>{escape(_title(form))}</b></p><div>$${latex}$$</div>{table}"
-        f"<ul>{listed}</ul>{ranking}"
-    )

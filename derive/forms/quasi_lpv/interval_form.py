@@ -25,6 +25,22 @@ _BLOCKS = ("A", "B", "offset")
 
 
 @dataclass(frozen=True, eq=False)
+class Ranging:
+    """How ranges of the entries of a form are found.
+
+    matrix: the stacked matrix with symbols in place of the lifted secants
+    lifts: these symbols, with the ranges of the derivatives whose means they are
+    rtol: wanted gap
+    effort: of the interval engine
+    """
+
+    matrix: sp.Matrix
+    lifts: tuple[Lift, ...]
+    rtol: float
+    effort: str
+
+
+@dataclass(frozen=True, eq=False)
 class IntervalForm:
     """A_lower <= A(rho) <= A_upper elementwise, and the same for B and the offset.
 
@@ -172,33 +188,24 @@ class IntervalForm:
 
 
 def make_interval_form(
-    blocks: dict[str, sp.Matrix],
-    model: Plant,
-    known: tuple[Known, ...],
-    lifts: tuple[Lift, ...],
-    rtol: float,
-    effort: str,
+    blocks: dict[str, sp.Matrix], model: Plant, known: tuple[Known, ...], way: Ranging
 ) -> IntervalForm:
     """Bound the blocks of a form elementwise."""
     if not known:
-        return _constant_form(blocks, model, lifts, rtol, effort)
+        return _constant_form(blocks, model, way)
     lower, upper, how = {}, {}, {}
     for name, block in blocks.items():
         places = {(i, j): block[i, j] for i in range(block.rows) for j in range(block.cols)}
-        found = bound_elements(places, model, known, [lift.signal for lift in lifts])
+        found = bound_elements(places, model, known, [lift.signal for lift in way.lifts])
         lower[name] = sp.ImmutableMatrix(*block.shape, list(found.lower.values()))
         upper[name] = sp.ImmutableMatrix(*block.shape, list(found.upper.values()))
         how[name] = np.array(list(found.how.values()), dtype=object).reshape(block.shape)
-    domain = np.array([(k.lower, k.upper) for k in known], dtype=float).reshape(-1, 2)
-    arguments = [k.argument for k in known]
-    minimum = {n: _extremes(m, arguments, domain, rtol, effort)[0] for n, m in lower.items()}
-    maximum = {n: _extremes(m, arguments, domain, rtol, effort)[1] for n, m in upper.items()}
+    minimum = {n: _extremes(m, known, way)[0] for n, m in lower.items()}
+    maximum = {n: _extremes(m, known, way)[1] for n, m in upper.items()}
     return IntervalForm(known, lower, upper, how, minimum, maximum)
 
 
-def _constant_form(
-    blocks: dict[str, sp.Matrix], model: Plant, lifts: tuple[Lift, ...], rtol: float, effort: str
-) -> IntervalForm:
+def _constant_form(blocks: dict[str, sp.Matrix], model: Plant, way: Ranging) -> IntervalForm:
     minimum, maximum, how = {}, {}, {}
     for name, block in blocks.items():
         low, high = np.zeros(block.shape), np.zeros(block.shape)
@@ -209,9 +216,9 @@ def _constant_form(
                     varying[(i, j)] = block[i, j]
                 else:
                     low[i, j], high[i, j] = enclose_number(block[i, j])
-        entries = matrix_entries(varying, model, [lift.signal for lift in lifts])
+        entries = matrix_entries(varying, model, [lift.signal for lift in way.lifts])
         if entries.places:
-            found = entries.ranges(rtol, effort, name)
+            found = entries.ranges(way.rtol, way.effort, name)
             for k, place in enumerate(entries.places):
                 low[place], high[place] = found.lower[k], found.upper[k]
         minimum[name], maximum[name] = low, high
@@ -228,13 +235,12 @@ def _constant_form(
     return IntervalForm((), lower, upper, how, minimum, maximum)
 
 
-def _extremes(
-    matrix: sp.Matrix, arguments: list[sp.Symbol], domain: FloatArray, rtol: float, effort: str
-) -> Bounds:
-    symbols = [ca.SX.sym(str(a)) for a in arguments]
-    table = dict(zip(arguments, symbols, strict=True))
+def _extremes(matrix: sp.Matrix, known: tuple[Known, ...], way: Ranging) -> Bounds:
+    table = {k.argument: ca.SX.sym(str(k.argument)) for k in known}
+    domain: FloatArray = np.array([(k.lower, k.upper) for k in known], dtype=float)
     rows = to_sx(list(matrix), table, ["a bound"] * len(matrix))
     if not rows:
         return np.zeros(matrix.shape), np.zeros(matrix.shape)
-    found = bound_ranges(column(rows), column(symbols), domain, rtol=rtol, effort=effort)
+    symbols = column(list(table.values()))
+    found = bound_ranges(column(rows), symbols, domain, rtol=way.rtol, effort=way.effort)
     return found.lower.reshape(matrix.shape), found.upper.reshape(matrix.shape)
