@@ -1,7 +1,7 @@
 """Scenarios: what happens to a plant, as a value that simulation only runs."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -249,6 +249,12 @@ class Scenario:
             raise PlantError(f"scenario {self.name!r}: {field} holds non-finite data", field=field)
         array.flags.writeable = False
         return array
+
+
+def known_name(name: str, known: Sequence[str], who: str) -> None:
+    """Refuse a name that no scenario of a plant has."""
+    if name not in known:
+        raise PlantError(f"scenario {name!r} is unknown; {who} {', '.join(known)}", name=name)
 
 
 def _needed(function: Callable[..., Any], unknown: int = 1) -> int:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -121,18 +121,18 @@ class _Notes:
     def __init__(self) -> None:
         self.checks: list[Check] = []
 
-    def step(self, title: str, action: Callable[[], tuple[T, str]]) -> T | None:
+    def step(self, title: str, action: Callable[..., tuple[T, str]], *given: Any) -> T | None:
         try:
-            value, text = action()
+            value, text = action(*given)
         except ObsynthError as error:
             self.checks.append(Check(title, False, str(error)))
             return None
         self.checks.append(Check(title, True, text))
         return value
 
-    def note(self, title: str, action: Callable[[], tuple[bool | None, str]]) -> None:
+    def note(self, title: str, action: Callable[..., tuple[bool | None, str]], *given: Any) -> None:
         try:
-            self.checks.append(Check(title, *action()))
+            self.checks.append(Check(title, *action(*given)))
         except ObsynthError as error:
             self.checks.append(Check(title, False, str(error)))
 
@@ -175,33 +175,31 @@ def analyse(model_or_split: Plant | Split) -> StructureReport:
         notes.inform("signals", _signals(model))
         general = None
         if model.Ts is not None:
-            general = notes.step("general class", lambda: _follow(model))
-        part = notes.step("split", lambda: _split(model))
+            general = notes.step("general class", _follow, model)
+        part = notes.step("split", _split, model)
         if part is None and general is not None:
             text = notes.checks.pop().text
             notes.inform("split", f"not of the class of the papers: {text}")
     if model.f:
-        notes.note("single faults", lambda: _isolate(model))
+        notes.note("single faults", _isolate, model)
         notes.note("excitation", lambda: (None, str(excitation(model))))
     if part is None:
         return StructureReport(model.name, tuple(notes.checks), None, None)
-    found = part
-    _point(notes, found.at, model)
-    decoupling = notes.step("unknown inputs", lambda: _decouple(found))
-    bounds = notes.step("Jacobian bounds", lambda: _bounds(found))
+    _point(notes, part.at, model)
+    decoupling = notes.step("unknown inputs", _decouple, part)
+    bounds = notes.step("Jacobian bounds", _bounds, part)
     if bounds is None:
-        return StructureReport(model.name, tuple(notes.checks), found, None)
-    family = bounds
-    kind = "exact" if family.family.exact else "outer"
-    reasons = "\n".join(str(d) for d in family.dependences if d.coefficients)
-    text = f"{family.family.vertex_count} ({kind}) in place of {family.naive_vertex_count}"
+        return StructureReport(model.name, tuple(notes.checks), part, None)
+    reasons = "\n".join(str(d) for d in bounds.dependences if d.coefficients)
+    kind = "exact" if bounds.family.exact else "outer"
+    text = f"{bounds.family.vertex_count} ({kind}) in place of {bounds.naive_vertex_count}"
     notes.inform("vertices", text + (f":\n{reasons}" if reasons else ""))
     if decoupling is not None:
-        notes.step("detectability", lambda: _detect(found, family))
-        _look_at_family(notes, found, family)
+        notes.step("detectability", _detect, part, bounds)
+        _look_at_family(notes, part, bounds)
     if model.names("f"):
-        _separate(notes, found, family)
-    return StructureReport(model.name, tuple(notes.checks), found, family)
+        _separate(notes, part, bounds)
+    return StructureReport(model.name, tuple(notes.checks), part, bounds)
 
 
 def _split(model: Plant) -> tuple[Split, str]:
@@ -265,19 +263,19 @@ def _look_at_family(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:
     if count > _MOST_VERTICES:
         notes.inform("zeros at vertices", f"not looked at: the family has {count} vertices")
         return
-
-    def unknown() -> tuple[bool, str]:
-        found = zeros_over_polytope(part, bounds, "unknown")
-        return found.decays, str(found)
-
     if part.model.d:
-        notes.note("zeros of unknown inputs", unknown)
+        notes.note("zeros of unknown inputs", _unknown_zeros, part, bounds)
     if part.model.f:
         notes.note(
             "zeros with faults", lambda: (None, str(zeros_over_polytope(part, bounds, "all")))
         )
     if count > 1:
         notes.note("weakest member", lambda: (None, str(weakest_member(part, bounds))))
+
+
+def _unknown_zeros(part: Split, bounds: JacobianBounds) -> tuple[bool, str]:
+    found = zeros_over_polytope(part, bounds, "unknown")
+    return found.decays, str(found)
 
 
 def _separate(notes: _Notes, part: Split, bounds: JacobianBounds) -> None:

@@ -4,8 +4,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.scenario import Scenario
+from obsynth.symbolic.scenario import Scenario, known_name
 
 _NAMES = ("nominal", "disturbed", "noise")
 
@@ -36,11 +35,7 @@ def hinf_example(name: Literal["nominal", "disturbed", "noise"] = "nominal") -> 
     >>> hinf_example().faults[[199, 200, 300, 301], 0].tolist()
     [0.0, 1.0, 1.0, 0.0]
     """
-    if name not in _NAMES:
-        raise PlantError(
-            f"scenario {name!r} is unknown; the H-infinity example has {', '.join(_NAMES)}",
-            name=name,
-        )
+    known_name(name, _NAMES, "the H-infinity example has")
     steps = 500
     k = np.arange(steps + 1, dtype=np.float64)
     waves = np.column_stack([np.sin(1.3 * k), np.cos(2.1 * k), np.sin(0.7 * k + 1.0)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.scenario import Scenario
+from obsynth.symbolic.scenario import Scenario, known_name
 
 Name = Literal["FS0", "FS1", "FS2", "Fig. 7", "SC"]
 
@@ -63,10 +63,7 @@ def qpv_example(
     >>> scenario.steps, [round(f, 3) for f in scenario.faults(6900)]
     (18000, [-0.095, 0.022, 0.0])
     """
-    if name not in _NAMES:
-        raise PlantError(
-            f"scenario {name!r} is unknown; the QPV example has {', '.join(_NAMES)}", name=name
-        )
+    known_name(name, _NAMES, "the QPV example has")
     if not (0.0 < Ts < duration < math.inf):
         raise PlantError(
             f"Ts = {Ts} s and duration = {duration} s: a positive step shorter than the whole",

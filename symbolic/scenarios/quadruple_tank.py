@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.scenario import Scenario
+from obsynth.symbolic.scenario import Scenario, known_name
 
 _NAMES = ("FS1", "FS2")
 
@@ -35,10 +34,7 @@ def quadruple_tank(name: str = "FS1") -> Scenario:
     >>> quadruple_tank("FS2").faults[2000].tolist()
     [-5.0, 5.0]
     """
-    if name not in _NAMES:
-        raise PlantError(
-            f"scenario {name!r} is unknown; the quadruple tank has {', '.join(_NAMES)}", name=name
-        )
+    known_name(name, _NAMES, "the quadruple tank has")
     steps = 5000
     k = np.arange(steps + 1, dtype=np.float64)
     profile = _profile(k)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.noise import bounded_noise
-from obsynth.symbolic.scenario import Scenario
+from obsynth.symbolic.scenario import Scenario, known_name
 
 _NAMES = ("faults", "fault free")
 _BOUND = 4.5e-3
@@ -59,10 +59,7 @@ def three_tanks(
     >>> scenario.steps, scenario.faults[[19999, 20000, 30000]].tolist()
     (32000, [[0.0, 0.0], [8e-05, 0.0], [8e-05, 6e-05]])
     """
-    if name not in _NAMES:
-        raise PlantError(
-            f"scenario {name!r} is unknown; the three tanks have {', '.join(_NAMES)}", name=name
-        )
+    known_name(name, _NAMES, "the three tanks have")
     steps = round(end / Ts)
     if steps < 1 or abs(steps * Ts - end) > 1e-9 * end:
         raise PlantError(f"end={end} is not a multiple of Ts={Ts}", end=end, Ts=Ts)
