@@ -291,7 +291,7 @@ def least_bounds(
     --------
     >>> from obsynth import least_bounds, plants, records
     >>> fit = least_bounds(plants.leaking_tanks(), records.three_tank_leak())
-    >>> fit.lower < fit.upper < 1.001 * fit.lower
+    >>> fit.lower < fit.upper < 1.01 * fit.lower
     True
     """
     problem = pose(plant, record, free, groups)
