@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.comparison import find_voids
 from obsynth.evaluate.choosing.tries import Try
+from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, new_figure, style
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
@@ -142,6 +143,9 @@ class Choice:
             f"{best.operations} operations a step."
         )
         said += " Its intervals of faults hold means over time." if best.means else ""
+        if isinstance(best.run, Estimate):
+            verdict = best.run.verdict
+            said += f" {verdict[0].upper()}{verdict[1:]}."
         if self.says_nothing(best):
             said += " They say hardly more than the declared ranges."
         others = ", ".join(o.name for o in self.made if o is not best and self.says_nothing(o))

@@ -419,9 +419,13 @@ class Estimate:
         lead = str(compare_with(self, None, channels)) if channels else ""
         return report(path, self.observer, self, lead=lead)
 
+    @property
+    def verdict(self) -> str:
+        """Whether the record refutes the assumptions, in a sentence."""
+        return str(self.refuted or f"nothing in {self.record.source} refutes the assumptions")
+
     def __repr__(self) -> str:
-        said = str(self.refuted or "nothing refutes the assumptions")
-        return f"<Estimate by {self.method} on {self.record.source!r}, {said}>"
+        return f"<Estimate by {self.method} on {self.record.source!r}, {self.verdict}>"
 
     def __str__(self) -> str:
         return str(self.summary())

@@ -211,10 +211,12 @@ def test_a_record_takes_the_place_of_the_simulation():
     found = ob.choose(PLANT, record, methods=[ob.IntervalObserver()], limit=None)
     assert "three_tank_leak.csv, 181 instants" in found.table.title
     assert found.tries[0].missed is None
+    assert "Nothing in three_tank_leak.csv refutes the assumptions." in found.reason
     assert np.median(found.tries[0].half_widths[:, 3]) == pytest.approx(0.01585, rel=2e-3)
     broken = replace(record, y=record.y + [[0.3, 0, 0]] * (record.time == 100)[:, None])
     void = ob.choose(PLANT, broken, methods=[ob.IntervalObserver()], limit=None)
     assert "void at 1 calls, which contradicts the assumptions" in str(void.table)
+    assert "The record refutes the assumptions at k = 64 (100 s): " in void.reason
     turned = replace(record, names={**record.names, "y": ("y2", "y1", "y3")})
     with pytest.raises(ob.SimulationError, match=r"y2, y1, y3 as y; .* has y1, y2, y3"):
         ob.choose(PLANT, turned)

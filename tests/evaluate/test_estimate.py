@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from records import damaged_record
 
 import obsynth as ob
 from methods import METHODS, observer_of, run_of
@@ -297,7 +298,10 @@ def test_what_is_shown(told, tmp_path):
     mpl.use("agg")
     page = told.report(tmp_path / "page.html", leak=("pulses", "rate")).read_text()
     assert "Records" in page and "100 % inside" in page and "src=" not in page
-    assert "nothing refutes" in repr(told) and "certain from [s]" in told._repr_html_()
+    assert (
+        "nothing in three_tank_leak.csv refutes" in repr(told)
+        and "certain from [s]" in told._repr_html_()
+    )
     assert [ax.get_ylabel() for ax in told.plot()] == ["e1 [V]", "h2 [V]", "e3 [V]", "leak [V/s]"]
     ob.plot_signal(told, "leak")
     numbers = json.loads(json.dumps(told.to_dict(), allow_nan=False))
@@ -325,3 +329,40 @@ def test_a_million_samples_are_estimated_and_written_in_a_minute():
     )
     _, seconds, mebibytes = done.stdout.split()[:3]
     assert float(seconds) < 60 and float(mebibytes) < 1024
+
+
+def test_the_estimate_goes_on_over_damage_and_sets_come_back():
+    """A channel missing for a while, two gaps, a stuck sensor, an outlier.
+
+    Mutants: an instant without a row left out of the estimate; readings that are left out used.
+    """
+    damaged = damaged_record()
+    record, k = damaged.record, np.arange(len(damaged.record))
+    observer = ob.IntervalObserver().design(damaged.plant)
+    told = ob.estimate(observer, record)
+    stuck, outlier = damaged.stuck[1], damaged.outlier[1]
+    assert stuck.start <= told.refuted.instant < stuck.stop and told.refuted.signals == ("y2",)
+    void = np.flatnonzero(told.status & STATUS["void"])
+    assert set(void) <= {*k[stuck], stuck.stop, outlier} and outlier in void
+    inside = np.all((told.x_lower <= damaged.x) & (damaged.x <= told.x_upper), axis=1)
+    sound = (k < stuck.start) | (k > stuck.stop + observer.certificate.design.options["recovery"])
+    assert inside[sound].all() and not inside.all()
+    quiet = np.zeros(len(k), dtype=bool)
+    for gap in (*damaged.gaps, damaged.missing[1]):
+        quiet[gap] = True
+    assert np.array_equal(told.status & STATUS["measurement_left_out"] > 0, quiet)
+    assert not np.any(told.status & STATUS["non_finite_input"])
+    half = told.x_upper - told.x_lower
+    last = damaged.gaps[0].stop
+    assert np.all(half[last - 1] > half[last + 3]) and np.isfinite(half).all()
+    assert np.all(np.median(half[-40:], axis=0) <= 1.5 * np.median(half[:80], axis=0))
+    for finding in record.findings():
+        record = record if finding.kind == "missing" else record.without(finding)
+    mended = ob.estimate(observer, record)
+    assert mended.refuted is None and mended.consistent == 1.0
+    assert np.all((mended.x_lower <= damaged.x) & (damaged.x <= mended.x_upper))
+    assert np.all(mended.f_lower[1:] <= damaged.f[:-1]) and np.any(mended.f_upper[1:] < 0)
+    assert np.all(damaged.f[:-1] <= mended.f_upper[1:])
+    assert mended.alarms()["f"][0] > 200
+    again = ob.estimate(observer, damaged.source, map={"v": "pump"})
+    assert np.array_equal(again.f_lower, told.f_lower) and again.record.notes == record.notes[:6]
