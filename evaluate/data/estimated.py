@@ -14,7 +14,7 @@ from obsynth.designs.core.observer import STATUS
 from obsynth.designs.detection.comparison import find_voids, list_voids
 from obsynth.designs.detection.detector import SKIPPED, core_of
 from obsynth.evaluate.data.allowed import allowed
-from obsynth.evaluate.data.meter import Comparison, compare_with
+from obsynth.evaluate.data.meter import compare
 from obsynth.evaluate.data.tables import to_dataset, write_columns
 from obsynth.evaluate.domain import count_status
 from obsynth.evaluate.errors import SimulationError
@@ -44,9 +44,8 @@ class Refutation:
     why: str
 
     def __str__(self) -> str:
-        return f"the record refutes the assumptions at k = {self.instant} ({self.time:g} s): " + (
-            self.why
-        )
+        at = f"k = {self.instant} ({self.time:g} s)"
+        return f"the record refutes the assumptions at {at}: {self.why}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,7 +56,8 @@ class Estimate:
     ----------
     observer : Observer or FaultDetector
     record : Record
-        With ``time``, ``u``, ``y``, which the estimate has too.
+    time (or t), u, rho, y, reference : (N,), (N, channels)
+        Those of the record.
     xhat, fhat, x_lower, x_upper, f_lower, f_upper : (N, n or n_f)
         What ``observer.step`` returned at that instant; with ``fault_delay = 1`` the fault columns
         at k speak of instant k - 1, and ``estimate[name]`` aligns them.
@@ -72,6 +72,10 @@ class Estimate:
         over the m instants before that of the row, whatever the course of the fault.
     blamed : tuple of str
         Outputs without each of which the first void instant would not be void.
+    names, units : dict
+        By group: "x", "f" and those of the record; ``estimated`` are states, then faults.
+    fault_delay, method, scenario : int and str
+        Of the observer; the source of the record.
     """
 
     observer: Any
@@ -89,65 +93,29 @@ class Estimate:
     mean_status: IntArray | None = None
     blamed: tuple[str, ...] = ()
     means: Mapping[int, Mapping[str, Trace]] = field(default_factory=dict)
+    time: FloatArray = field(init=False)
+    t: FloatArray = field(init=False)
+    u: FloatArray = field(init=False)
+    rho: FloatArray = field(init=False)
+    y: FloatArray = field(init=False)
+    reference: FloatArray = field(init=False)
+    names: Mapping[str, tuple[str, ...]] = field(init=False)
+    units: Mapping[str, tuple[str, ...]] = field(init=False)
+    estimated: tuple[str, ...] = field(init=False)
+    fault_delay: int = field(init=False)
+    method: str = field(init=False)
+    scenario: str = field(init=False)
 
-    @property
-    def time(self) -> FloatArray:
-        """Time in seconds, (N,)."""
-        return self.record.time
-
-    t = time
-
-    @property
-    def u(self) -> FloatArray:
-        """The inputs, (N, n_u)."""
-        return self.record.u
-
-    @property
-    def y(self) -> FloatArray:
-        """The readings, (N, m)."""
-        return self.record.y
-
-    @property
-    def rho(self) -> FloatArray:
-        """Measured scheduling, (N, channels)."""
-        return np.asarray(self.record.rho)
-
-    @property
-    def reference(self) -> FloatArray:
-        """The channels that no observer reads, (N, channels)."""
-        return self.record.reference
-
-    @cached_property
-    def names(self) -> Mapping[str, tuple[str, ...]]:
-        """Signal names by group: "x", "f" and those of the record."""
-        model = self.observer.model
-        return {"x": model.names("x"), "f": model.names("f"), **self.record.names}
-
-    @cached_property
-    def units(self) -> Mapping[str, tuple[str, ...]]:
-        """Their units."""
-        own = {k: tuple(s.unit for s in getattr(self.observer.model, k)) for k in ("x", "f")}
-        return {**own, **self.record.units}
-
-    @property
-    def fault_delay(self) -> int:
-        """How many samples the fault columns lag behind."""
-        return int(self.observer.fault_delay)
-
-    @property
-    def method(self) -> str:
-        """The name of the observer's method."""
-        return str(self.observer.method)
-
-    @property
-    def scenario(self) -> str:
-        """Where the record came from."""
-        return self.record.source
-
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        """Names of all signals with an estimate: states, then faults."""
-        return self.names["x"] + self.names["f"]
+    def __post_init__(self) -> None:
+        model, record = self.observer.model, self.record
+        own = {kind: tuple(s.unit for s in getattr(model, kind)) for kind in ("x", "f")}
+        names = {"x": model.names("x"), "f": model.names("f"), **record.names}
+        told = {group: getattr(record, group) for group in ("time", *record.names)}
+        told |= {"t": record.time, "names": names, "units": {**own, **record.units}}
+        told |= {"estimated": names["x"] + names["f"], "scenario": record.source}
+        told |= {name: getattr(self.observer, name) for name in ("fault_delay", "method")}
+        for name, value in told.items():
+            object.__setattr__(self, name, value)
 
     def __getitem__(self, name: str) -> Trace:
         return take(self, name)
@@ -257,12 +225,14 @@ class Estimate:
             return None
         k = int(both.min())
         if k in void:
-            told = ", ".join(self.blamed) or "no reading alone"
-            why = f"a set is empty or a reading impossible; without {told} it would not be"
-            why = why if self.blamed else "a set is empty whichever single reading is left out"
-            return Refutation(k, float(self.t[k]), self.blamed, why)
-        names = tuple(n for n, m in zip(self.estimated, self._missed[k], strict=True) if m)
-        why = f"the set of {', '.join(names)} misses the declared range"
+            names, alone = self.blamed, f"without {', '.join(self.blamed)} it would not be"
+            why = (
+                f"a set is empty or a reading impossible; {alone if names else 'not by one alone'}"
+            )
+        else:
+            missed = zip(self.estimated, self._missed[k], strict=True)
+            names = tuple(name for name, out in missed if out)
+            why = f"the set of {', '.join(names)} misses the declared range"
         return Refutation(k, float(self.t[k]), names, why)
 
     def alarms(self, persistence: int = 1) -> dict[str, IntArray]:
@@ -297,27 +267,7 @@ class Estimate:
             found[name] = at[at >= 0]
         return found
 
-    def compare(self, scale: float | None = None, **channels: tuple[str, str]) -> Comparison:
-        """Compare a state or a fault with a channel of the record that no observer reads.
-
-        Parameters
-        ----------
-        scale : float, optional
-            Units of the signal in a unit of the channel; by default least squares of the middles of
-            the intervals.
-        **channels
-            One signal with its channel: ``leak=("pulses", "rate")`` for a counter, whose increase
-            from instant k to k + 1 is compared, ``leak=("flow", "level")`` for its values.
-
-        Returns
-        -------
-        Comparison
-
-        Examples
-        --------
-        >>> told.compare(leak=("pulses", "rate"))      # doctest: +SKIP
-        """
-        return compare_with(self, scale, channels)
+    compare = compare
 
     def summary(self) -> Table:
         """Widths of every state and fault, and when a fault was certain."""
@@ -412,11 +362,11 @@ class Estimate:
 
         return plot_run(self, signals)
 
-    def report(self, path: str | os.PathLike[str], **channels: tuple[str, str]) -> Path:
+    def report(self, path: str | os.PathLike[str], **channels: Any) -> Path:
         """Write one self-contained HTML page as `report` does; `channels` as in `compare`."""
         from obsynth.evaluate.report import report
 
-        lead = str(compare_with(self, None, channels)) if channels else ""
+        lead = str(self.compare(**channels)) if channels else ""
         return report(path, self.observer, self, lead=lead)
 
     @property

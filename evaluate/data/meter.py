@@ -1,6 +1,5 @@
 """An estimated signal against a meter that no observer reads."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from obsynth.evaluate.errors import SimulationError
 
-KINDS = ("rate", "level")
+KINDS = (("rate",), ("level",))
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,34 @@ class Comparison:
         )
 
 
-def compare_with(
-    told: Any, scale: float | None, channels: Mapping[str, tuple[str, str]]
-) -> Comparison:
-    """Compare one signal of an estimate with a channel of its record."""
-    name, (channel, kind) = _checked(told, channels)
+def compare(told: Any, scale: float | None = None, **channels: tuple[str, str]) -> Comparison:
+    """Compare a state or a fault with a channel of the record that no observer reads.
+
+    Parameters
+    ----------
+    scale : float, optional
+        Units of the signal in a unit of the channel; by default least squares of the middles of the
+        intervals.
+    **channels
+        One signal with its channel: ``leak=("pulses", "rate")`` for a counter, whose increase from
+        instant k to k + 1 is compared, ``leak=("flow", "level")`` for its values.
+
+    Returns
+    -------
+    Comparison
+
+    Examples
+    --------
+    >>> told.compare(leak=("pulses", "rate"))      # doctest: +SKIP
+    """
+    name, pair = next(iter(channels.items()), ("", ("", "")))
+    if len(channels) != 1 or name not in told.estimated or tuple(pair[1:]) not in KINDS:
+        raise SimulationError(
+            f"compare takes one of {', '.join(told.estimated)} with its channel and 'rate' (of a "
+            f"counter) or 'level', as {told.estimated[-1]}=('meter', 'rate'); got {channels}.",
+            symbol=name,
+        )
+    channel, kind = pair
     trace, values = told[name], told.record[channel]
     true = np.append(np.diff(values), np.nan) if kind == "rate" else values
     true, low, high = true[: len(trace.t)], trace.lower, trace.upper
@@ -97,18 +119,3 @@ def compare_with(
         int(first[0]) + late if first.size else None,
         float((outside & there).sum() / max(there.sum(), 1)),
     )
-
-
-def _checked(told: Any, channels: Mapping[str, tuple[str, str]]) -> tuple[str, tuple[str, str]]:
-    """Return one signal and its channel and kind, or refuse what was given."""
-    if len(channels) != 1 or not {*channels} <= {*told.estimated}:
-        raise SimulationError(
-            f"compare takes one of {', '.join(told.estimated)} with its channel, for instance "
-            f"{told.estimated[-1]}=('meter', 'rate'); got {', '.join(channels) or 'none'}."
-        )
-    ((name, given),) = channels.items()
-    if not isinstance(given, tuple) or len(given) != 2 or given[1] not in KINDS:
-        raise SimulationError(
-            f"{name}={given!r} is no channel with 'rate' (of a counter) or 'level'.", symbol=name
-        )
-    return name, given

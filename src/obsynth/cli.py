@@ -144,13 +144,9 @@ def estimate(
         typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
     ] = None,
     time_column: Annotated[str | None, typer.Option("--time", help="Column of the time.")] = None,
-    jitter: Annotated[float, typer.Option(help="How far stamps may be off, of Ts.")] = 0.05,
     first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
     until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
     guess: Annotated[str | None, typer.Option(help="First state, numbers with commas.")] = None,
-    meter: Annotated[
-        list[str] | None, typer.Option("--compare", help="SIGNAL=CHANNEL,rate or level.")
-    ] = None,
     out: Annotated[Path | None, typer.Option(help="File to write, .csv or .parquet.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
@@ -162,40 +158,30 @@ def estimate(
         import obsynth
 
         observer = obsynth.load(design)
-        columns = {name: _column(told) for name, told in _pairs("--map", mapping)}
-        given = obsynth.read_record(record, observer.model, columns, time_column, jitter=jitter)
+        columns = dict(map(_column, mapping or ()))
+        given = obsynth.read_record(record, observer.model, columns, time_column)
         state = None if guess is None else _numbers("--guess", guess.split(","))
         told = obsynth.estimate(observer, given[first:until], guess=state)
-        meters: Any = {name: tuple(to.split(",")) for name, to in _pairs("--compare", meter)}
-        beside = [told.compare(None, **{name: pair}) for name, pair in meters.items()]
         if out is not None:
             told.write(out)
         if report is not None:
-            told.report(report, **meters)
+            told.report(report)
     if as_json:
-        print(json.dumps({**told.to_dict(), "compare": [vars(one) for one in beside]}, indent=1))
+        print(json.dumps(told.to_dict(), indent=1))
     else:
         _console().print(_rich(told.summary()))
-        for one in beside:
-            _console().print(str(one), markup=False)
     if told.refuted is not None:
         print(f"obsynth: {told.refuted}", file=sys.stderr)
         raise typer.Exit(code=3)
 
 
-def _pairs(option: str, given: list[str] | None) -> Iterator[tuple[str, str]]:
-    """Read NAME=VALUE."""
-    for text in given or ():
-        name, mark, value = text.partition("=")
-        if not mark:
-            _refuse(f"{option} {text!r} is not SIGNAL=...")
-        yield name, value
-
-
-def _column(told: str) -> Any:
-    """Read COLUMN[,SCALE[,OFFSET]]; nothing is an output that was not measured."""
+def _column(text: str) -> tuple[str, Any]:
+    """Read SIGNAL=COLUMN[,SCALE[,OFFSET]]; without a column an output was not measured."""
+    signal, mark, told = text.partition("=")
+    if not mark:
+        _refuse(f"--map {text!r} is not SIGNAL=COLUMN.")
     name, *numbers = told.split(",")
-    return (name, *_numbers("--map", numbers)) if numbers else name or None
+    return signal, (name, *_numbers("--map", numbers)) if numbers else name or None
 
 
 def _numbers(option: str, given: list[str]) -> list[float]:

@@ -231,9 +231,9 @@ def test_a_comparison_counts_what_it_says(told):
     none = dataclasses.replace(made, record=dataclasses.replace(record, reference=0 * level))
     for given, refusal in [
         ({"leak": ("meter", "level")}, "nowhere other than zero"),
-        ({"leak": ("meter", "flow")}, "'rate'"),
+        ({"leak": ("meter", "flow")}, "'rate' .of a counter. or 'level'"),
         ({"leek": ("meter", "rate")}, "takes one of e1, h2, e3, leak"),
-        ({}, "got none"),
+        ({}, "got {}"),
     ]:
         with pytest.raises(ob.SimulationError, match=refusal):
             none.compare(**given)
