@@ -17,7 +17,7 @@ from obsynth.evaluate.data.tables import to_dataset
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.table import Table
-from obsynth.evaluate.trace import Trace, Violation, take
+from obsynth.evaluate.trace import Trace, Violation, as_told, take
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -108,23 +108,13 @@ class Run:
         groups = {key: getattr(model, key) for key in ("x", "u", "d", "f", "w", "rho")}
         names = {key: tuple(s.name for s in signals) for key, signals in groups.items()}
         units = {key: tuple(s.unit for s in signals) for key, signals in groups.items()}
-        names["y"] = tuple(model.output_names)
-        units["y"] = tuple(model.output_units)
-        status = np.asarray(claims["status"], dtype=np.int64).reshape(-1)
-        words = ("status", "alarm", "mean_status")
-        arrays = {key: value for key, value in claims.items() if key not in words}
-        arrays |= truths
-        told = claims.get("mean_status")
-        joined = None if told is None else np.asarray(told, dtype=np.int64).reshape(-1)
-        alarm = np.asarray(claims["alarm"] > 0.5) if "alarm" in claims else None
-        for array in (t, status, *arrays.values()):
+        names["y"], units["y"] = tuple(model.output_names), tuple(model.output_units)
+        arrays: dict[str, Any] = {**as_told(claims), **truths}
+        for array in (t, *arrays.values()):
             array.setflags(write=False)
-        if alarm is not None:
-            alarm.setflags(write=False)
         half_widths = observer.half_widths
         return cls(
             t=t,
-            status=status,
             names=names,
             units=units,
             box=state_box(observer),
@@ -136,8 +126,6 @@ class Run:
             method=observer.method,
             truth=truth,
             outside=outside,
-            alarm=alarm,
-            mean_status=joined,
             **arrays,
         )
 

@@ -1,5 +1,6 @@
 """One signal of a run, and where it was outside of its interval."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +72,14 @@ class Trace:
         if self.lower is None or self.upper is None:
             raise SimulationError(f"{self.name} has no interval.", symbol=self.name)
         return np.asarray(0.5 * (self.upper - self.lower))
+
+
+def as_told(claims: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Return what a step told at every instant, words of bits whole and alarms true or false."""
+    told: dict[str, Any] = dict(claims)
+    for key in {"status", "mean_status"} & told.keys():
+        told[key] = told[key].reshape(-1).astype(np.int64)
+    return told | ({"alarm": told["alarm"] > 0.5} if "alarm" in told else {})
 
 
 def take(run: Any, name: str) -> Trace:

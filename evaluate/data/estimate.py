@@ -12,7 +12,7 @@ from obsynth.evaluate.checked import scheduling_columns, step_function
 from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.trace import Trace
+from obsynth.evaluate.trace import Trace, as_told
 from obsynth.evaluate.truth import Call, dense, sample_time
 from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
@@ -87,14 +87,10 @@ def estimate(
     names = [model.names("rho")[k] for k in scheduling_columns(step, model, "step")]
     rows = np.column_stack([record.u, record.y, *(record[name] for name in names)])
     log, blamed = _march(step, np.array(memory, dtype=float), rows, model.output_names)
-    log.flags.writeable = False
-    ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out())])
-    parts = np.split(log, ends[:-1], axis=1)
-    told: dict[str, Any] = dict(zip(step.name_out()[1:], parts, strict=True))
-    for key in {"status", "mean_status"} & told.keys():
-        told[key] = told[key][:, 0].astype(np.int64)
-    if "alarm" in told:
-        told["alarm"] = told["alarm"] > 0.5
+    ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
+    told = as_told(dict(zip(step.name_out()[1:], np.split(log, ends, axis=1), strict=True)))
+    for array in told.values():
+        array.flags.writeable = False
     own = observer.observer if isinstance(observer, FaultDetector) else observer
     theta = rows[:, record.u.shape[1] + record.y.shape[1] :]
     means = {m: _means(FaultDetector(own, window=m), record, theta, told) for m in windows}
@@ -151,26 +147,21 @@ def _march(
     args = [memory, *np.split(given, np.cumsum(sizes)[:-1])]
     places = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
     call = Call(step, args, [moved, *np.split(told, places)])
-    status = call.results[STEP_OUTPUTS.index("status")]
+    evaluate = call.evaluate
 
     def run(rows: FloatArray, log: FloatArray) -> None:
-        evaluate = call.evaluate
         for row, out in zip(rows, log, strict=True):
             given[:] = row
             evaluate()
             out[:] = told
             memory[:] = moved
 
-    def void() -> bool:
-        call.evaluate()
-        return bool(int(status[0]) & STATUS["void"])
-
     log, blamed = np.empty((len(rows), told.size)), None
-    column = int(places[STEP_OUTPUTS.index("status") - 2])
+    column, void = int(places[STEP_OUTPUTS.index("status") - 2]), STATUS["void"]
     for k in range(0, len(rows), BLOCK):
         kept, part = memory.copy(), log[k : k + BLOCK]
         run(rows[k : k + BLOCK], part)
-        at = np.flatnonzero(part[:, column].astype(np.int64) & STATUS["void"])
+        at = np.flatnonzero(part[:, column].astype(np.int64) & void)
         if at.size and blamed is None:
             # once more up to the void, then without each of its readings
             after, memory[:] = memory.copy(), kept
@@ -180,6 +171,7 @@ def _march(
             for i, name in enumerate(outputs):
                 given[:] = rows[k]
                 args[2][i] = np.nan
-                alone += [] if void() else [name]
+                evaluate()
+                alone += [] if int(told[column]) & void else [name]
             blamed, memory[:] = tuple(alone), after
     return log, blamed or ()

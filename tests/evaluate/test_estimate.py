@@ -285,7 +285,9 @@ def test_a_file_is_replaced_only_when_it_is_complete(told, tmp_path, monkeypatch
     with pytest.raises(OSError, match="full"):
         told.write(path)
     assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["told.csv"]
-    for bad, refusal in [("told.txt", "neither with"), ("no/told.csv", "does not exist")]:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    cases = [("told.txt", "neither with"), ("no/told.csv", "does not exist")]
+    for bad, refusal in [*cases, ("told.parquet", "needs pyarrow: pip install")]:
         with pytest.raises(ob.ObsynthError, match=refusal):
             told.write(tmp_path / bad)
 
