@@ -38,7 +38,7 @@ def quiet(observer, count):
         time=np.arange(count) * float(model.Ts),
         u=np.tile(u, (count, 1)),
         y=y + noise,
-        reference=(),
+        reference=np.zeros((count, 0)),
         names=names,
         units={key: ("",) * len(value) for key, value in names.items()},
         source="nominal",
