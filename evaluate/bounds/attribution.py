@@ -103,7 +103,9 @@ def attribute(problem: Problem, record: Record, bounds: FloatArray) -> Attributi
 
 
 def _scale(problem: Problem) -> Least:
-    return least(problem, np.ones(1))
+    """Return the factor of the bounds; more is done for it only where it may decide."""
+    found = least(problem, np.ones(1), contractions=0)
+    return least(problem, np.ones(1)) if found.lower <= 1.0 < found.upper else found
 
 
 def _first(problem: Problem, whole: Least) -> tuple[int, Least, Least]:

@@ -36,6 +36,8 @@ def enclose(problem: Problem, bounds: FloatArray, passes: int = PASSES) -> Boxes
     steps, n = len(problem), problem.n
     ends = np.broadcast_to(whole, (steps + 1, *whole.shape)).copy()
     ends[-1] = [-FAR, FAR]  # of what follows the record nothing is known
+    if problem.first is not None:
+        ends[0, :n] = _meet(ends[0, :n], problem.first)
     rates = [np.inf if s.rate is None else s.rate for s in problem.plant.f]
     rates = [0.0 if s.constant else r for r, s in zip(rates, problem.plant.f, strict=True)]
     fault = problem.places["f"]

@@ -1,5 +1,6 @@
 """Least bounds from both sides: a trajectory attains them, below a certified number none do."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +18,12 @@ CONTRACTIONS = 2
 """Times at most that the intervals of parameters are cut before the bound is taken."""
 STALLED = 0.05
 """Share of an interval below which another cut is not worth its programs."""
+APART = 0.05
+"""Distance from the attained cost, relative, from which on the first states are cut as well."""
+MOST_CUTS = 8
+"""Times that they are at most."""
+LONGEST = 400
+"""Instants of a linear program; what it takes grows faster than with their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +33,7 @@ class Least:
     upper: of a trajectory, which needs its bounds itself; infinite where none was found
     lower: certified, at most the upper; infinite: proved that nothing explains the record
     problem: with the intervals of parameters that are left
+    begin: instant at which the window begins that the linear program is of
     """
 
     problem: Problem
@@ -34,6 +42,7 @@ class Least:
     lower: float
     linear: Linear | None = field(repr=False)
     solution: Solution | None = field(repr=False)
+    begin: int = 0
 
     @property
     def upper(self) -> float:
@@ -47,17 +56,31 @@ def least(
     largest: FloatArray | None = None,
     start: FloatArray | None = None,
     contractions: int = CONTRACTIONS,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Least:
-    """Look for the least ``weights'bounds``; bounds with weight zero up to the largest."""
+    """Look for the least ``weights'bounds``; bounds with weight zero up to the largest.
+
+    No window of a record needs more than all of it: long ones are certified by windows.
+    """
+    say = progress or (lambda stage, share: None)
+    say("looking for a trajectory", 0.0)
     found = explain(problem, weights, largest, start)
     upper = _cost(weights, found)
     cost = upper * (1.0 + ROOM)
     with np.errstate(divide="ignore", invalid="ignore"):
         top = np.where(weights > 0.0, cost / weights, np.inf)
     top = np.minimum(top, np.inf if largest is None else largest * (1.0 + ROOM))
-    narrowed, linear, solution = below(problem, weights, top, cost, contractions)
-    proved = np.inf if solution is None else max(solution.certified, 0.0)
-    return Least(narrowed, weights, found, min(proved, upper), linear, solution)
+    best = Least(problem, weights, found, 0.0, None, None)
+    for begin in range(0, len(problem), LONGEST):
+        say("certifying", 0.2 + 0.8 * begin / len(problem))
+        window = replace(problem, box=best.problem.box).window(begin, begin + LONGEST)
+        after, linear, solution = below(window, weights, top, cost, contractions)
+        box = replace(problem, box=after.box)
+        lower = min(np.inf if solution is None else solution.certified, upper)
+        if lower > best.lower or begin == 0:
+            best = Least(box, weights, found, max(lower, 0.0), linear, solution, begin)
+        best = replace(best, problem=box)
+    return best
 
 
 def _cost(weights: FloatArray, found: Trajectory) -> float:
@@ -77,28 +100,47 @@ def below(
         width = np.ptp(before.box[before.still], axis=1)
         if (np.ptp(after.box[after.still], axis=1) > (1.0 - STALLED) * width).all():
             break
-    boxes = enclose(problem, top)
-    if boxes.empty is not None:
-        return problem, None, None
-    linear = assemble(problem, boxes, top)
-    solution = linear.minimise(linear.cost(weights))
+    for left in reversed(range(MOST_CUTS if contractions else 1)):
+        boxes = enclose(problem, top)
+        if boxes.empty is not None:
+            return problem, None, None
+        linear = assemble(problem, boxes, top)
+        solution = linear.minimise(linear.cost(weights))
+        if not left or solution.certified >= (1.0 - APART) * cost:
+            break
+        width = np.ptp(boxes.ends[0, : problem.n], axis=1)
+        after = narrowed(problem, top, weights, cost, states=True)
+        if after is None:
+            return problem, None, None
+        problem = after
+        if (np.ptp(np.asarray(problem.first), axis=1) > (1.0 - STALLED) * width).all():
+            break
     return problem, linear, solution
 
 
 def narrowed(
-    problem: Problem, top: FloatArray, weights: FloatArray | None = None, cost: float = np.inf
+    problem: Problem,
+    top: FloatArray,
+    weights: FloatArray | None = None,
+    cost: float = np.inf,
+    states: bool = False,
 ) -> Problem | None:
-    """Cut the intervals of the parameters that stand still once; None where nothing is left."""
+    """Cut the intervals of what stands still once, and of the first states if they are asked for.
+
+    None where nothing is left.
+    """
     boxes: Boxes = enclose(problem, top)
     if boxes.empty is not None:
         return None
     linear = assemble(problem, boxes, top)
     if weights is not None and np.isfinite(cost):
         linear = linear.limited(weights, cost)
-    box = problem.box.copy()
-    for j in np.flatnonzero(problem.still & (np.ptp(problem.box, axis=1) > 0.0)):
-        if linear.shared[0, j] >= 0:
-            box[j] = linear.range_of(int(linear.shared[0, j]))
-            if box[j, 0] > box[j, 1]:
+    box, first = problem.box.copy(), boxes.ends[0].copy()
+    for j in np.flatnonzero(np.ptp(first, axis=1) > 0.0):
+        still = bool(problem.still[j])
+        if linear.shared[0, j] >= 0 and (still or (states and j < problem.n)):
+            ends = linear.range_of(int(linear.shared[0, j]))
+            if ends[0] > ends[1]:
                 return None
-    return replace(problem, box=box)
+            (box if still else first)[j] = ends
+    return replace(problem, box=box, first=first[: problem.n] if states else problem.first)

@@ -1,6 +1,6 @@
 """The smallest disturbance bounds that explain a measured record, attained and certified."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -74,7 +74,9 @@ class LeastBounds:
     def refuted(self) -> bool:
         """Whether the declared bounds of the disturbances are too small for certain."""
         declared = dict(zip(self.problem.groups, self._declared.tolist(), strict=True))
-        return bool(np.isfinite([*declared.values()]).all() and self.refutes(**declared))
+        if self.lower == np.inf or not np.isfinite([*declared.values()]).all():
+            return self.lower == np.inf
+        return self.refutes(**declared)
 
     @property
     def trajectory(self) -> dict[str, FloatArray]:
@@ -118,7 +120,8 @@ class LeastBounds:
             )
             names = self.problem.plant.names("w")
             for k, j in np.argwhere(weight > 1e-9 * max(weight.max(), 1e-300)).tolist():
-                rows.append([float(self.record.time[k]), names[j], float(weight[k, j])])
+                time = float(self.record.time[self.least.begin + k])
+                rows.append([time, names[j], float(weight[k, j])])
         return Table(
             "Support",
             ["time [s]", "disturbance", "multiplier"],
@@ -211,6 +214,21 @@ class LeastBounds:
         groups = range(len(self.problem.groups))
         return np.array([radius[self.problem.group == g].max(initial=0.0) for g in groups])
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what is found as numbers and names for JSON; null is infinite."""
+        sides = {"upper": self.upper, "lower": self.lower}
+        return {
+            "plant": self.problem.plant.name,
+            "record": self.record.source,
+            "instants": len(self.record),
+            "bounds": _finite(self.bounds),
+            "declared": _finite(dict(zip(self.problem.groups, self._declared, strict=True))),
+            "weights": self.weights,
+            **_finite(sides),
+            "params": self.params,
+            "refuted": self.refuted,
+        }
+
     def table(self) -> Table:
         """Bounds by group beside the declared ones, both sides of their weighted sum."""
         declared = self._declared.tolist()
@@ -225,6 +243,11 @@ class LeastBounds:
             ["sum, certified", self.lower, None, None],
         ]
         verdict = "The declared bounds are refuted." if self.refuted else ""
+        if not np.isfinite(self.upper):
+            gap = self.least.trajectory.gap
+            verdict = f"No trajectory was found that meets the equations (best: to {gap:.2g})."
+            if self.lower == np.inf:
+                verdict = "No bounds explain it: ranges or equations without disturbance refute it."
         return Table(
             f"Least bounds of {self.problem.plant.name}",
             ["group", "bound", "weight", "declared"],
@@ -248,6 +271,7 @@ def least_bounds(
     weights: Mapping[str, float] | None = None,
     least_of: Mapping[str, float] | None = None,
     safety: float = SAFETY,
+    progress: Callable[[str, float], None] | None = None,
 ) -> LeastBounds:
     """Return the smallest disturbance bounds with which a plant explains a record.
 
@@ -271,6 +295,8 @@ def least_bounds(
         Bounds of groups that are known not to be smaller, as half a quantum of the readings.
     safety : float
         Factor between the bounds and those of the plant that is returned.
+    progress : callable, optional
+        Told the stage and the share that is done.
 
     Returns
     -------
@@ -308,7 +334,12 @@ def least_bounds(
     if not safety >= 1.0:
         raise BoundsError(f"safety= is a factor of at least 1, not {safety}.", safety=safety)
     problem = replace(problem, smallest=smallest)
-    return LeastBounds(problem, record, float(safety), least(problem, factors))
+    found = least(problem, factors, progress=progress)
+    return LeastBounds(problem, record, float(safety), found)
+
+
+def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: float(v) if np.isfinite(v) else None for name, v in values.items()}
 
 
 def _by_group(

@@ -35,6 +35,7 @@ class Problem:
     box: ranges of v, (n_v, 2); those of the disturbances play no part
     names: of v
     smallest: what the bounds of groups are at least, (n_groups,); 0 by default
+    first: ends of the states at the first instant, (n, 2), where they are known better
     """
 
     plant: Plant
@@ -48,6 +49,7 @@ class Problem:
     names: tuple[str, ...]
     still: BoolArray = field(repr=False)
     smallest: FloatArray | float = 0.0
+    first: FloatArray | None = field(default=None, repr=False)
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -86,7 +88,7 @@ class Problem:
 
     def window(self, first: int, last: int) -> "Problem":
         """Return the same for the instants ``first`` to ``last - 1``."""
-        return replace(self, u=self.u[first:last], y=self.y[first:last])
+        return replace(self, u=self.u[first:last], y=self.y[first:last], first=None)
 
     def scaled(self, bounds: FloatArray) -> "Problem":
         """Return the problem of one number: the factor of bounds of the groups."""

@@ -84,6 +84,8 @@ def validate(problem: Problem, bounds: FloatArray, windows: int) -> Validation:
         raise BoundsError(f"{windows} windows: give 2 to {len(problem)}.", windows=windows)
     edges = np.linspace(0, len(problem), windows + 1).round().astype(int)
     scaled = problem.scaled(bounds)
-    found = [least(scaled.window(a, b), np.ones(1)) for a, b in pairwise(edges.tolist())]
+    found = [
+        least(scaled.window(a, b), np.ones(1), contractions=0) for a, b in pairwise(edges.tolist())
+    ]
     factors = np.array([one.upper for one in found])
     return Validation(factors, np.array([one.lower for one in found]), len(bounds))

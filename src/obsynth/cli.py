@@ -175,6 +175,56 @@ def estimate(
         raise typer.Exit(code=3)
 
 
+@app.command()
+def bounds(
+    plant: Annotated[str, typer.Argument(help="A name in obsynth.plants, or a JSON file.")],
+    record: Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")],
+    mapping: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
+    ] = None,
+    time_column: Annotated[str | None, typer.Option("--time", help="Column of the time.")] = None,
+    first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
+    until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="SIGNAL or PARAMETER=LOWER:UPPER; the others are held. Default: signals."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+) -> None:
+    """Find the least bounds that explain a record; exit 3 if it refutes the declared ones."""
+    with _refusals():
+        import json
+
+        import obsynth
+        from obsynth.evaluate.progress import bar
+
+        model = _plant(plant)
+        given = obsynth.read_record(record, model, dict(map(_column, mapping or ())), time_column)
+        ranges = None if free is None else dict(map(_free, free))
+        with bar() as advance:
+            found = obsynth.least_bounds(model, given[first:until], ranges, progress=advance)
+            refuted = found.refuted
+    if as_json:
+        print(json.dumps(found.to_dict(), indent=1))
+    else:
+        _console().print(_rich(found.table()))
+    if refuted:
+        print("obsynth: the record refutes the declared bounds.", file=sys.stderr)
+        raise typer.Exit(code=3)
+
+
+def _free(text: str) -> tuple[str, Any]:
+    """Read SIGNAL, or PARAMETER=LOWER:UPPER."""
+    name, mark, told = text.partition("=")
+    ends = tuple(_numbers("--free", told.split(":"))) if mark else None
+    if ends is not None and len(ends) != 2:
+        _refuse(f"--free {text!r} is not PARAMETER=LOWER:UPPER.")
+    return name, ends
+
+
 def _column(text: str) -> tuple[str, Any]:
     """Read SIGNAL=COLUMN[,SCALE[,OFFSET]]; without a column an output was not measured."""
     signal, mark, told = text.partition("=")

@@ -9,6 +9,8 @@ from scipy.sparse import csr_array
 from witness import happened, record_of
 
 import obsynth as ob
+from obsynth.evaluate.bounds import certified
+from obsynth.evaluate.bounds.attribution import attribute
 from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.linear import Linear
 from obsynth.evaluate.bounds.problem import pose
@@ -77,7 +79,7 @@ def test_a_trajectory_keeps_rates():
 def test_sizes_hold_the_ranges():
     """Mistakes of half a unit: of the share in a group, of the middle, of the product."""
     rng = np.random.default_rng(0)
-    for _ in range(40):
+    for _ in range(10):
         plant, record = asked([0.5, 0.5], bounds=rng.uniform(0, 1, 3))
         low, high = np.sort(rng.normal(size=(2, 3)), axis=0)
         ranges = {f"w{j + 1}": (low[j], high[j]) for j in range(3)}
@@ -103,6 +105,22 @@ def test_known_lower_ends():
     plant, record = asked([0.5, 0.5, 0.5])
     fit = ob.least_bounds(plant, record, [], least_of={"outputs": 0.02})
     assert fit.bounds["outputs"] == fit.upper == 0.02 and abs(fit.lower - 0.02) < 1e-9
+
+
+def test_what_no_bounds_explain():
+    """Readings without noise outside of the range: proved, and said."""
+    plant = ob.Plant("bare")
+    (x,) = plant.states("x", range=(0, 1))
+    (w,) = plant.disturbances("w", bound=0.1)
+    plant.dynamics([x + w], Ts=1)
+    plant.outputs([x])
+    fit = ob.least_bounds(plant, record_of(plant, np.empty((2, 0)), [[0.5], [2.0]]))
+    assert fit.lower == fit.upper == np.inf and fit.refuted
+    assert "No bounds explain it" in repr(fit) and fit.to_dict()["upper"] is None
+    with pytest.raises(ob.BoundsError, match="no bounds were found"):
+        fit.plant.names("w")
+    fit = ob.least_bounds(plant, record_of(plant, np.empty((3, 0)), [[0.5], [0.75], [0.5]]))
+    assert abs(fit.upper - 0.25) < 1e-7 and abs(fit.lower - 0.25) < 1e-7
 
 
 def test_one_disturbance_alone():
@@ -159,3 +177,54 @@ def test_refusals():
         ob.least_bounds(plant, gap)
     with pytest.raises(ob.SimulationError, match="sampled every 1 s"):
         ob.least_bounds(plant, replace(record, time=0.5 * record.time))
+
+
+def test_what_is_past_the_bounds():
+    """Readings half a unit off, of which .2 are allowed, at four instants. Mistake: a slack that
+    takes room away."""
+    plant, record = asked([0, 1, 0, 1])
+    found = attribute(pose(plant, record, []), record, np.array([0.1]))
+    assert abs(found.excess.sum() - 1.2) < 1e-9
+    assert found.scale[0] == pytest.approx(2.5) == found.scale[1]
+
+
+def test_what_stands_still_is_one_number():
+    """Readings p and 1 + p of one parameter; one of its own at each instant would explain both."""
+    plant = ob.Plant("gain")
+    (x,) = plant.states("x", range=(0, 1))
+    (p,) = plant.params("p", range=(0, 2))
+    (w,) = plant.disturbances("w", bound=0.1)
+    plant.dynamics([x], Ts=1)
+    plant.outputs([p * (1 + 0 * x) + w])
+    record = record_of(plant, np.empty((3, 0)), [[0.5], [1.5], [1.0]])
+    fit = ob.least_bounds(plant, record)
+    assert abs(fit.upper - 0.5) < 1e-7 and 0.5 - 1e-7 < fit.lower <= fit.upper
+    assert abs(fit.params["p"] - 1.0) < 1e-6
+    boxes = enclose(fit.problem, np.array([0.75]))
+    assert np.allclose(boxes.ends[:, 2], [0.75, 1.25])
+
+
+def test_faults_move_by_their_rates():
+    """0, .1, .1 with .1 at first, and no more than .05 less after it; .1 less were none at all."""
+    plant, record = asked([0, 0.1, 0.1], rate=0.05)
+    assert ob.least_bounds(plant, record).lower > 0.005
+    assert ob.least_bounds(*asked([0, 0.1, 0.1])).upper < 1e-6
+    exact = pose(*asked([0, 0.1, np.nan], rate=0.05))
+    boxes = enclose(exact, np.array([1e-6]))
+    assert np.allclose(boxes.ends[:2, 1], [[0.1, 0.1], [0.05, 0.1]], atol=1e-5)
+
+
+def test_windows_of_long_records(monkeypatch):
+    """Half a unit in the second of three windows; it is told at its time."""
+    monkeypatch.setattr(certified, "LONGEST", 2)
+    plant, record = asked([0.5, 0.5, 0.0, 1.0, 0.5, 0.5, 0.5])
+    said = []
+    problem = pose(plant, record, [])
+    found = certified.least(problem, np.ones(1), progress=lambda *a: said.append(a))
+    assert abs(found.lower - 0.25) < 1e-7 and found.begin == 2
+    assert [round(share, 2) for _, share in said] == [0.0, 0.2, 0.43, 0.66, 0.89]
+    support = ob.LeastBounds(problem, record, 1.2, found).support
+    assert {row[0] for row in support.rows} == {2.0, 3.0}
+    narrow = replace(problem, first=np.array([[0.5, 0.5]]))
+    assert narrow.window(2, 4).first is None
+    assert enclose(narrow, np.ones(1)).ends[0, 0].tolist() == [0.5, 0.5]
