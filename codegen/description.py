@@ -133,6 +133,13 @@ class Description:
             "f": len(self.f),
         }
 
+    def place(self, port: str, i: int) -> str:
+        """Return what entry i of a vector of the step is called in C, between its structs."""
+        if port in {"memory", "next"}:
+            field = next(f for f in self.fields if f.start <= i < f.start + f.size)
+            return f"state->{field.name}" + (f"[{i - field.start}]" if field.size > 1 else "")
+        return f"{'in' if port in STEP_INPUTS else 'out'}->{port}[{i}]"
+
 
 def describe(
     observer: Observer | FaultDetector, name: str | None = None, memory: FloatArray | None = None

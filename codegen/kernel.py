@@ -1,7 +1,8 @@
-"""The arithmetic of one step: as C without CasADi's interface, and on CasADi's virtual machine."""
+"""The arithmetic of one step: what both writers share, and CasADi's virtual machine."""
 
 import math
-import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,49 +16,52 @@ from obsynth.symbolic.arrays import FloatArray
 STEP_INPUTS = ("memory", "u", "y", "theta")
 """Inputs of a step, in their order; the last one of scheduled observers only."""
 
-_RESULTS = ("next", *STEP_OUTPUTS[1:], *FURTHER_OUTPUTS[-1])
-
-# CasADi wraps these to serve C89 as well; the wrapped C99 function is what its VM calls.
-_WRAPPED = frozenset({"expm1", "fabs", "fmax", "fmin", "hypot", "log1p"})
-
-_C99_TEXT = """
-    acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh erf exp floor fmod log pow
-    remainder sin sinh sqrt tan tanh
-"""
-_C99 = _WRAPPED | frozenset(_C99_TEXT.split())
+RESULTS = ("next", *STEP_OUTPUTS[1:], *FURTHER_OUTPUTS[-1])
+"""Results of a step, in their order; the last ones of detectors only."""
 
 _EXACT = frozenset({"ceil", "copysign", "fabs", "floor", "fmax", "fmin", "fmod", "remainder"}) | {
     "sqrt"
 }
 
-_FUNCTION = re.compile(
-    r"^static int casadi_f0\([^)]*\) \{\n(?P<body>.*?)^\}\n", re.MULTILINE | re.DOTALL
-)
-_HELPER = re.compile(r"^casadi_real casadi_(\w+)\(([^)]*)\) (\{[^\n]*\})$", re.MULTILINE)
-_READ = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
-_WRITE = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=")
-_LITERAL = re.compile(r"(?<![\w.])\d+\.\d*e[+-]\d+")
-_WORD = re.compile(r"(?<![\d.])[A-Za-z_]\w*")  # "e+300" of a literal is no word
+OPERATIONS = {
+    getattr(ca, name): name.removeprefix("OP_").lower()
+    for name in sorted(dir(ca))
+    if name.startswith("OP_")
+}
+"""CasADi's names of operations by their numbers."""
+
+_MOVES = frozenset({"input", "output", "const", "assign"})
 
 
 @dataclass(frozen=True)
 class Kernel:
     """C text of the arithmetic of one step.
 
+    backend: who wrote it
     functions: static functions; the last one is ``NAME_kernel``
-    arguments: its arguments: those of ``memory, u, y, theta, next, xhat, ...`` that it reads or
-        writes
+    arguments: what it reads and writes: some of ``memory, u, y, theta, next, xhat, ...``, or of
+        ``state, in, out``
     library: what it calls from ``math.h``, sorted
-    inexact: those of them that IEEE 754 does not define to the last bit, so that another machine's
-        mathematics library may return another last bit
     operations: instructions of the CasADi function, a measure of its length
+    counts: how often it does what, by CasADi's names of operations
     """
 
+    backend: str
     functions: str
     arguments: tuple[str, ...]
     library: tuple[str, ...]
-    inexact: tuple[str, ...]
     operations: int
+    counts: Mapping[str, int]
+
+    @property
+    def inexact(self) -> tuple[str, ...]:
+        """What of the library IEEE 754 does not define to the last bit: libraries differ there."""
+        return tuple(name for name in self.library if name not in _EXACT)
+
+
+def counted(operations: Iterable[str]) -> dict[str, int]:
+    """Return how often each operation occurs, without loads, stores and constants."""
+    return dict(sorted(Counter(name for name in operations if name not in _MOVES).items()))
 
 
 def _not_scalar(step: ca.Function, why: str) -> CodegenError:
@@ -68,7 +72,7 @@ def _not_scalar(step: ca.Function, why: str) -> CodegenError:
     )
 
 
-def _scalar_function(step: ca.Function) -> ca.Function:
+def scalar_function(step: ca.Function) -> ca.Function:
     """Return the step as a function of scalar operations with dense inputs and outputs."""
     if not step.is_a("SXFunction"):
         try:
@@ -89,116 +93,6 @@ def _scalar_function(step: ca.Function) -> ca.Function:
     return ca.Function(step.name(), inputs, outputs)
 
 
-def _casadi_text(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("kernel", {"with_header": False})
-    generator.add(function, False)
-    return str(generator.dump())
-
-
-def _surprise(what: str) -> CodegenError:
-    version = ca.CasadiMeta.version()
-    return CodegenError(
-        f"{what}; this obsynth cannot use the C that CasADi {version} writes for this step",
-        casadi=version,
-    )
-
-
-def _shortest(literal: re.Match[str]) -> str:
-    return c_number(float(literal[0]))
-
-
-def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
-    """Write the arithmetic of a step as static C functions.
-
-    CasADi's C passes arrays of pointers, work vectors and a memory index, exports some
-    fifteen symbols and brings its own types. What is kept of it is the sequence of
-    operations, statement by statement, with the arguments as plain arrays.
-    """
-    function = _scalar_function(step)
-    text = _casadi_text(function)
-    found = _FUNCTION.findall(text)
-    if len(found) != 1:
-        raise _surprise(f"{len(found)} functions found in CasADi's C where one was expected")
-    body = found[0]
-
-    body = _READ.sub(lambda m: f"{STEP_INPUTS[int(m[1])]}[{m[2]}]", body)
-    body = _WRITE.sub(lambda m: f"{_RESULTS[int(m[1])]}[{m[2]}]=", body)
-    body = _LITERAL.sub(_shortest, body)
-    lines = body.rstrip().splitlines()
-    if lines[-1].strip() != "return 0;":
-        raise _surprise(f"CasADi's function ends on {lines[-1].strip()!r}")
-    body = "\n".join(f"  {line}" for line in lines[:-1])
-
-    helpers = {name: (arguments, code) for name, arguments, code in _HELPER.findall(text)}
-    used: list[str] = []
-
-    def rename(match: re.Match[str]) -> str:
-        word = match[1]
-        if word == "real":
-            return f"{prefix}_real_t"
-        if word in {"inf", "nan"}:
-            return {"inf": "INFINITY", "nan": "NAN"}[word]
-        if word in _WRAPPED:
-            return word
-        if word not in helpers:
-            raise _surprise(f"CasADi's C uses casadi_{word}, which is not known")
-        if word not in used:
-            used.append(word)
-        return f"{prefix}_{word}"
-
-    body = re.sub(r"\bcasadi_(\w+)", rename, body)
-    library = _check_words(body, prefix, used)
-    parts = [
-        re.sub(r"\bcasadi_(\w+)", rename, f"static casadi_real casadi_{name}({arguments}) {code}")
-        for name in used
-        for arguments, code in [helpers[name]]
-    ]
-    enclosed, arguments = _enclose(function, prefix, body)
-    parts.append(enclosed)
-    return Kernel(
-        functions="\n\n".join(parts),
-        arguments=arguments,
-        library=library,
-        inexact=tuple(name for name in library if name not in _EXACT),
-        operations=int(function.n_instructions()),
-    )
-
-
-def _check_words(body: str, prefix: str, helpers: list[str]) -> tuple[str, ...]:
-    """Return the library functions of the body; refuse every word whose meaning is not known."""
-    known = {*STEP_INPUTS, *_RESULTS, "INFINITY", "NAN", f"{prefix}_real_t"}
-    known |= {f"{prefix}_{helper}" for helper in helpers}
-    library = set()
-    for word in set(_WORD.findall(body)):
-        if word in _C99:
-            library.add(word)
-        elif word == "erfinv":
-            raise CodegenError(
-                "the step calls erfinv, which the mathematics library of C99 does not have",
-                symbol="erfinv",
-            )
-        elif word not in known and not re.fullmatch(r"a\d+", word):
-            raise _surprise(f"CasADi's C holds {word!r}, which is not known")
-    return tuple(sorted(library))
-
-
-def _enclose(function: ca.Function, prefix: str, body: str) -> tuple[str, tuple[str, ...]]:
-    """Put the body into a function of plain arrays, without unused parameters."""
-    real = f"{prefix}_real_t"
-    words = set(_WORD.findall(body))
-    arguments, parameters = [], []
-    for i, name in enumerate(STEP_INPUTS[: function.n_in()]):
-        if name in words:
-            arguments.append(name)
-            parameters.append(f"const {real} {name}[{function.numel_in(i)}]")
-    for i, name in enumerate(_RESULTS[: function.n_out()]):
-        if name in words:
-            arguments.append(name)
-            parameters.append(f"{real} {name}[{function.numel_out(i)}]")
-    head = ",\n    ".join(parameters)
-    return f"static void {prefix}_kernel(\n    {head})\n{{\n{body}\n}}", tuple(arguments)
-
-
 def c_number(value: float) -> str:
     """Return the shortest C literal of type double that is read back as the same number."""
     if math.isnan(value):
@@ -206,6 +100,14 @@ def c_number(value: float) -> str:
     if math.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     return repr(float(value))
+
+
+def c_literal(value: float, real: str) -> str:
+    """Return a constant as an operand of a C type; infinity and NaN of C are float."""
+    text = c_number(value)
+    if math.isfinite(value):
+        return text
+    return f"-({real}){text[1:]}" if text[0] == "-" else f"({real}){text}"
 
 
 class Machine:

@@ -13,11 +13,13 @@ from typing import Any, Literal
 import casadi as ca
 
 from obsynth.codegen.build import Build, Comparison, build_and_compare, find_compiler
+from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
-from obsynth.codegen.kernel import Kernel, generate_kernel
+from obsynth.codegen.kernel import Kernel
 from obsynth.codegen.render import generator_name, render
+from obsynth.codegen.tape import write_tape
 from obsynth.codegen.vectors import Vectors, make_vectors
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -26,8 +28,8 @@ from obsynth.symbolic.arrays import FloatArray
 PRECISIONS = ("double",)
 """Precisions that a project can be generated for."""
 
-BACKENDS = ("casadi",)
-"""Writers of the kernel."""
+BACKENDS = ("casadi", "tape")
+"""Writers of the kernel: CasADi, or ours from CasADi's instructions."""
 
 KIND = "obsynth C project"
 
@@ -106,7 +108,7 @@ def generate_c(
     folder: str | os.PathLike[str],
     name: str | None = None,
     precision: Literal["double"] = "double",
-    backend: Literal["casadi"] = "casadi",
+    backend: Literal["casadi", "tape"] = "casadi",
     vectors: int = 10_000,
     seed: int = 0,
     overwrite: bool = False,
@@ -128,8 +130,9 @@ def generate_c(
     name : str, optional
         Prefix of every C name; made from the plant's name by default.
     precision : {"double"}
-    backend : {"casadi"}
-        Who writes the kernel.
+    backend : {"casadi", "tape"}
+        Who writes the kernel: CasADi's code generation, or our own from the instructions of the
+        same function, shorter and quicker. Interface and results are the same to the last bit.
     vectors : int
         Number of recorded steps, at least 100.
     seed : int
@@ -167,7 +170,7 @@ def generate_c(
     if start < 0:
         raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
     description = describe(observer, name, memory)
-    kernel = generate_kernel(observer.step, description.name)
+    kernel = _kernel(description, backend)
     recorded = make_vectors(description, count, start)
     files = render(description, kernel, recorded, start_given=memory is not None)
     files[MANIFEST] = _manifest(description, kernel, recorded, start, files)
@@ -189,6 +192,13 @@ def generate_c(
         build=build,
         comparison=comparison,
     )
+
+
+def _kernel(description: Description, backend: str) -> Kernel:
+    step, name = description.observer.step, description.name
+    if backend == "tape":
+        return write_tape(step, name, description.place)
+    return generate_kernel(step, name)
 
 
 def _compared(
@@ -242,7 +252,7 @@ def _manifest(
         "model": {"name": observer.model.name, "sha256": description.model_hash},
         "method": observer.method,
         "precision": PRECISIONS[0],
-        "backend": BACKENDS[0],
+        "backend": kernel.backend,
         "sample_time": description.sample_time,
         "fault_delay": observer.fault_delay,
         "sizes": description.sizes,
@@ -255,6 +265,7 @@ def _manifest(
             "assumptions": list(observer.guarantee.assumptions),
         },
         "operations": kernel.operations,
+        "operation_counts": dict(kernel.counts),
         "library_functions": list(kernel.library),
         "not_defined_to_the_last_bit": list(kernel.inexact),
         "vectors": {

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
-from obsynth.codegen.kernel import Kernel, Machine, c_number
+from obsynth.codegen.kernel import Kernel, Machine, c_literal, c_number
 from obsynth.codegen.vectors import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
@@ -85,6 +85,7 @@ def render(
         autoescape=False,
     )
     environment.filters["number"] = c_number
+    environment.filters["constant"] = lambda value: c_literal(value, f"{description.name}_real_t")
     environment.filters["comment"] = c_comment
     environment.filters["cell"] = lambda text: " ".join(text.replace("|", "\\|").split())
     values = _values(description, kernel, vectors, start_given)

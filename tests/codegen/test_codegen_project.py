@@ -275,7 +275,7 @@ def test_fast_math_is_refused_by_the_sources(
     ("options", "word"),
     [
         ({"precision": "single"}, "available: 'double'"),
-        ({"backend": "tape"}, "available: 'casadi'"),
+        ({"backend": "hand"}, "available: 'casadi', 'tape'"),
         ({"vectors": 99}, "at least 100"),
         ({"vectors": 1e3}, "whole number"),
         ({"seed": -1}, "seed"),

@@ -1,0 +1,334 @@
+"""The arithmetic of one step as C of our own: the instruction tape, one assignment a value.
+
+What runs is what CasADi's virtual machine runs, to the last bit but for which NaN a NaN is:
+
+- `if_else` is on the tape ``(c ? a : 0) + (!c ? b : 0)``. Written is ``c ? a : b``, and ``+ 0.0``
+  behind it where a zero could be negative and its sign be seen: the sum has made it positive.
+- `fmax` and `fmin` of the mathematics library drop a NaN for the other operand, and return the
+  first of two that are equal. Comparisons do the same if they ask for a NaN of the first operand;
+  they need not where one of the two is never a NaN.
+- Comparisons are int; as factors of positive constants they choose the constant or zero.
+- All inputs are read before a result is written, so that states and structs may overlap.
+- Beyond some thousand statements there are several functions, see `parts`.
+- A product is never written into the expression of a sum: what a compiler may fuse by C's rules
+  is not there.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from obsynth.codegen.errors import CodegenError
+from obsynth.codegen.kernel import (
+    OPERATIONS,
+    RESULTS,
+    STEP_INPUTS,
+    Kernel,
+    c_literal,
+    counted,
+    scalar_function,
+)
+from obsynth.codegen.parts import in_parts
+
+_COMPARED = {"lt": "<", "le": "<=", "eq": "==", "ne": "!="}
+_TRUTH = {*_COMPARED, "and", "or", "not"}
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", **_COMPARED, "and": "&&", "or": "||"}
+# operands are written more than once
+_TWICE = {"fmax", "fmin", "sq", "twice", "sign"}
+_CALLED = {name: name for name in ("fabs", "pow", "sqrt", "exp", "log", "sin", "cos", "tan")}
+_CALLED |= {name: name for name in ("asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh")}
+_CALLED |= {name: name for name in ("acosh", "atanh", "atan2", "floor", "ceil", "fmod", "erf")}
+_CALLED |= {name: name for name in ("log1p", "expm1", "hypot", "copysign", "remainder")}
+_CALLED["constpow"] = "pow"
+# -0 in, -0 out, and nothing else depends on the sign of a zero
+_ODD = {"neg", "twice", "sqrt", "sign", "floor", "ceil", "fmax", "fmin", "if_else_zero", "mul"}
+_BLIND = {*_TRUTH, "fabs", "sq"}
+_LONGEST = 60
+
+
+@dataclass(eq=False)
+class _Value:
+    """One value of the tape.
+
+    nan: whether it may be none
+    minus: whether what is written may be -0
+    uses: how many read it
+    signed: whether the sign of a zero is seen by anything
+    product: whether its expression holds a product
+    """
+
+    name: str
+    args: tuple["_Value", ...]
+    number: float = 0.0
+    place: tuple[int, int] = (0, 0)
+    nan: bool = True
+    minus: bool = True
+    uses: int = 0
+    signed: bool = False
+    text: str = ""
+    simple: bool = True
+    product: bool = False
+
+    @property
+    def truth(self) -> bool:
+        return self.name in _TRUTH
+
+
+class _Reader:
+    """The values of a function, equal ones once."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self.values: dict[tuple[object, ...], _Value] = {}
+        self.results: list[tuple[int, int, _Value]] = []
+        work: dict[int, _Value] = {}
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            out, args = function.instruction_output(k), function.instruction_input(k)
+            name = OPERATIONS.get(code, str(code))
+            if name == "output":
+                self.results.append((out[0], out[1], work[args[0]]))
+            elif name == "input":
+                work[out[0]] = self._value(name, (), place=(args[0], args[1]))
+            elif name == "const":
+                work[out[0]] = self.constant(function.instruction_constant(k))
+            elif name == "assign":
+                work[out[0]] = work[args[0]]
+            else:
+                work[out[0]] = self._operation(name, tuple(work[a] for a in args))
+
+    def constant(self, number: float) -> _Value:
+        """Return a constant."""
+        return self._value("const", (), number=number)
+
+    def _operation(self, name: str, args: tuple[_Value, ...]) -> _Value:
+        if name == "add":
+            for one, other in (args, args[::-1]):
+                if one.name == other.name == "if_else_zero" and _opposite(one, other):
+                    return self._value("choose", (one.args[0], one.args[1], other.args[1]))
+        if name == "mul":
+            for factor, truth in (args, args[::-1]):
+                if truth.truth and factor.name == "const" and 0 < factor.number < float("inf"):
+                    return self._value("if_else_zero", (truth, factor))
+        if name not in {*_INFIX, *_TWICE, *_CALLED, "not", "neg", "inv", "if_else_zero"}:
+            raise CodegenError(
+                f"the step uses the operation {name!r} of CasADi, which C99 does not have: write"
+                " the equations without it",
+                symbol=name,
+            )
+        return self._value(name, args)
+
+    def _value(
+        self,
+        name: str,
+        args: tuple[_Value, ...],
+        number: float = 0.0,
+        place: tuple[int, int] = (0, 0),
+    ) -> _Value:
+        key = (name, *map(id, args), repr(number), place)
+        if key not in self.values:
+            value = _Value(name, args, number, place)
+            value.nan, value.minus = _may_be(value)
+            self.values[key] = value
+        return self.values[key]
+
+    def used(self) -> list[_Value]:
+        """Return the values that results need, in their order; count uses and see signs."""
+        for *_, value in self.results:
+            value.uses += 1
+            value.signed = True
+        for value in reversed(self.values.values()):
+            if value.uses:
+                seen = _seen(value)
+                for argument, sign in zip(value.args, seen, strict=True):
+                    argument.uses += 1
+                    argument.signed |= sign
+        return [value for value in self.values.values() if value.uses]
+
+
+def _opposite(one: _Value, other: _Value) -> bool:
+    return other.args[0].name == "not" and other.args[0].args[0] is one.args[0]
+
+
+def _may_be(value: _Value) -> tuple[bool, bool]:
+    """Return whether a value may be a NaN, and whether what is written may be -0."""
+    name, args = value.name, value.args
+    if name == "const":
+        return value.number != value.number, repr(value.number) == "-0.0"
+    if name in _TRUTH:
+        return False, False
+    if name in {"fabs", "sq"}:
+        return args[0].nan, False
+    if name in {"neg", "sign", "floor", "ceil"}:
+        return args[0].nan, True
+    if name in {"fmax", "fmin"}:
+        return args[0].nan and args[1].nan, args[0].minus or args[1].minus
+    if name == "if_else_zero":
+        return args[1].nan, args[1].minus
+    if name == "choose":
+        return args[1].nan or args[2].nan, args[1].minus or args[2].minus
+    if name == "add":
+        return True, args[0].minus and args[1].minus
+    if name in {"sub", "twice", "sqrt"}:
+        return True, args[0].minus
+    return True, True
+
+
+def _seen(value: _Value) -> list[bool]:
+    """Return of which operands the sign of a zero is seen."""
+    name, args = value.name, value.args
+    if name == "choose" or name in _BLIND:
+        return [False] * len(args)
+    if name in {"add", "sub"}:
+        # a sum is -0 only if both terms are; if one never is, the other's sign changes nothing
+        hidden = not value.minus
+        return [value.signed and not hidden] * 2
+    if name in _ODD:
+        return [value.signed] * len(args)
+    if name == "div":
+        return [value.signed, True]
+    return [True] * len(args)
+
+
+class _Writer:
+    """C text of values."""
+
+    def __init__(self, real: str) -> None:
+        self.real = real
+        self.lines: list[str] = []
+        self.library: set[str] = set()
+        self.count = 0
+
+    def write(self, values: Sequence[_Value], places: Mapping[tuple[int, int], str]) -> None:
+        """Write values in their order, those that one other reads into its expression."""
+        readers = {id(a): value for value in values for a in value.args}
+        for value in values:
+            if value.name == "const":
+                value.text = self.literal(value.number)
+                value.simple = not value.text.startswith("-")
+            elif value.name == "input":
+                self._name(value, places[value.place])
+        for value in values:
+            if value.name in {"const", "input"}:
+                continue
+            text = self._expression(value)
+            reader = readers.get(id(value))
+            value.product = value.name in {"mul", "sq"} or any(a.product for a in value.args)
+            if value.uses > 1 or reader is None or not _joins(value, reader, text):
+                self._name(value, text)
+            else:
+                value.text, value.simple = text, value.name in _CALLED
+
+    def literal(self, number: float) -> str:
+        """Return a constant of the type."""
+        return c_literal(number, self.real)
+
+    def result(self, value: _Value) -> str:
+        """Return a value as a number that is assigned."""
+        return f"({self.real}){self.atom(value)}" if value.truth else value.text
+
+    def atom(self, value: _Value) -> str:
+        """Return a value as an operand."""
+        return value.text if value.simple else f"({value.text})"
+
+    def _name(self, value: _Value, text: str) -> None:
+        kind = "int" if value.truth else self.real
+        value.text, value.simple, value.product = f"t{self.count}", True, False
+        self.count += 1
+        self.lines.append(f"const {kind} {value.text} = {text};")
+
+    def _number(self, value: _Value) -> str:
+        return f"({self.real}){self.atom(value)}" if value.truth else self.atom(value)
+
+    def _condition(self, value: _Value) -> str:
+        if value.truth:
+            return self.atom(value)
+        return f"({self.atom(value)} != {self.literal(0.0)})"
+
+    def _expression(self, value: _Value) -> str:
+        name, args = value.name, value.args
+        if name in {"and", "or"}:
+            return f"{self._condition(args[0])} {_INFIX[name]} {self._condition(args[1])}"
+        if name == "not":
+            return f"!{self._condition(args[0])}"
+        if name == "if_else_zero":
+            zero = self.literal(0.0)
+            return f"{self._condition(args[0])} ? {self._number(args[1])} : {zero}"
+        if name == "choose":
+            then, other = self._number(args[1]), self._number(args[2])
+            text = f"{self._condition(args[0])} ? {then} : {other}"
+            return f"({text}) + {self.literal(0.0)}" if value.signed and value.minus else text
+        if name in _CALLED:
+            self.library.add(_CALLED[name])
+            return f"{_CALLED[name]}({', '.join(map(self.result, args))})"
+        numbers = [self._number(argument) for argument in args]
+        if name in {"fmax", "fmin"}:
+            return self._extreme(value, *numbers)
+        written: dict[str, Callable[[], str]] = {
+            "sq": lambda: f"{numbers[0]} * {numbers[0]}",
+            "twice": lambda: f"{numbers[0]} + {numbers[0]}",
+            "neg": lambda: f"-{numbers[0]}",
+            "inv": lambda: f"{self.literal(1.0)} / {numbers[0]}",
+            "sign": lambda: self._sign(numbers[0]),
+        }
+        return written[name]() if name in written else f" {_INFIX[name]} ".join(numbers)
+
+    def _extreme(self, value: _Value, x: str, y: str) -> str:
+        """Return the larger or smaller of two: the first where they are equal, no NaN if one is."""
+        first, second = value.args
+        low, high = (x, y) if value.name == "fmax" else (y, x)
+        if not first.nan:
+            return f"({low} < {high}) ? {y} : {x}"
+        if not second.nan:
+            return f"({high} <= {low}) ? {x} : {y}"
+        return f"(({low} < {high}) || ({x} != {x})) ? {y} : {x}"
+
+    def _sign(self, x: str) -> str:
+        zero, one = self.literal(0.0), self.literal(1.0)
+        return f"({x} < {zero}) ? -{one} : (({x} > {zero}) ? {one} : {x})"
+
+
+def _joins(value: _Value, reader: _Value, text: str) -> bool:
+    """Whether an expression may stand inside of that of its reader."""
+    fused = value.product and reader.name in {"add", "sub", "choose"}
+    return not fused and reader.name not in _TWICE and len(text) <= _LONGEST
+
+
+def write_tape(
+    step: ca.Function,
+    prefix: str,
+    places: Callable[[str, int], str] = lambda port, i: f"{port}[{i}]",
+) -> Kernel:
+    """Write the arithmetic of a step as one static C function of its structs.
+
+    places: how entry i of ``memory, u, y, theta, next, xhat, ...`` is called in C
+    """
+    function = scalar_function(step)
+    reader = _Reader(function)
+    values = reader.used()
+    real = f"{prefix}_real_t"
+    inputs = [value.place for value in values if value.name == "input"]
+    writer = _Writer(real)
+    writer.write(values, {(k, i): places(STEP_INPUTS[k], i) for k, i in inputs})
+    status = RESULTS.index("status")
+    told = [(k, i, value) for k, i, value in reader.results if k != status]
+    stores = [f"{places(RESULTS[k], i)} = {writer.result(value)};" for k, i, value in told]
+    returned = [writer.result(value) for k, _, value in reader.results if k == status]
+    loads = writer.lines[: len(inputs)]
+    functions, lines = in_parts(
+        loads, writer.lines[len(inputs) :], [*stores, f"return {returned[0]};"], prefix
+    )
+    if not any(STEP_INPUTS[k] != "memory" for k, _ in inputs):
+        lines = [*lines[:-1], "(void)in;", lines[-1]]
+    body = "\n".join(f"    {line}".rstrip() for line in lines)
+    head = f"{prefix}_state_t *state, const {prefix}_in_t *in, {prefix}_out_t *out"
+    return Kernel(
+        backend="tape",
+        functions="\n\n".join(
+            [*functions, f"static {real} {prefix}_kernel(\n    {head})\n{{\n{body}\n}}"]
+        ),
+        arguments=("state", "in", "out"),
+        library=tuple(sorted(writer.library)),
+        operations=int(function.n_instructions()),
+        counts=counted(value.name for value in values),
+    )
