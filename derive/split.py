@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import casadi as ca
@@ -80,10 +79,6 @@ class Split:
         >>> bool(abs(np.array(g)).max() < 1e-12)
         True
         """
-        return self._g_function
-
-    @cached_property
-    def _g_function(self) -> ca.Function:
         kinds = ["x", "u"] + [k for k in ("p", "rho") if self.model.names(k)]
         return sx_function("g", {k: _symbols(self.model, k) for k in kinds}, {"g": self.g})
 

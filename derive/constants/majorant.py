@@ -247,12 +247,9 @@ def _fixed(
     given: dict[int, float] = {}
     for name, value in (fixed or {}).items():
         if str(name) not in names or shape == "scalar":
-            raise DerivationError(
-                f"fixed= names {name}, but "
-                + ("a scalar majorant has nothing to fix" if shape == "scalar" else "")
-                + ("" if shape == "scalar" else f"the states are {', '.join(names)}"),
-                symbol=str(name),
-            )
+            scalar = "a scalar majorant has nothing to fix"
+            why = scalar if shape == "scalar" else f"the states are {', '.join(names)}"
+            raise DerivationError(f"fixed= names {name}, but {why}", symbol=str(name))
         if not 0.0 < float(value) < np.inf:
             raise DerivationError(
                 f"the fixed element of {name} has to be positive and finite; given was {value}",

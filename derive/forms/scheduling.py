@@ -7,7 +7,6 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.connected import connected
-from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.zero_test import prove_zero
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.forms.measured import known_signals
@@ -18,6 +17,7 @@ from obsynth.derive.jacobian.family import (
     AffineFamily,
     build_family,
     find_dependences,
+    monomials,
 )
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.symbolic.plant import Plant
@@ -203,13 +203,13 @@ def _scalars(
 
     direct: set[Entry] = set()
     places = list(parts)
-    for together in connected(monomials for _, monomials in parts.values()):
+    for together in connected(functions for _, functions in parts.values()):
         group = sorted(places[k] for k in together)
-        monomials = list(dict.fromkeys(m for place in group for m in parts[place][1]))
+        functions = list(dict.fromkeys(m for place in group for m in parts[place][1]))
         independent = [place for place in group if place in basis]
-        if len(monomials) <= len(independent):
+        if len(functions) <= len(independent):
             direct.update(group)
-            for monomial in monomials:
+            for monomial in functions:
                 add(monomial)
         else:
             for place in independent:
@@ -248,14 +248,8 @@ def _declared_first(
 
 def _monomials(entry: sp.Expr, known: set[sp.Symbol]) -> tuple[sp.Expr, dict[sp.Expr, sp.Expr]]:
     """Constant part, and the coefficients of the products of varying factors."""
-    constant: sp.Expr = sp.Integer(0)
-    found: dict[sp.Expr, sp.Expr] = {}
-    for term in expand_terms(entry):
-        coefficient, monomial = term.as_independent(*known, as_Add=False)
-        if monomial == 1:
-            constant += coefficient
-        else:
-            found[monomial] = found.get(monomial, sp.Integer(0)) + coefficient
+    found = monomials(entry, known)
+    constant = found.pop(sp.Integer(1), sp.Integer(0))
     return constant, {m: c for m, c in found.items() if c != 0}
 
 

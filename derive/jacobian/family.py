@@ -209,7 +209,6 @@ def build_family(
     dependences: Sequence[AffineDependence],
     ranges: Mapping[Entry, tuple[float, float]],
     supports: Mapping[Entry, tuple[str, ...]],
-    name: str = "m",
 ) -> AffineFamily:
     """Assemble the family from independent entries and proved dependences.
 
@@ -240,13 +239,9 @@ def build_family(
             error += operations * UNIT_ROUNDOFF * magnitude
         if error > 0.0:
             radius[entry] = up(error * (1.0 + 16 * UNIT_ROUNDOFF))
-    seen: set[str] = set()
-    disjoint = True
-    for entry in basis:
-        names = set(supports[entry])
-        disjoint = disjoint and not (names & seen)
-        seen |= names
-    labels = tuple(f"{entry_name(entry, name)}({', '.join(supports[entry])})" for entry in basis)
+    names = [name for entry in basis for name in set(supports[entry])]
+    disjoint = len(names) == len(set(names))
+    labels = tuple(f"{entry_name(entry)}({', '.join(supports[entry])})" for entry in basis)
     return AffineFamily(
         constant,
         directions,
@@ -262,10 +257,10 @@ _LARGEST_DENOMINATOR = 1000
 _ROUNDING = 1e-14
 
 
-def entry_name(entry: Entry, name: str = "m") -> str:
+def entry_name(entry: Entry) -> str:
     """Return what an entry is called in texts, counted from 1. Shapes: entry (int, int)."""
     i, j = entry[0] + 1, entry[1] + 1
-    return f"{name}{i}{j}" if max(i, j) < 10 else f"{name}{i},{j}"
+    return f"m{i}{j}" if max(i, j) < 10 else f"m{i},{j}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +279,6 @@ class AffineDependence:
         How the difference was proved to be zero.
     shared : tuple of str
         Names of the variables on which the entries depend.
-    name : str
-        How entries are called, for the text.
     size : float
         Largest magnitude of the entry at the samples; the text does not add constants to it that
         the rounding of a matrix has left.
@@ -296,7 +289,6 @@ class AffineDependence:
     constant: sp.Expr
     proof: str
     shared: tuple[str, ...]
-    name: str = "m"
     size: float = 0.0
 
     def __str__(self) -> str:
@@ -304,7 +296,7 @@ class AffineDependence:
         for other, coefficient in self.coefficients.items():
             number = float(coefficient.evalf(17))
             factor = {1.0: "", -1.0: "-"}.get(number, f"{number:.6g} ")
-            terms.append(f"{factor}{entry_name(other, self.name)}")
+            terms.append(f"{factor}{entry_name(other)}")
         constant = float(sp.N(self.constant, 17))
         small = bool(terms) and abs(constant) <= _ROUNDING * self.size
         if not terms or (constant != 0.0 and not small):
@@ -317,11 +309,11 @@ class AffineDependence:
             if len(self.coefficients) == 1
             else (f"all depend on {', '.join(self.shared)}" if self.coefficients else "constant")
         )
-        left = entry_name(self.entry, self.name)
+        left = entry_name(self.entry)
         return f"{left} = {text}: {reason}; difference proved zero ({self.proof})"
 
 
-def _monomials(entry: sp.Expr, variables: set[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
+def monomials(entry: sp.Expr, variables: set[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
     """Coefficients of the products of non-constant factors; the constant stands at 1."""
     found: dict[sp.Expr, sp.Expr] = {}
     for term in expand_terms(entry):
@@ -361,7 +353,6 @@ def find_dependences(
     entries: Mapping[Entry, sp.Expr],
     samples: Mapping[Entry, FloatArray],
     variables: Sequence[sp.Symbol],
-    name: str = "m",
 ) -> tuple[list[Entry], list[AffineDependence]]:
     """Split entries into independent ones and ones that depend affinely on them."""
     known = set(variables)
@@ -371,7 +362,7 @@ def find_dependences(
     columns: list[FloatArray] = []
     units: list[float] = []
     dependences: list[AffineDependence] = []
-    prover = _Prover(entries, known, name)
+    prover = _Prover(entries, known)
     for entry in sorted(entries, key=lambda e: _preferred(e, entries[e], known)):
         # in units of the largest value: the square of exp(400) is no double, nor that of exp(-400)
         largest = float(np.abs(samples[entry]).max(initial=0.0))
@@ -405,11 +396,9 @@ def find_dependences(
 class _Prover:
     """Turns a proposed dependence into a proved one."""
 
-    def __init__(
-        self, entries: Mapping[Entry, sp.Expr], variables: set[sp.Symbol], name: str
-    ) -> None:
-        self.entries, self.variables, self.name = entries, variables, name
-        self.parts = {e: _monomials(expression, variables) for e, expression in entries.items()}
+    def __init__(self, entries: Mapping[Entry, sp.Expr], variables: set[sp.Symbol]) -> None:
+        self.entries, self.variables = entries, variables
+        self.parts = {e: monomials(expression, variables) for e, expression in entries.items()}
 
     def constant(self, entry: Entry) -> AffineDependence | None:
         return self._accept(entry, {})
@@ -440,6 +429,4 @@ class _Prover:
             return None
         involved = (entry, *coefficients)
         shared = {s for e in involved for s in self.entries[e].free_symbols & self.variables}
-        return AffineDependence(
-            entry, coefficients, rest, proof, tuple(sorted(map(str, shared))), self.name
-        )
+        return AffineDependence(entry, coefficients, rest, proof, tuple(sorted(map(str, shared))))
