@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import factorial
 from typing import Any
 
 import casadi as ca
@@ -11,8 +12,8 @@ import sympy as sp
 # left out is below 1e-16 there. A constant patch would have a wrong derivative, and a
 # division by x itself would have no bound on an interval that contains zero.
 _PATCH = 1.0 / 8.0
-_SINC = (1, -6, 120, -5040, 362880, -39916800)
-_PHI1 = (1, 2, 6, 24, 120, 720, 5040, 40320, 362880, 3628800, 39916800)
+_SINC = tuple((-1) ** k / factorial(2 * k + 1) for k in range(6))
+_PHI1 = tuple(1.0 / factorial(k + 1) for k in range(11))
 _TANHC = (
     1.0,
     -1.0 / 3.0,
@@ -90,25 +91,20 @@ class tanhc(_Quotient):
         return sp.Piecewise((slope, sp.Ne(x, 0)), (0, True))
 
 
-def _patched(x: ca.SX, numerator: ca.SX, variable: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:
-    """Return numerator/x, or the polynomial in ``variable`` near zero."""
-    polynomial = ca.SX(coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        polynomial = polynomial * variable + coefficient
-    quotient = x * numerator / ca.fmax(x * x, _PATCH**2)
-    return ca.if_else(ca.fabs(x) < _PATCH, polynomial, quotient)
+def _patched(
+    numerator: Callable[[ca.SX], ca.SX], coefficients: tuple[float, ...], even: bool = True
+) -> Callable[[ca.SX], ca.SX]:
+    """Return numerator/x as a function of x, near zero the polynomial in x^2, or in x."""
 
+    def build(x: ca.SX) -> ca.SX:
+        variable = x * x if even else x
+        polynomial = ca.SX(coefficients[-1])
+        for coefficient in reversed(coefficients[:-1]):
+            polynomial = polynomial * variable + coefficient
+        quotient = x * numerator(x) / ca.fmax(x * x, _PATCH**2)
+        return ca.if_else(ca.fabs(x) < _PATCH, polynomial, quotient)
 
-def _sinc(x: ca.SX) -> ca.SX:
-    return _patched(x, ca.sin(x), x * x, tuple(1.0 / c for c in _SINC))
-
-
-def _phi1(x: ca.SX) -> ca.SX:
-    return _patched(x, ca.expm1(x), x, tuple(1.0 / c for c in _PHI1))
-
-
-def _tanhc(x: ca.SX) -> ca.SX:
-    return _patched(x, ca.tanh(x), x * x, _TANHC)
+    return build
 
 
 def _heaviside(x: ca.SX, at_zero: ca.SX | None = None) -> ca.SX:
@@ -168,9 +164,9 @@ _TABLE = (
     NamedFunction("Max", sp.Max, _fold(ca.fmax), 1, None),
     NamedFunction("Min", sp.Min, _fold(ca.fmin), 1, None),
     NamedFunction("Heaviside", sp.Heaviside, _heaviside, 1, 2),
-    NamedFunction("sinc", sp.sinc, _sinc),
-    NamedFunction("phi1", phi1, _phi1),
-    NamedFunction("tanhc", tanhc, _tanhc),
+    NamedFunction("sinc", sp.sinc, _patched(ca.sin, _SINC)),
+    NamedFunction("phi1", phi1, _patched(ca.expm1, _PHI1, even=False)),
+    NamedFunction("tanhc", tanhc, _patched(ca.tanh, _TANHC)),
 )
 
 BY_NAME = {function.name: function for function in _TABLE}

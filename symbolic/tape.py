@@ -46,10 +46,6 @@ def _guarded(value: sp.Expr) -> tuple[sp.Expr, sp.Basic] | None:
     return None
 
 
-def _if_else_zero(condition: sp.Basic, value: sp.Basic) -> sp.Expr:
-    return sp.Piecewise((_number(value), _condition(condition)), (0, True))
-
-
 _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_ASSIGN: lambda a: a,
     ca.OP_ADD: _add,
@@ -95,7 +91,7 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_NOT: lambda a: sp.Not(_condition(a)),
     ca.OP_AND: lambda a, b: sp.And(_condition(a), _condition(b)),
     ca.OP_OR: lambda a, b: sp.Or(_condition(a), _condition(b)),
-    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    ca.OP_IF_ELSE_ZERO: lambda c, a: sp.Piecewise((_number(a), _condition(c)), (0, True)),
 }
 
 

@@ -11,7 +11,6 @@ from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.matrix_maximum import EntryRanges, matrix_maximum
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.derive.rigour import rational, up
 from obsynth.symbolic.arrays import FloatArray
@@ -63,15 +62,7 @@ def largest_value(
     expression: ca.SX, entries: MatrixEntries, rtol: float, effort: str, method: str
 ) -> Maximum:
     """Bound the largest value of an expression in the entries."""
-    found = bound_ranges(
-        expression,
-        entries.variables,
-        entries.box,
-        entries.constants,
-        entries.constant_box,
-        rtol=rtol,
-        effort=effort,
-    )
+    found = entries.search(rtol, effort, expression)
     for failure in found.failures:
         rows = tuple(sorted({entries.model.names("x")[i] for i, _ in entries.places}))
         raise UnboundedError(

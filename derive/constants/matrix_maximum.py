@@ -9,7 +9,7 @@ from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum, largest_over_box
 from obsynth.derive.constants.interval_matrix import augment, eigenvalue_over_interval
 from obsynth.derive.constants.symmetric_field import SymmetricField
-from obsynth.derive.intervals.ranges import Status, bound_ranges
+from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.rigour import UNIT_ROUNDOFF, down, largest_eigenvalue, perron_bound, up
 from obsynth.symbolic.arrays import FloatArray
@@ -198,15 +198,7 @@ def _root_of_squares(
 ) -> Maximum:
     """Bound sqrt(sum of squares): the largest eigenvalue of entries in one row and column."""
     chosen = entries.take(inside)
-    found = bound_ranges(
-        ca.sumsqr(chosen.values),
-        chosen.variables,
-        chosen.box,
-        chosen.constants,
-        chosen.constant_box,
-        rtol=rtol,
-        effort=effort,
-    )
+    found = chosen.search(rtol, effort, ca.sumsqr(chosen.values))
     upper = float(up(np.sqrt(max(found.upper[0], 0.0))))
     attained = float(np.nextafter(np.sqrt(max(found.attained_upper[0], 0.0)), 0.0))
     at = chosen.named(found.points_upper[0])

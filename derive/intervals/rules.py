@@ -70,10 +70,6 @@ NAMES: dict[int, str] = {
 _HALF = float(np.nextafter(0.5 * np.pi, np.inf))
 
 
-def _acos(a: Interval) -> Interval:
-    return ar.negate(_MINUS_ACOS(a))
-
-
 _MINUS_ACOS = fn.increasing(
     lambda v: -np.arccos(v), -float(np.nextafter(np.pi, np.inf)), 0.0, (-1.0, 1.0)
 )
@@ -103,7 +99,7 @@ RULES: dict[str, Callable[..., Interval]] = {
     "acosh": fn.increasing(np.arccosh, 0.0, domain=(1.0, np.inf)),
     "atanh": fn.increasing(np.arctanh, domain=(-1.0, 1.0)),
     "asin": fn.increasing(np.arcsin, -_HALF, _HALF, (-1.0, 1.0)),
-    "acos": _acos,
+    "acos": lambda a: ar.negate(_MINUS_ACOS(a)),
     "atan": fn.increasing(np.arctan, -_HALF, _HALF),
     "erf": fn.increasing(_erf, -1.0, 1.0),
     "sine": fn.sine,

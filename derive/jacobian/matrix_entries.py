@@ -179,10 +179,12 @@ def matrix_entries(
     entries: Mapping[Entry, sp.Expr], model: Plant, more: Sequence[Signal] = ()
 ) -> MatrixEntries:
     """Prepare exact expressions of a plant's signals for the interval engine."""
+    values = model.constant_values
+    # denominators stay whole: written out, 1/(1 + (a - b)^2) has no bound over a box
     exact = {
         place: expression
         for place in sorted(entries)
-        if (expression := _expanded(substitute(entries[place], model.constant_values))) != 0
+        if (expression := sp.Add(*expand_terms(substitute(entries[place], values)))) != 0
     }
     present = {s for expression in exact.values() for s in expression.free_symbols}
     available = [*(s for kind in KINDS for s in getattr(model, kind)), *more]
@@ -193,10 +195,9 @@ def matrix_entries(
     columns = {s.symbol: ca.SX.sym(s.name) for s in signals}
     held = {dummy: ca.SX.sym(f"number{k}") for k, dummy in enumerate(numbers.values())}
     labels = [f"entry ({i + 1}, {j + 1})" for i, j in exact]
-    values = to_sx(rows, columns | held, labels)
     return MatrixEntries(
         exact,
-        column(values),
+        column(to_sx(rows, columns | held, labels)),
         column(list(columns.values())),
         tuple(s.name for s in signals),
         tuple(columns),
@@ -205,11 +206,6 @@ def matrix_entries(
         [enclose_number(number) for number in numbers],
         model,
     )
-
-
-def _expanded(expression: sp.Expr) -> sp.Expr:
-    # denominators stay whole: written out, 1/(1 + (a - b)^2) has no bound over a box
-    return sp.Add(*expand_terms(expression))
 
 
 def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
@@ -221,8 +217,10 @@ def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
     if not expression.args:
         return expression
     if expression.is_Pow:
-        # the exponent stays: whether it is an integer decides about the domain
-        return sp.Pow(_hoist(expression.base, numbers), _exponent(expression.exp, numbers))
+        # a rational exponent stays: whether it is an integer decides about the domain
+        power = expression.exp
+        power = power if power.is_Rational else _hoist(power, numbers)
+        return sp.Pow(_hoist(expression.base, numbers), power)
     if expression.is_Add or expression.is_Mul:
         numeric = [a for a in expression.args if a.is_number]
         if len(numeric) > 1:
@@ -233,10 +231,6 @@ def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
             ]
             return expression.func(*parts)
     return expression.func(*(_hoist(a, numbers) for a in expression.args))
-
-
-def _exponent(exponent: sp.Expr, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
-    return exponent if exponent.is_Rational else _hoist(exponent, numbers)
 
 
 def _is_short(number: sp.Rational) -> bool:

@@ -194,10 +194,6 @@ def _half(graph: Graph, inner: int, n: int) -> int:
     return graph.plain("multiply", [whole, root])
 
 
-def _square(graph: Graph, args: list[int]) -> int:
-    return _power(graph, args[0], 2)
-
-
 def _multiply(graph: Graph, args: list[int]) -> int:
     a, b = args
     shorter = cancelled(graph, a, b, 1)
@@ -361,12 +357,8 @@ def _inverse(graph: Graph, args: list[int]) -> int:
     return _divide(graph, [graph.number(1.0, 1.0), args[0]])
 
 
-def _not_equal(graph: Graph, args: list[int]) -> int:
-    return graph.append(Node("logical_not", (graph.plain("equal", args),)))
-
-
 REWRITES: dict[str, Callable[[Graph, list[int]], int]] = {
-    "square": _square,
+    "square": lambda graph, args: _power(graph, args[0], 2),
     "multiply": _multiply,
     "divide": _divide,
     "add": _add,
@@ -377,7 +369,9 @@ REWRITES: dict[str, Callable[[Graph, list[int]], int]] = {
     "power": _power_const,
     "power_const": _power_const,
     "inverse": _inverse,
-    "not_equal": _not_equal,
+    "not_equal": lambda graph, args: graph.append(
+        Node("logical_not", (graph.plain("equal", args),))
+    ),
     "twice": lambda graph, args: graph.append(Node("twice", (args[0],))),
     "assign": lambda _graph, args: args[0],
 }
