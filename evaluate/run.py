@@ -1,7 +1,7 @@
 """What a simulation gives: the truth, the claims about it, and whether they hold."""
 
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -218,7 +218,7 @@ class Run:
         for name in self.estimated:
             trace, width = self[name], self.widths[name]
             ends = float(width[0]), float(width[-1])
-            rows.append([trace.label, covered(self, name), rms[name], *ends])
+            rows.append([trace.label, covered([self], name), rms[name], *ends])
             if self.alarm is not None:
                 raised = None if trace.alarm is None else np.flatnonzero(trace.alarm)
                 first = None if raised is None or not raised.size else float(trace.t[raised[0]])
@@ -280,9 +280,10 @@ def _bounds(trace: Trace) -> tuple[FloatArray, FloatArray]:
     return trace.lower, trace.upper
 
 
-def covered(run: Run, name: str) -> str:
-    """Write the coverage of a signal for a table; ``n/a`` where the method does not bound it."""
-    return percent(run.coverage[name]) if name in run.bounded else "n/a"
+def covered(runs: Sequence[Run], name: str) -> str:
+    """Write the smallest coverage of a signal; ``n/a`` where the method does not bound it."""
+    found = [run.coverage[name] for run in runs if name in run.bounded]
+    return percent(min(found)) if found else "n/a"
 
 
 def percent(fraction: float) -> str:

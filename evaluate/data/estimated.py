@@ -296,23 +296,16 @@ class Estimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the estimate says as numbers for JSON; what is no finite number is None."""
-        alarms = {
-            name: {"count": len(at), "first": int(at[0]) if at.size else None}
-            for name, at in self.alarms().items()
-        }
-        refuted, numbers = (
-            self.refuted,
-            ("fault_delay", "status_shares", "first", "consistent", "use"),
-        )
+        names = ("method", "fault_delay", "status_shares", "first", "consistent", "use")
+        refuted = self.refuted
         told: dict[str, Any] = {
-            "method": self.method,
+            **{name: getattr(self, name) for name in names},
             "model": self.observer.model.name,
             "source": self.record.source,
             "instants": len(self.t),
-            **{name: getattr(self, name) for name in numbers},
             "widths": self.widths(),
             "conflict": self.conflict.tolist(),
-            "alarms": alarms,
+            "alarms": {name: at.tolist() for name, at in self.alarms().items()},
             "refuted": None if refuted is None else {**vars(refuted), "said": str(refuted)},
             "notes": list(self.record.notes),
         }

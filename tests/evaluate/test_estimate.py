@@ -305,7 +305,7 @@ def test_what_is_shown(told, tmp_path):
     assert [ax.get_ylabel() for ax in told.plot()] == ["e1 [V]", "h2 [V]", "e3 [V]", "leak [V/s]"]
     ob.plot_signal(told, "leak")
     numbers = json.loads(json.dumps(told.to_dict(), allow_nan=False))
-    assert numbers["alarms"]["leak"]["first"] == 25 and numbers["refuted"] is None
+    assert numbers["alarms"]["leak"][0] == 25 and numbers["refuted"] is None
 
 
 def test_a_record_of_another_plant_is_refused(told):
