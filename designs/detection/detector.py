@@ -59,9 +59,8 @@ class FaultDetector:
         count, for example ``("outside_domain",)``. Samples that are not initialised, void or
         recovering, saw an input that is not finite or have no valid fault interval never count.
     window : int, optional
-        A number m of instants: the step then returns the mean of every fault over the m instants
-        before the one of the call too, guaranteed for any course of the fault, and zero outside of
-        it counts towards the alarm as well.
+        A number m of instants, over which the step then returns the mean of every fault too,
+        guaranteed for any course of the fault.
 
     Raises
     ------
@@ -90,12 +89,11 @@ class FaultDetector:
     remain inside an interval that holds zero for ever. Where a method does not predict its
     steady widths nothing is promised.
 
-    **Window.** At call k the mean of f over k - m..k - 1 is enclosed by what the states moved in
-    that time and the sets of these instants (``designs/detection/window.py`` has the formula), far
-    narrower than at one instant. ``mean_status`` joins the statuses of the calls k - m..k; its bit
-    16 says that there are no m instants yet, since the first call, a void one or a missing input.
-    Such means, and those at whose calls a sample did not count, are left out of the alarm. A mean
-    may keep the alarm up for m - 1 instants after the fault's end.
+    **Window.** At call k the mean of f over k - m..k - 1 is enclosed by what the states moved
+    meanwhile (see ``docs/step.md``), far narrower than f at one instant. ``mean_status`` joins the
+    statuses of these calls; its bit 16 says that there are fewer than m since the first, a void one
+    or a missing input. Where it lets a sample count, a mean without zero counts as f does; it may
+    keep the alarm up for m - 1 instants after the fault's end.
 
     The detector can be simulated and turned into C like an observer: its step has the
     observer's outputs and, behind them, ``alarm`` (n_f,), each 0 or 1; with a window also
@@ -201,7 +199,7 @@ class FaultDetector:
     @cached_property
     def mean(self) -> Window | None:
         """The recursion of the means; None without a window."""
-        return None if self.window is None else window_of(self.observer, self.window)
+        return None if self.window is None else Window(self.observer, self.window)
 
     @cached_property
     def decide(self) -> ca.Function:
@@ -243,9 +241,8 @@ class FaultDetector:
         """Observer and decision as one step, with the further output ``alarm``.
 
         (memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
-        status, alarm); the memory is the observer's with the counters behind it. With a window,
-        what its means remember stands behind these, and (mean_lower, mean_upper, mean_status)
-        behind the alarm.
+        status, alarm[, mean_lower, mean_upper, mean_status]); the memory is the observer's with
+        the counters, and what the means remember, behind it.
         """
         step, layout = self.observer.step, self.memory_layout
         n_memory, names = int(step.numel_in(0)), list(step.name_in())
@@ -411,9 +408,8 @@ class FaultDetector:
         """Return mean_lower, mean_upper, mean_status of a run; nothing without a window."""
         if self.mean is None:
             return []
-        theta = np.zeros((len(run.t), 0))
-        if self.mean.scheduled:
-            theta = run.rho[:, [i for i, s in enumerate(self.model.rho) if s.measured]]
+        known = [s.name for s in self.model.rho if s.measured and self.mean.sizes["theta"]]
+        theta = run.rho[:, [run.names["rho"].index(name) for name in known]] if known else ()
         sets = (run.x_lower, run.x_upper, run.f_lower, run.f_upper, run.status)
         return self.mean.over(run.u, theta, *sets)
 
@@ -459,20 +455,6 @@ def _bounded_faults(observer: Observer) -> NDArray[np.bool_]:
 def _told(bound: ca.SX, told: ca.SX) -> bool:
     slopes = ca.gradient(bound, told)
     return not all(slopes[i].is_zero() for i in range(slopes.numel()))
-
-
-def window_of(observer: Any, m: int) -> Window:
-    """Return the means over m instants of what an observer says."""
-    design = getattr(getattr(observer, "certificate", None), "design", None)
-    return Window(
-        observer.model,
-        m,
-        observer.fault_delay,
-        moving=observer.ode is None,
-        scheduled=observer.step.n_in() > 3,
-        half_widths=observer.half_widths,
-        precision=getattr(design, "precision", "double"),
-    )
 
 
 def _whole_numbers(

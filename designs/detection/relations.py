@@ -51,7 +51,7 @@ def relations(
     for s in (*plant.x, *unknown[n + n_f :], *known):
         middle = 0.5 * (s.lower + s.upper) if s.bounded else 0.0
         at[s.symbol] = middle if s.nominal is None else float(s.nominal)
-    numbers = np.array([at[s] for s in symbols])
+    numbers = np.split([at[s] for s in symbols], [len(unknown)])
     found = []
     pairs = _combined(plant) if _is_short(plant) else []
     for j, (cx, row) in [(j, pair) for j in range(n_f) for pair in pairs]:
@@ -65,7 +65,7 @@ def relations(
         pair = _spread(row - cx, 1 / slope) - fault, _spread(cx, 1 / slope)
         code = ca.vertcat(*to_sx(pair, places, [f"the mean of {fault}"] * 2))
         J = ca.Function("J", ports, [ca.densify(ca.jacobian(code, ports[0]))])
-        slopes = np.abs(np.array(J(numbers[: len(unknown)], numbers[len(unknown) :])))
+        slopes = np.abs(np.array(J(*numbers)))
         wide = (slopes * np.where(slopes == 0.0, 0.0, sizes)).sum(axis=1) @ [1.0, 2.0 / m]
         if np.isfinite(wide):
             found.append((float(wide), j, code))

@@ -15,7 +15,6 @@ those of the m+1 calls together. A mean that is empty contradicts the assumption
 the window begins anew.
 """
 
-from dataclasses import dataclass, fields
 from functools import cached_property, reduce
 from typing import Any
 
@@ -30,65 +29,34 @@ from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
 from obsynth.designs.core.step import HUGE
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.detection.relations import relations
-from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
 _JOINED = tuple(name for name in STATUS if name != "fault_not_valid")
 _CHUNK = 512
 
 
-@dataclass(frozen=True, eq=False)
 class Window:
-    """The recursion of the means.
+    """The recursion of the means over m instants, behind the step of an observer.
 
-    plant: discrete; where `moving` is False its rows are no truth, and the F_j alone are used
-    m: instants of the mean
-    delay: of the fault sets, 0 or 1
-    scheduled: whether measured scheduling is an input
-    half_widths: of states and faults that are to be expected, (n + n_f,)
+    Where the observer is of a differential equation, rows are no truth and the F_j alone are used.
     """
 
-    plant: Plant
-    m: int
-    delay: int
-    moving: bool = True
-    scheduled: bool = False
-    half_widths: FloatArray | None = None
-    precision: str = "double"
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is made of the fields, as symbols cannot be pickled."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    @cached_property
-    def relations(self) -> tuple[list[int], Equations | None]:
-        """Faults of the relations, and their rows."""
-        return relations(self.plant, self.half_widths, self.m) if self.moving else ([], None)
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Lengths of u, theta and the outputs of an observer's step that are read."""
-        plant, n, n_f = self.plant, len(self.plant.x), len(self.plant.f)
-        n_theta = sum(s.measured for s in plant.rho) if self.scheduled else 0
-        named = zip(STEP_OUTPUTS[3:], (n, n, n_f, n_f, 1), strict=True)
-        return {"u": len(plant.u), "theta": n_theta, **dict(named)}
-
-    @cached_property
-    def layout(self) -> dict[str, slice]:
-        """Where the parts of the memory are."""
-        found, of = self.relations[0], self.sizes
-        parts = (self.m - 1) * 2 * (of["f_lower"] + 2 * len(found))
-        kept = {"count": 1, "ready": 1, "since": len(_JOINED), "parts": parts}
-        kept |= {"known": of["u"] + of["theta"], "x": 2 * of["x_lower"]} if found else {}
-        kept |= {} if self.delay else {"f": 2 * of["f_lower"]}
-        return slices({f"mean_{name}": size for name, size in kept.items() if size})
-
-    @property
-    def first(self) -> FloatArray:
-        """The memory before the first call."""
-        memory = np.zeros(max(place.stop for place in self.layout.values()))
-        memory[self.layout["mean_since"]] = self.m + 1.0
-        return memory
+    def __init__(self, observer: Any, m: int) -> None:
+        self.m, self.plant, self.delay = m, observer.model, observer.fault_delay
+        design = getattr(getattr(observer, "certificate", None), "design", None)
+        self.precision: str = getattr(design, "precision", "double")
+        self.relations: tuple[list[int], Equations | None] = [], None
+        if observer.ode is None:
+            self.relations = relations(self.plant, observer.half_widths, m)
+        n, n_f, q = len(self.plant.x), len(self.plant.f), len(self.relations[0])
+        n_theta = sum(s.measured for s in self.plant.rho) * (observer.step.n_in() > 3)
+        named = dict(zip(STEP_OUTPUTS[3:], (n, n, n_f, n_f, 1), strict=True))
+        self.sizes = {"u": len(self.plant.u), "theta": n_theta, **named}
+        kept = {"count": 1, "ready": 1, "since": len(_JOINED), "x": 2 * n, "f": 2 * n_f}
+        kept |= {"known": len(self.plant.u) + n_theta, "parts": 2 * (m - 1) * (n_f + 2 * q)}
+        self.layout = slices({f"mean_{name}": size for name, size in kept.items() if size})
+        self.first: FloatArray = np.zeros(sum(kept.values()))
+        self.first[self.layout["mean_since"]] = m + 1.0
 
     @cached_property
     def step(self) -> ca.Function:
@@ -97,7 +65,7 @@ class Window:
         memory = ca.SX.sym("memory", len(self.first))
         ports = [ca.SX.sym(name, size) for name, size in self.sizes.items()]
         u, theta, x_lower, x_upper, f_lower, f_upper, status = ports
-        part = {"known": ca.SX(0, 1), "parts": ca.SX(0, 1)}
+        part = dict.fromkeys(("known", "parts"), ca.SX(0, 1))
         part |= {name[5:]: memory[place] for name, place in self.layout.items()}
         bit = {k: ca.fmod(ca.floor(status / value), 2) >= 1 for k, value in STATUS.items()}
         good = ca.logic_not(ca.logic_or(bit["not_initialised"], bit["void"]))
@@ -159,10 +127,10 @@ class Window:
             ends.append(reduce(Ends.meet, [Ends(mean.lower, mean.upper) for mean in means]))
         return Ends(ca.vertcat(*(e.lower for e in ends)), ca.vertcat(*(e.upper for e in ends)))
 
-    def over(self, *columns: FloatArray) -> list[FloatArray]:
+    def over(self, *columns: Any) -> list[FloatArray]:
         """Return the means of a run: mean_lower, mean_upper (N + 1, n_f), mean_status (N + 1,).
 
-        columns: u, theta, x_lower, x_upper, f_lower, f_upper (N + 1, ...), status (N + 1,)
+        columns: u, theta (or nothing), x_lower, x_upper, f_lower, f_upper, status, (N + 1, ...)
         """
         N, memory, found = len(columns[-1]), self.first, []
         rows = [np.asarray(c, dtype=float).reshape(N, -1).T for c in columns]

@@ -6,6 +6,7 @@ not rounded outwards; a void instant or a missing input within the window.
 """
 
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,14 @@ from obsynth.designs.detection.window import Window
 
 NOT_VALID, VOID = STATUS["fault_not_valid"], STATUS["void"]
 KINDS = ("u", "d", "f", "w", "p", "rho")
+
+
+def window_of(plant, m, delay, moving=True):
+    """The window of an observer of which nothing is known but its plant."""
+    inputs = 3 + any(s.measured for s in plant.rho)
+    parts = {"fault_delay": delay, "ode": None if moving else "not discrete", "half_widths": None}
+    observer = SimpleNamespace(model=plant, step=SimpleNamespace(n_in=lambda: inputs), **parts)
+    return Window(observer, m)
 
 
 def plant_of(name):
@@ -63,7 +72,7 @@ def judged(window, plant, course, rng):
     """Run a window over sets around courses: true means and their bounds at the last call."""
     arrays, fair = course
     count = len(fair)
-    measured = [i for i, s in enumerate(plant.rho) if s.measured and window.scheduled]
+    measured = [i for i, s in enumerate(plant.rho) if s.measured]
     X = around(rng, arrays["x"], plant.box("x"), 0.05)
     F = around(rng, arrays["f"], plant.box("f").reshape(-1, 2), 2.0)
     step, memory = window.step.map(count), np.tile(window.first[:, None], count)
@@ -86,12 +95,11 @@ CASES = [("leaking_tanks", 0), ("leaking_tanks", 1), ("flexible_joint", 1), ("ta
 def test_no_course_of_a_fault_leaves_its_mean(name, delay):
     """Unmeasured states, gains that vary, unknown inputs, parameters; whatever the sets."""
     plant, count, m = plant_of(name), 1000, 3
-    scheduled = any(s.measured for s in plant.rho)
-    window = Window(plant, m, delay, scheduled=scheduled)
+    window = window_of(plant, m, delay)
     assert window.relations[0]
     rng, *course = courses(plant, m + 2, count, seed=7 + delay)
     assert course[1].sum() > 0.4 * count
-    for one in (window, Window(plant, m, delay, moving=False, scheduled=scheduled)):
+    for one in (window, window_of(plant, m, delay, moving=False)):
         mean, lower, upper = judged(one, plant, course, rng)
         size = 1e-13 * (1.0 + np.abs(mean).max())  # what the trajectory itself is rounded by
         assert ((lower <= mean + size) & (mean - size <= upper)).all()
@@ -120,7 +128,7 @@ def test_pairs_of_rows_are_free_of_what_they_share():
     plant.outputs([a + w[0], b + w[1]])
     found, equations = relations(plant, None, 4)
     assert equations.slopes[1, :2].mean(axis=1) == pytest.approx([2, 2 / 3]) and found == [0]
-    window = Window(plant, 4, 1)
+    window = window_of(plant, 4, 1)
     rng, *course = courses(plant, 6, 500, seed=2)
     assert course[1].sum() > 50
     mean, lower, upper = judged(window, plant, course, rng)
@@ -137,7 +145,7 @@ def test_ends_are_rounded_outwards():
     plant.dynamics([x * sp.Rational(3, 4) + u * sp.Rational(1, 8) + f * 3 + z, z / 2], Ts=1)
     plant.outputs([x, z])
     rng, m, narrow = np.random.default_rng(0), 5, []
-    window, alone = Window(plant, m, 1), Window(plant, m, 1, moving=False)
+    window, alone = window_of(plant, m, 1), window_of(plant, m, 1, moving=False)
     none, calm, wide = np.zeros((m + 1, 0)), np.zeros(m + 1), np.full((m + 1, 1), 3.0)
     for _ in range(40):
         us, at, faults = rng.uniform(-9, 9, m + 1), [rng.uniform(-80, 80, 2)], []
@@ -166,7 +174,7 @@ def test_sets_are_cut_with_the_domain_before_they_are_used():
     plant.outputs([x])
     one, wide = np.ones((3, 1)), np.full((3, 1), 3.0)
     none, status = np.zeros((3, 0)), np.zeros(3)
-    lower, upper, _ = Window(plant, 2, 1).over(none, none, -0.5 * one, one, -wide, wide, status)
+    lower, upper, _ = window_of(plant, 2, 1).over(none, none, -0.5 * one, one, -wide, wide, status)
     # the truth may rest at 1 with f = 1, and went from .5 to 1 at most
     assert lower[-1, 0] <= 1.0 <= upper[-1, 0] and upper[-1, 0] == pytest.approx(2.25)
 
@@ -186,7 +194,7 @@ def quiet(window, words, u=None, F=None):
 def test_a_window_needs_all_of_its_instants():
     """The mean's status joins those of the calls k - m..k; it begins anew after what breaks it."""
     m = 3
-    window = Window(ob.plants.leaking_tanks(), m, 1)
+    window = window_of(ob.plants.leaking_tanks(), m, 1)
     words = np.zeros(30, dtype=int)
     words[0], words[8], words[15] = NOT_VALID, VOID | 4, 2
     words[22:24] = 32
@@ -214,7 +222,7 @@ def test_inputs_beyond_their_range_break_a_window_where_they_matter():
     plant.outputs([x])
     rows, wide = np.full((12, 1), 0.5), np.ones((12, 1))
     rows[5] = 1.5
-    _, _, status = Window(plant, 2, 0).over(
+    _, _, status = window_of(plant, 2, 0).over(
         rows, np.zeros((12, 0)), wide, wide, -wide, wide, np.zeros(12)
     )
     assert np.flatnonzero(status & NOT_VALID).tolist() == [0, 1, 6, 7]
@@ -228,7 +236,7 @@ def test_rows_that_are_too_long_to_write_out_are_left_alone():
 
 
 def test_a_mean_that_contradicts_its_sets_is_void():
-    window = Window(ob.plants.leaking_tanks(), 2, 1)
+    window = window_of(ob.plants.leaking_tanks(), 2, 1)
     F = np.full((8, 1), 0.05)
     N, rest = 8, np.tile([0.12, 0.1, 0.12], (8, 1))
     rest[4, 1] += 0.3  # no leak explains it
@@ -242,7 +250,7 @@ def test_a_mean_that_contradicts_its_sets_is_void():
 
 def test_a_fault_set_that_is_not_valid_is_the_declared_one():
     """Mutant: bit 16 of the observer taken over, or its set taken."""
-    window = Window(ob.plants.leaking_tanks(), 2, 1)
+    window = window_of(ob.plants.leaking_tanks(), 2, 1)
     words = np.full(6, NOT_VALID)
     lower, status = quiet(window, words, F=np.full((6, 1), 1e-9))
     assert not (status[2:] & NOT_VALID).any()
