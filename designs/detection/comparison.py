@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,38 +13,6 @@ from obsynth.symbolic.arrays import FloatArray
 BoolArray = NDArray[np.bool_]
 LISTED = 5
 VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
-
-
-class RunLike(Protocol):
-    """What the comparison reads of a run, which a later room defines; arrays are time first."""
-
-    @property
-    def t(self) -> FloatArray:
-        """Time in seconds, (N + 1,)."""
-
-    @property
-    def f(self) -> FloatArray:
-        """True faults, (N + 1, n_f)."""
-
-    @property
-    def f_lower(self) -> FloatArray:
-        """Lower bounds as returned at each instant, (N + 1, n_f)."""
-
-    @property
-    def f_upper(self) -> FloatArray:
-        """Upper bounds as returned at each instant, (N + 1, n_f)."""
-
-    @property
-    def status(self) -> NDArray[np.int64]:
-        """Status of each step, (N + 1,)."""
-
-    @property
-    def names(self) -> Mapping[str, tuple[str, ...]]:
-        """Names of the signals by group; ``names["f"]`` are the faults."""
-
-    @property
-    def fault_delay(self) -> int:
-        """By how many samples the fault bounds lag behind."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from obsynth.designs.core.observer import (
     STEP_OUTPUTS,
     Observer,
 )
-from obsynth.designs.detection.comparison import Detection, RunLike, compare
+from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
 
@@ -309,9 +309,10 @@ class FaultDetector:
                 )
         if self.window is not None:
             claims.append(
-                f"the mean of {', '.join(names)} over the {self.window} instants before the call "
+                f"the mean of {', '.join(names)} over the {self.window} instants before a call "
                 "lies in [mean_lower, mean_upper], whatever the course, where what is claimed of "
-                "the returned sets holds at these calls"
+                "the returned sets holds at these calls; an alarm of it proves that the fault was "
+                "there at some of these instants"
             )
         claims.append(
             "a void sample (status bit 8) proves that some assumption failed since the last void "
@@ -358,7 +359,7 @@ class FaultDetector:
         mask = sum(STATUS[name] for name in self._skipped)
         return np.asarray((np.asarray(status, dtype=np.int64) & mask) == 0)
 
-    def detect(self, run: RunLike, threshold: float = 0.0) -> Detection:
+    def detect(self, run: Any, threshold: float = 0.0) -> Detection:
         """Compare the alarms of a run with the faults that were there.
 
         Parameters

@@ -10,9 +10,8 @@ rounded outwards, and sums are formed anew at every call from what is remembered
 
 The mean is valid (bit 16 of its status not set) once m transitions in a row may be used: those
 between two calls that are initialised and not void, the first with an input that is finite and in
-its range where that matters. A missing reading (bit 32) only makes it wider. Its other bits are
-those of the m+1 calls together. A mean that is empty contradicts the assumptions: it is void, and
-the window begins anew.
+its range where that matters. Its other bits are those of the m+1 calls together. A mean that is
+empty contradicts the assumptions: it is void, and the window begins anew.
 """
 
 from functools import cached_property, reduce

@@ -1,6 +1,6 @@
 """`estimate`: an observer on a record, and which readings contradict it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -12,7 +12,7 @@ from obsynth.evaluate.checked import scheduling_columns, step_function
 from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.trace import Trace, as_told
+from obsynth.evaluate.trace import as_told
 from obsynth.evaluate.truth import Call, dense, sample_time
 from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
@@ -92,24 +92,8 @@ def estimate(
     for array in told.values():
         array.flags.writeable = False
     own = observer.observer if isinstance(observer, FaultDetector) else observer
-    theta = rows[:, record.u.shape[1] + record.y.shape[1] :]
-    means = {m: _means(FaultDetector(own, window=m), record, theta, told) for m in windows}
-    return Estimate(observer, record, blamed=blamed, means=means, **told)
-
-
-def _means(
-    detector: FaultDetector, record: Record, theta: FloatArray, told: Mapping[str, FloatArray]
-) -> dict[str, Trace]:
-    """Return the means of the faults over a detector's window."""
-    sets = (told[key] for key in STEP_OUTPUTS[3:])
-    said: list[Any] = detector.mean.over(record.u, theta, *sets) if detector.mean else []
-    lower, upper, status = said
-    found = {}
-    for j, s in enumerate(detector.model.f):
-        name, true = f"mean of {s.name} over {detector.window}", np.full(len(record), np.nan)
-        ends = lower[:, j], upper[:, j]
-        found[s.name] = Trace(name, s.unit, record.time, true, None, *ends, status=status)
-    return found
+    detectors = tuple(FaultDetector(own, window=m) for m in windows)
+    return Estimate(observer, record, blamed=blamed, windows=detectors, **told)
 
 
 def fits(model: Plant, record: Record) -> None:

@@ -67,9 +67,8 @@ class Estimate:
         Alarms of a fault detector; None where an observer ran alone.
     mean_lower, mean_upper : (N, n_f) or None, mean_status : (N,) int or None
         Of a detector with a window m: means of the faults over k - m..k - 1, and the status.
-    means : mapping of int to mapping of str to Trace
-        By the windows m that were asked for and the names of the faults: intervals of the means
-        over the m instants before that of the row, whatever the course of the fault.
+    windows : tuple of FaultDetector
+        Of the windows that were asked for, see `means`.
     blamed : tuple of str
         Outputs without each of which the first void instant would not be void.
     names, units : dict
@@ -92,7 +91,7 @@ class Estimate:
     mean_upper: FloatArray | None = None
     mean_status: IntArray | None = None
     blamed: tuple[str, ...] = ()
-    means: Mapping[int, Mapping[str, Trace]] = field(default_factory=dict)
+    windows: tuple[Any, ...] = ()
     time: FloatArray = field(init=False)
     t: FloatArray = field(init=False)
     u: FloatArray = field(init=False)
@@ -132,9 +131,22 @@ class Estimate:
         at = {name: np.flatnonzero(self.status & bit) for name, bit in STATUS.items()}
         return {name: int(k[0]) if k.size else None for name, k in at.items()}
 
+    @cached_property
+    def means(self) -> Mapping[int, Mapping[str, Trace]]:
+        """Means of the faults over the m instants before that of the row, by m and name."""
+        found: dict[int, dict[str, Trace]] = {}
+        none = np.full(len(self.t), np.nan)
+        for detector in self.windows:
+            m, (lower, upper, status) = detector.window, detector.means(self)
+            for s, low, high in zip(detector.model.f, lower.T, upper.T, strict=True):
+                given = f"mean of {s.name} over {m}", s.unit, self.t, none, None, low, high
+                found.setdefault(m, {})[s.name] = Trace(*given, status=status)
+        return found
+
     @property
-    def _means(self) -> list[Trace]:
-        return [trace for told in self.means.values() for trace in told.values()]
+    def _traces(self) -> list[Trace]:
+        own = [self[name] for name in self.estimated]
+        return own + [trace for told in self.means.values() for trace in told.values()]
 
     def widths(self) -> dict[str, dict[str, float]]:
         """Half widths of every state and fault over the record, and of means of faults.
@@ -148,8 +160,7 @@ class Estimate:
         found = {}
         kinds = ("x", *["f"] * (1 + len(self.means)))
         boxes = np.vstack([self.observer.model.box(k).reshape(-1, 2) for k in kinds])
-        traces = [*(self[name] for name in self.estimated), *self._means]
-        for trace, box in zip(traces, boxes, strict=True):
+        for trace, box in zip(self._traces, boxes, strict=True):
             half = trace.half_width
             known = half[np.isfinite(half) & trace.valid]
             middle, most = (np.median(known), known.max()) if known.size else (np.inf, np.inf)
@@ -255,11 +266,12 @@ class Estimate:
         skip = sum(STATUS[name] for name in SKIPPED)
         ends = zip(self.names["f"], self.f_lower.T, self.f_upper.T, strict=True)
         told: list[Any] = [(*one, self.status, self.fault_delay) for one in ends]
-        told += [(t.name, t.lower, t.upper, t.status, 0) for t in self._means]
+        traces = self._traces[len(self.estimated) :]
+        told += [(trace.name, trace.lower, trace.upper, trace.status, 0) for trace in traces]
         found = {}
         for name, low, high, status, late in told:
-            valid = status & skip == 0
-            kept = np.flatnonzero(valid | (status & STATUS["void"] > 0))
+            valid, void = status & skip == 0, status & STATUS["void"] > 0
+            kept = np.flatnonzero(valid | void)
             order = np.arange(len(kept))
             hit = (((low > 0) | (high < 0)) & valid)[kept]
             since = order - np.maximum.accumulate(np.where(hit, -1, order))
@@ -272,12 +284,11 @@ class Estimate:
     def summary(self) -> Table:
         """Widths of every state and fault, and when a fault was certain."""
         alarms, rows = self.alarms(), []
-        labels = {t.name: t.label for t in (*map(self.__getitem__, self.estimated), *self._means)}
-        for name, width in self.widths().items():
-            at = alarms.get(name)
+        for trace, width in zip(self._traces, self.widths().values(), strict=True):
+            at = alarms.get(trace.name)
             since = float(self.t[at[0]]) if at is not None and at.size else None
             share = width["of_range"]
-            rows.append([labels[name], width["median"], width["largest"], width["finite"]])
+            rows.append([trace.label, width["median"], width["largest"], width["finite"]])
             rows[-1] += [None if np.isnan(share) else share, since]
         columns = ["signal", "median half width", "largest", "finite", "of the range"]
         title = f"{self.method} on {self.record.source}, {len(self.t)} instants"
