@@ -131,14 +131,15 @@ class Window:
 
         columns: u, theta (or nothing), x_lower, x_upper, f_lower, f_upper, status, (N + 1, ...)
         """
-        N, memory, found = len(columns[-1]), self.first, []
+        memory: Any = self.first
+        N, found = len(columns[-1]), []
         rows = [np.asarray(c, dtype=float).reshape(N, -1).T for c in columns]
         runs: Any = {n: self.step.mapaccum(n) for n in {min(N, _CHUNK), N % _CHUNK} if n}
         for k in range(0, N, _CHUNK):
             part = [row[:, k : k + _CHUNK] for row in rows]
-            moved, *means = map(np.array, runs[part[-1].size](memory, *part))
-            memory = moved[:, -1]
-            found.append(np.vstack(means))
+            moved, *means = runs[part[-1].size](memory, *part)
+            memory = moved[:, -1]  # an array of the others would take longer than the means
+            found.append(np.vstack([np.array(mean) for mean in means]))
         n_f, told = len(self.plant.f), np.hstack(found)
         return [told[:n_f].T, told[n_f:-1].T, told[-1].astype(np.int64)]
 

@@ -147,6 +147,9 @@ def estimate(
     first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
     until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
     guess: Annotated[str | None, typer.Option(help="First state, numbers with commas.")] = None,
+    window: Annotated[
+        list[int] | None, typer.Option(help="Instants for means of the faults.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="File to write, .csv or .parquet.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
@@ -161,7 +164,7 @@ def estimate(
         columns = dict(map(_column, mapping or ()))
         given = obsynth.read_record(record, observer.model, columns, time_column)
         state = None if guess is None else _numbers("--guess", guess.split(","))
-        told = obsynth.estimate(observer, given[first:until], guess=state)
+        told = obsynth.estimate(observer, given[first:until], guess=state, windows=window or ())
         if out is not None:
             told.write(out)
         if report is not None:

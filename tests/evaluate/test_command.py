@@ -252,7 +252,7 @@ def test_estimate_tells_what_estimate_tells(design, tmp_path):
         "--guess",
         ".06,.2,.12",
     ]
-    rest += ["--out", str(files[0]), "--report", str(files[1])]
+    rest += ["--out", str(files[0]), "--report", str(files[1]), "--window", "5"]
     args = ["estimate", str(design), str(RAW), *channels(), *rest]
     result = runner.invoke(app, [*args, "--json"])
     assert result.exit_code == 0, result.output
@@ -262,6 +262,8 @@ def test_estimate_tells_what_estimate_tells(design, tmp_path):
     assert told["instants"] == 164 and told["alarms"]["leak"] == same.alarms()["leak"].tolist()
     assert told["widths"]["leak"]["median"] == pytest.approx(same.widths()["leak"]["median"])
     assert told["refuted"] is None and told["consistent"] == 1.0
+    means = told["widths"]["mean of leak over 5"]
+    assert 2 * means["median"] < told["widths"]["leak"]["median"] and means["finite"] > 0.9
     assert len(files[0].read_text().splitlines()) == 165 and "Records" in files[1].read_text()
     shown = runner.invoke(app, args)
     assert shown.exit_code == 0 and "median half width" in shown.output
