@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.derive.rigour import ExactMatrix
 from obsynth.symbolic.arrays import FloatArray
 
 
@@ -49,17 +50,7 @@ class FixedPoint:
         )
 
 
-def _fractions(values: Any) -> list[list[Fraction]]:
-    array = np.atleast_2d(np.asarray(values, dtype=object))
-    return [[Fraction(value) for value in row] for row in array]
-
-
-def _times(matrix: list[list[Fraction]], vector: list[Fraction]) -> list[Fraction]:
-    return [sum((a * b for a, b in zip(row, vector, strict=True)), Fraction(0)) for row in matrix]
-
-
-def _dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
-    return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
+_exact = np.vectorize(Fraction, otypes=[object])
 
 
 def verify_fixed_point(
@@ -73,47 +64,28 @@ def verify_fixed_point(
     s: tuple[Fraction, ...],
 ) -> tuple[Fraction, Fraction] | None:
     """Check a fixed point in exact arithmetic."""
-    A, B_f, C, T, M = (_fractions(matrix) for matrix in (A, B_f, C, T, M))
-    error, fault, value = list(e), list(e_f), list(s)
-    if not any(error) or any(_times(C, error)):
+    A, B_f, C, T, M = map(_exact, (A, B_f, C, T, M))
+    error, fault, value = map(_exact, (e, e_f, s))
+    if not error.any() or (C @ error).any():
         return None
-    parts = zip(_times(A, error), _times(B_f, fault), value, strict=True)
-    if _times(T, [a + b + c for a, b, c in parts]) != error:
+    if (T @ (A @ error + B_f @ fault + value) != error).any():
         return None
-    Me = _times(M, error)
-    q1 = _dot(error, Me) - _dot(value, error)
-    q2 = _dot(Me, Me) - _dot(value, value)
+    Me = M @ error
+    q1, q2 = error @ Me - value @ error, Me @ Me - value @ value
     return (q1, q2) if q1 >= 0 and q2 >= 0 else None
 
 
-def _solution_space(A: Any, B_f: Any, C: Any, T: Any) -> list[list[Fraction]]:
-    """Basis of all (e, e_f, s) with C e = 0 and T (A e + B_f e_f + s) = e, exactly."""
-    T, A, B_f, C = (np.array(_fractions(m), dtype=object) for m in (T, A, B_f, C))
-    n, n_f, m = A.shape[0], B_f.shape[1], C.shape[0]
-    eye = np.array([[Fraction(int(i == j)) for j in range(n)] for i in range(n)], dtype=object)
-    rows = np.full((m + n, 2 * n + n_f), Fraction(0), dtype=object)
-    rows[:m, :n] = C
-    rows[m:, :n] = T @ A - eye
-    rows[m:, n : n + n_f] = T @ B_f
-    rows[m:, n + n_f :] = T
-    return _null_space(rows)
-
-
-def _null_space(rows: Any) -> list[list[Fraction]]:
-    from flint import fmpq, fmpq_mat
-
-    m, n = rows.shape
-    matrix = fmpq_mat(m, n, [fmpq(v.numerator, v.denominator) for v in rows.ravel()])
-    reduced, rank = matrix.rref()
-    pivots = [next(j for j in range(n) if reduced[i, j] != 0) for i in range(rank)]
-    basis = []
-    for free in (j for j in range(n) if j not in pivots):
-        vector = [Fraction(0)] * n
-        vector[free] = Fraction(1)
-        for i, pivot in enumerate(pivots):
-            entry = reduced[i, free]
-            vector[pivot] = -Fraction(int(entry.p), int(entry.q))
-        basis.append(vector)
+def _solution_space(A: Any, B_f: Any, C: Any, T: Any) -> Any:
+    """Basis of all (e, e_f, s) with C e = 0 and T (A e + B_f e_f + s) = e, exactly, in rows."""
+    T, A, B_f, C = map(_exact, (T, A, B_f, C))
+    rest = np.zeros((len(C), B_f.shape[1] + len(A)), dtype=int)
+    rows = np.block([[C, rest], [T @ A - np.eye(len(A), dtype=int), T @ B_f, T]])
+    reduced, rank = ExactMatrix.of(rows).entries.rref()
+    table = _exact(ExactMatrix(reduced).to_fractions())[:rank]
+    pivots = [int(np.flatnonzero(row)[0]) for row in table]
+    free = [j for j in range(rows.shape[1]) if j not in pivots]
+    basis = _exact(np.eye(rows.shape[1], dtype=int))[free]
+    basis[:, pivots] = -table[:, free].T
     return basis
 
 
@@ -137,14 +109,12 @@ def find_fixed_point(
     from scipy.optimize import minimize
 
     space = _solution_space(A, B_f, C, T)
-    if not space:
+    if not len(space):
         return None
-    n, n_f = len(_fractions(A)), len(_fractions(B_f)[0])
-    basis = np.array([[float(value) for value in row] for row in space]).T
+    n, n_f = np.shape(B_f)
+    basis = space.T.astype(float)
     rng = np.random.default_rng(seed)
-    numeric = [
-        np.array([[float(v) for v in row] for row in _fractions(M)], dtype=float) for M in vertices
-    ]
+    numeric = [_exact(M).astype(float) for M in vertices]
     # directions that do not move e only cost |s|^2: start without them
     moves = np.abs(basis[:n]).max(axis=0)
     for _ in range(starts):
@@ -178,7 +148,7 @@ def _shortfall(c: FloatArray, basis: FloatArray, M: FloatArray, n_f: int) -> flo
 
 def _rounded_point(
     c: FloatArray,
-    space: list[list[Fraction]],
+    space: Any,
     n: int,
     n_f: int,
     data: tuple[Any, Any, Any, Any, Any],
@@ -188,15 +158,11 @@ def _rounded_point(
     largest = float(np.abs(c).max())
     for denominator in (10, 100, 1000, 10**4, 10**6, 10**9):
         coordinates = [Fraction(float(x / largest)).limit_denominator(denominator) for x in c]
-        vector = [
-            sum((q * row[i] for q, row in zip(coordinates, space, strict=True)), Fraction(0))
-            for i in range(2 * n + n_f)
-        ]
+        vector = coordinates @ space
         unit = max(vector[:n], key=abs)
         if unit == 0:
             continue
-        vector = [value / unit for value in vector]
-        e, e_f, s = tuple(vector[:n]), tuple(vector[n : n + n_f]), tuple(vector[n + n_f :])
+        e, e_f, s = (tuple(part) for part in np.split(vector / unit, (n, n + n_f)))
         quadratics = verify_fixed_point(*data, e, e_f, s)
         if quadratics is not None:
             return FixedPoint(e, e_f, s, *quadratics, vertex)
