@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from fractions import Fraction
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
+from obsynth.derive.rigour import is_positive_definite, prove_positive_definite
 from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error.lmis import (
     Arithmetic,
@@ -23,39 +24,21 @@ from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.lmi.problem import symmetric_block
+from obsynth.designs.core.signals import DECLARED, prove_boxes, within
+from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
-RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational LDL' on the worst vertex"
 
 
 def claims(design: UioDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
-    yield _prove_boxes(design)
+    rates = design.rate - noise_box(design.plant).rate
+    w = design.plant.box("w")
+    yield prove_boxes(DECLARED, w, design.w_centre, design.w_radius, rates)
     yield _prove_decoupling(design)
     yield prove_rounding(design)
     yield from prove_ellipsoid(design)
-
-
-def _prove_boxes(design: UioDesign) -> Claim:
-    boxes = noise_box(design.plant)
-    w = design.plant.box("w")
-    room = np.concatenate(
-        [
-            w[:, 0] - (design.w_centre - design.w_radius),
-            (design.w_centre + design.w_radius) - w[:, 1],
-            design.rate - boxes.rate,
-        ]
-    )
-    margin = float(room.min(initial=np.inf))
-    return Claim(
-        "boxes",
-        "the stored boxes hold the declared disturbances and fault rates",
-        bool(margin >= 0.0),
-        margin,
-        "comparison",
-    )
 
 
 def _prove_decoupling(design: UioDesign) -> Claim:
@@ -157,26 +140,15 @@ def _prove_lmi(design: UioDesign, bound: EllipsoidBound) -> Claim:
     )
 
 
-def _corner(P: FloatArray, component: int, upper: Any) -> Enclosure:
-    unit = np.zeros((1, len(P)))
-    unit[0, component] = 1.0
-    block: Enclosure = symmetric_block(
-        [[Enclosure.of(np.array([[upper]]))], [Enclosure.of(unit.T), Enclosure.of(P)]]
-    )
-    return block
-
-
 def _prove_half_widths(bound: EllipsoidBound) -> Claim:
-    holds, margin = True, np.inf
-    for i, upper in enumerate(bound.inverse_diagonal):
-        result = prove_positive_definite(_corner(bound.P[bound.shape_of(i)], i, upper))
-        holds = holds and result.all_proved
-        margin = min(margin, float(result.relative.min()))
+    upper, units = bound.inverse_diagonal, np.eye(len(bound.inverse_diagonal))
+    shapes = [bound.P[bound.shape_of(i)] for i in range(len(units))]
+    proofs = [prove_inverse(P, units[[i]], upper[[i]]) for i, P in enumerate(shapes)]
     return Claim(
         "half_widths",
         "(P^-1)_ii stays below the stored value for every component",
-        bool(holds),
-        margin,
+        all(holds for holds, _ in proofs),
+        min(margin for _, margin in proofs),
         RUMP,
     )
 
@@ -186,16 +158,8 @@ def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
 
     Shapes: shapes (s, p, p).
     """
-    p = shapes.shape[-1]
-    values = np.empty(p)
-    for i in range(p):
-        P = shapes[0 if len(shapes) == 1 else i]
-        near = float(np.linalg.inv(P)[i, i])
-        for slack in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
-            values[i] = near * (1.0 + slack)
-            if prove_positive_definite(_corner(P, i, values[i]), sharp=False).all_proved:
-                break
-    return values
+    every = np.broadcast_to(shapes, (shapes.shape[-1], *shapes.shape[1:]))
+    return np.array([inverse_bounds(P, np.eye(len(P))[[i]])[0] for i, P in enumerate(every)])
 
 
 def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
@@ -237,15 +201,8 @@ def numbers(design: UioDesign) -> Numbers:
 def guarantee(design: UioDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     names = (*design.plant.names("x"), *design.plant.names("f"))
-    where = ", ".join(
-        f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}"
-        for s, curved in zip(design.plant.x, curved_states(design.plant), strict=True)
-        if curved
-    )
-    noise = ", ".join(
-        f"{name} in [{low:g}, {high:g}]"
-        for name, (low, high) in zip(design.plant.names("w"), design.plant.box("w"), strict=True)
-    )
+    where = within(compress(design.plant.x, curved_states(design.plant)), units=True)
+    noise = within(design.plant.w)
     rates = ", ".join(
         f"|{name}(k+1) - {name}(k)| <= {rate:g}"
         for name, rate in zip(design.plant.names("f"), design.rate, strict=True)

@@ -12,7 +12,7 @@ from obsynth.derive.structure.conditions import detectability, unknown_input_con
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import PlantClass
-from obsynth.designs.core.signals import LARGEST_SIGNAL, finite_box
+from obsynth.designs.core.signals import finite_box, wider
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -28,11 +28,6 @@ class NoiseBox:
     w_centre: FloatArray
     w_radius: FloatArray
     rate: FloatArray
-
-    @property
-    def stacked(self) -> FloatArray:
-        """Radii of v_k = (w_k, eps_k, w_{k+1}), shape (2 n_w + n_f,)."""
-        return np.concatenate([self.w_radius, self.rate, self.w_radius])
 
     def equal_weights(self, blocks: int = 3) -> FloatArray:
         """Weights of the scaled components of v, summing to 1 (errata 4 of the method).
@@ -115,12 +110,7 @@ class Limits(NamedTuple):
         """Read the limits of a plant."""
         x, f, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xfu")
         curved, held = curved_states(plant)[:, None], covered_inputs(plant)[:, None]
-        return cls(np.where(curved, x, _wider(x)), _wider(f), np.where(held, u, _wider(u)))
-
-
-def _wider(box: FloatArray) -> FloatArray:
-    wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
-    return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
+        return cls(np.where(curved, x, wider(x)), wider(f), np.where(held, u, wider(u)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,18 +1,46 @@
-"""What the methods read of declared ranges: a size for signals without one, the nominal w."""
+"""What the methods read and say of declared ranges: sizes where there is none, the nominal w."""
+
+from collections.abc import Iterable
 
 import numpy as np
 
-from obsynth.symbolic import Plant
+from obsynth.designs.core.certificate import Claim
+from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
 
 LARGEST_SIGNAL = 1e6
 """Magnitude up to which signals without a declared range are covered."""
+DECLARED = "hold the declared disturbances and fault rates"
+NOTHING = np.zeros(0)
 
 
 def finite_box(plant: Plant, kind: str) -> FloatArray:
     """Return the declared box of signals, `LARGEST_SIGNAL` where there is none, shape (k, 2)."""
     box = plant.box(kind)
     return np.where(np.isfinite(box), box, np.sign(box) * LARGEST_SIGNAL)
+
+
+def wider(box: FloatArray) -> FloatArray:
+    """Return a finite box that reaches beyond another by its width, up to `LARGEST_SIGNAL`."""
+    wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
+    return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
+
+
+def within(signals: Iterable[Signal], units: bool = False) -> str:
+    """Write the ranges of signals in the user's names, ``x in [0, 2] m, w in [-1, 1]``."""
+    return ", ".join(
+        f"{s.name} in [{s.lower:g}, {s.upper:g}]{f' {s.unit}' if units and s.unit else ''}"
+        for s in signals
+    )
+
+
+def prove_boxes(
+    what: str, box: FloatArray, centre: FloatArray, radius: FloatArray, more: FloatArray = NOTHING
+) -> Claim:
+    """Prove that stored middles and radii hold a box, (k, 2); more: what else is not negative."""
+    room = np.concatenate([box[:, 0] - (centre - radius), (centre + radius) - box[:, 1], more])
+    margin = float(room.min(initial=np.inf))
+    return Claim("boxes", f"the stored boxes {what}", bool(margin >= 0.0), margin, "comparison")
 
 
 def noise_centre(plant: Plant) -> FloatArray:

@@ -7,6 +7,7 @@ import numpy as np
 
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import within
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign, BankModel
 from obsynth.designs.filter_bank.widths import steady_half_widths
 
@@ -81,15 +82,6 @@ def guarantee(design: BankDesign) -> Guarantee:
     measured = ", ".join(names[i] for i in design.outputs.tolist())
     first = float(design.filters[0])
     rates = ", ".join(f"{rate:g}" for rate in design.filters.tolist())
-    where = ", ".join(
-        f"{name} in [{low:g}, {high:g}]"
-        for name, (low, high) in zip(names, design.region.tolist(), strict=True)
-    )
-    sizes = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in plant.f)
-    noise = ", ".join(
-        f"{name} in [{low:g}, {high:g}]"
-        for name, (low, high) in zip(plant.names("w"), plant.box("w").tolist(), strict=True)
-    )
     claims = [
         f"[f_lower, f_upper] holds a mean of the fault since the sets began, with the weights "
         f"exp(-{first:g} age), age in seconds, at every sample, however the fault moves; not its "
@@ -103,15 +95,15 @@ def guarantee(design: BankDesign) -> Guarantee:
     assumptions = [
         f"the plant is {plant.name} in continuous time, its inputs held between the samples "
         f"(Ts = {design.Ts:g} s)",
-        f"the states stay in the region {where} at all times [monitored for {measured}: status "
-        "bit 8]",
-        f"the faults stay in {sizes}",
+        f"the states stay in the region {within(design.assumed.x)} at all times "
+        f"[monitored for {measured}: status bit 8]",
+        f"the faults stay in {within(plant.f)}",
         "what happens between two samples is enclosed by an envelope whose containment every step "
         "checks; where it fails the bank begins anew",
         f"the step is evaluated in IEEE {design.precision} precision: the rounding errors of one "
         f"step stay below {design.rounding:.1e} of the size of its terms, which is "
         "added to the bounds",
     ]
-    if noise:
-        assumptions.append(f"{noise} [monitored in part: status bit 8]")
+    if plant.w:
+        assumptions.append(f"{within(plant.w)} [monitored in part: status bit 8]")
     return Guarantee(tuple(claims), tuple(assumptions))

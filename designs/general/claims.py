@@ -1,6 +1,7 @@
 """Proofs for the gains and bounds as they are stored, and that they speak of the stored plant."""
 
 from collections.abc import Iterator
+from itertools import compress
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from obsynth.derive.structure.following import NO_RATE, untold
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import DECLARED, prove_boxes, within
 from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
@@ -23,29 +25,12 @@ LOST = "no gain was found that follows it"
 
 def claims(design: GeneralDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
-    yield _prove_boxes(design)
+    box = design.extended.plant.box("w").reshape(-1, 2)
+    yield prove_boxes(DECLARED, box, design.v_centre, design.v_radius)
     yield prove_rounding(design)
     yield from prove_storage(design)
     if design.peak is not None:
         yield from prove_peak_claims(design, design.peak)
-
-
-def _prove_boxes(design: GeneralDesign) -> Claim:
-    box = design.extended.plant.box("w").reshape(-1, 2)
-    room = np.concatenate(
-        [
-            box[:, 0] - (design.v_centre - design.v_radius),
-            (design.v_centre + design.v_radius) - box[:, 1],
-        ]
-    )
-    margin = float(room.min(initial=np.inf))
-    return Claim(
-        "boxes",
-        "the stored boxes hold the declared disturbances and fault rates",
-        bool(margin >= 0.0),
-        margin,
-        "comparison",
-    )
 
 
 def prove_peak_claims(design: GeneralDesign, bound: PeakBound) -> Iterator[Claim]:
@@ -126,14 +111,8 @@ def guarantee(design: GeneralDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     plant, extended = design.plant, design.extended
     names = (*plant.names("x"), *extended.followed)
-    bends = curved(extended.plant)
-    where = ", ".join(
-        f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}"
-        for s, bent in zip(extended.plant.x, bends, strict=True)
-        if bent
-    )
-    inputs = zip(extended.plant.names("w"), extended.plant.box("w").tolist(), strict=True)
-    noise = ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in inputs)
+    where = within(compress(extended.plant.x, curved(extended.plant)), units=True)
+    noise = within(extended.plant.w)
     bound = design.bound
     if isinstance(bound, EnergyBound):
         claims = [*_energy_claims(design, bound)]

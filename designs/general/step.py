@@ -20,7 +20,7 @@ from obsynth.designs.core.running import (
     all_steady,
     settle,
 )
-from obsynth.designs.core.signals import LARGEST_SIGNAL
+from obsynth.designs.core.signals import finite_box, wider
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.lmis import rounding_in
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
@@ -62,18 +62,8 @@ class Limits:
     @classmethod
     def of(cls, plant: Plant) -> "Limits":
         """Read the limits of an extended plant."""
-        x, u = (_finite(plant.box(kind)) for kind in "xu")
-        return cls(_wider(x), np.where(held(plant)[:, None], u, _wider(u)))
-
-
-def _finite(box: FloatArray) -> FloatArray:
-    box = box.reshape(-1, 2)
-    return np.where(np.isfinite(box), box, [-LARGEST_SIGNAL, LARGEST_SIGNAL])
-
-
-def _wider(box: FloatArray) -> FloatArray:
-    wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
-    return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
+        x, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xu")
+        return cls(wider(x), np.where(held(plant)[:, None], u, wider(u)))
 
 
 def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:

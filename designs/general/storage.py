@@ -13,10 +13,9 @@ from obsynth.designs.general.lmis import Loop, closed_rows, error_loop, storage_
 from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign
 from obsynth.designs.general.synthesis import Found
 from obsynth.designs.general.system import error_system
-from obsynth.designs.lmi.problem import symmetric_block
+from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
-RUMP = "floating-point Cholesky after Rump, formation of the block enclosed"
 # What P gives up until rounding and the solver's tolerance have their margin.
 LOSSES = (0.0, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 
@@ -32,7 +31,7 @@ def with_ellipsoid(design: GeneralDesign, found: Found) -> GeneralDesign:
         P = found.P * (1.0 - loss)
         bound = EllipsoidBound(P, found.gamma, found.noise, found.tau * (1.0 - loss), np.ones(0))
         if invariance(design, bound, loop).holds:
-            bound = replace(bound, inverse_diagonal=inverse_diagonal_bounds(P))
+            bound = replace(bound, inverse_diagonal=inverse_bounds(P, np.eye(len(P))))
             return design.changed(bound=bound)
     raise SolverTrouble(
         "the ellipsoid that was found is not proved",
@@ -158,33 +157,7 @@ def _multipliers(bound: EnergyBound) -> Claim:
     )
 
 
-def _corner(P: FloatArray, component: int, upper: float) -> Enclosure:
-    unit = np.zeros((len(P), 1))
-    unit[component] = 1.0
-    block: Enclosure = symmetric_block([[_one(upper)], [Enclosure.of(unit), Enclosure.of(P)]])
-    return block
-
-
 def _half_widths(bound: EllipsoidBound) -> Claim:
-    results = [
-        prove_positive_definite(_corner(bound.P, i, upper))
-        for i, upper in enumerate(bound.inverse_diagonal.tolist())
-    ]
-    return Claim(
-        "half_widths",
-        "(P^-1)_ii stays below the stored value for every component",
-        all(result.all_proved for result in results),
-        min(float(result.relative.min()) for result in results),
-        RUMP,
-    )
-
-
-def inverse_diagonal_bounds(P: FloatArray) -> FloatArray:
-    """Return doubles just above ``(P^-1)_ii`` that are proved, (N,)."""
-    near, values = np.diag(np.linalg.inv(P)), np.empty(len(P))
-    for i in range(len(P)):
-        for slack in 10.0 ** np.arange(-12, -5):
-            values[i] = near[i] * (1.0 + slack)
-            if prove_positive_definite(_corner(P, i, values[i]), sharp=False).all_proved:
-                break
-    return values
+    statement = "(P^-1)_ii stays below the stored value for every component"
+    proof = prove_inverse(bound.P, np.eye(len(bound.P)), bound.inverse_diagonal)
+    return Claim("half_widths", statement, *proof, RUMP)

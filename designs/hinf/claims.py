@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from fractions import Fraction
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from obsynth.designs.core.signals import (
     at_centre,
     finite_box,
     noise_centre,
+    within,
 )
 from obsynth.designs.hinf.lmis import (
     PrintedLoop,
@@ -29,9 +31,9 @@ from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.sector import build_sector, covers_sector
 from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
+from obsynth.designs.lmi.proof import RUMP
 from obsynth.symbolic.arrays import FloatArray
 
-RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "exact rational elimination at the worst vertex"
 # What rounding F and H may leave of the fault, relative to what they take away.
 RESIDUAL = 1e-12
@@ -287,15 +289,12 @@ def guarantee(design: HinfDesign) -> Guarantee:
         claims.append(f"V+ <= {bound.decay:g} V for V = e'Pe where {quiet}")
     if plant.d:
         claims.append(f"whatever {', '.join(plant.names('d'))} does")
-    ranges = ", ".join(
-        f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}" for s in plant.x
-    )
     residual = max(decoupling_residual(design))
     seen = "[monitored: status bits 4 and 8, as far as xhat and y show it]"
     inside = "x lies in the box" if design.sector is not None else "x and xhat lie in the box"
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
-        f"{inside}: {ranges} {seen}",
+        f"{inside}: {within(plant.x, units=True)} {seen}",
         *_inputs_assumed(design),
         "every reading arrives (status bit 32); one that is missing counts as a new initial error",
         f"{about} has finite energy over the horizon; no bound is used",
@@ -309,7 +308,6 @@ def guarantee(design: HinfDesign) -> Guarantee:
 
 
 def _inputs_assumed(design: HinfDesign) -> list[str]:
-    held = zip(design.plant.u, covered_inputs(design.plant).tolist(), strict=True)
-    bounded = [s for s, matters in held if matters and np.isfinite([s.lower, s.upper]).any()]
-    ranges = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in bounded)
-    return [f"{ranges} [monitored: status bit 4]"] if bounded else []
+    held = compress(design.plant.u, covered_inputs(design.plant))
+    bounded = [s for s in held if np.isfinite([s.lower, s.upper]).any()]
+    return [f"{within(bounded)} [monitored: status bit 4]"] if bounded else []

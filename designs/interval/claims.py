@@ -8,12 +8,11 @@ from obsynth.derive.rigour import UNIT, exact, nearest
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import LARGEST_SIGNAL
+from obsynth.designs.core.signals import LARGEST_SIGNAL, within
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.rows import Rows
 from obsynth.designs.interval.widths import steady_holds
-from obsynth.symbolic import Signal
 
 IN_PART = "monitored in part: status bit 8"
 EXACT = "exact rational arithmetic on the stored numbers"
@@ -146,10 +145,6 @@ def guarantee(design: IntervalDesign) -> Guarantee:
     if free:
         claims.append(f"for all values of {', '.join(free)}, however fast they change")
     claims.append(f"all of this with the step evaluated in IEEE {design.precision} precision")
-
-    def ranges(*signals: Signal) -> str:
-        return ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in signals)
-
     watched = [s for s in plant.x if s.name in design.model.scheduled]
     held = [s for s in plant.u if s.name in design.model.scheduled]
     assumptions = [
@@ -157,11 +152,11 @@ def guarantee(design: IntervalDesign) -> Guarantee:
         "the first state lies in the box given to memory0",
     ]
     if plant.rho or plant.p:
-        assumptions.append(ranges(*plant.rho, *plant.p))
+        assumptions.append(within((*plant.rho, *plant.p)))
     bounded = [s for s in plant.f if s.bounded]
     if held:
-        assumptions.append(f"{ranges(*held)} [monitored: status bit 4]")
-    assumptions += [f"{ranges(*some)} [{IN_PART}]" for some in (watched, bounded, plant.w) if some]
+        assumptions.append(f"{within(held)} [monitored: status bit 4]")
+    assumptions += [f"{within(some)} [{IN_PART}]" for some in (watched, bounded, plant.w) if some]
     slow = [(s.name, 0.0 if s.constant else s.rate) for s in plant.f]
     moves = ", ".join(f"{name} by {rate:g}" for name, rate in slow if rate is not None)
     if moves and "rates" in Watch.of(design.options).cuts:

@@ -22,16 +22,20 @@ from numpy.typing import NDArray
 from obsynth.derive.rigour import (
     Enclosure,
     ExactMatrix,
+    ProofResult,
     is_positive_definite,
     prove_positive_definite,
 )
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import Affine, IntArray
-from obsynth.designs.lmi.problem import Problem
+from obsynth.designs.lmi.problem import Problem, symmetric_block
+from obsynth.symbolic.arrays import FloatArray
 
 # Entries of the blocks formed at a time, so that the work arrays stay in the cache.
 _CHUNK_ENTRIES = 2**16
+
+RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 
 # The margin of this many vertices tells what to expect of all.
 _SAMPLE = 256
@@ -125,6 +129,32 @@ def prove_family(
         worst=tuple(worst),
         exact=tuple(confirmed),
     )
+
+
+def inverse_bounds(P: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return doubles just above ``r P^-1 r'`` for rows r, proved; shapes (n, n), (k, n), (k,)."""
+    inverse, found = np.linalg.inv(P), np.empty(len(rows))
+    for i, row in enumerate(rows):
+        near = float(row @ inverse @ row)
+        for slack in 10.0 ** np.arange(-12, -5):
+            found[i] = near * (1.0 + slack) + (1e-300 if near == 0 else 0.0)
+            if _corner(P, row, found[i], sharp=False).all_proved:
+                break
+    return found
+
+
+def prove_inverse(P: FloatArray, rows: FloatArray, upper: FloatArray) -> tuple[bool, float]:
+    """Whether ``r P^-1 r'`` is proved to stay below numbers for all rows, and the least margin."""
+    found = [_corner(P, *pair) for pair in zip(rows, upper.tolist(), strict=True)]
+    margin = min((float(one.relative.min()) for one in found), default=np.inf)
+    return all(one.all_proved for one in found), margin
+
+
+def _corner(P: FloatArray, row: FloatArray, upper: float, sharp: bool = True) -> ProofResult:
+    """Decide ``[upper, r; r', P] > 0``, which says that ``r P^-1 r' < upper``."""
+    of = Enclosure.of
+    block = symmetric_block([[of(np.array([[upper]]))], [of(row[:, None]), of(P)]])
+    return prove_positive_definite(block, sharp=sharp)
 
 
 # Blocks with less than this share of the dual weight get the multiplier zero.

@@ -13,8 +13,7 @@ import numpy as np
 from obsynth.derive.rigour import Enclosure, ExactMatrix, prove_positive_definite
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.signals import about_centre, at_centre, noise_centre
-from obsynth.designs.lmi.problem import symmetric_block
-from obsynth.designs.lmi.proof import FamilyProof, prove_family
+from obsynth.designs.lmi.proof import RUMP, FamilyProof, prove_family, prove_inverse
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import (
     PolyaTerm,
@@ -32,7 +31,6 @@ from obsynth.designs.qpv.step import allowance
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.text import write_text
 
-RUMP = "floating-point Cholesky after Rump, formation of the blocks enclosed"
 EXACT = "the worst ones also by exact rational LDL'"
 
 
@@ -258,39 +256,14 @@ def _exact(data: VertexData) -> dict[str, list[ExactMatrix]]:
     }
 
 
-def _corner(P: FloatArray, row: FloatArray, upper: float) -> Enclosure:
-    block: Enclosure = symmetric_block(
-        [[Enclosure.of(np.array([[upper]]))], [Enclosure.of(row[:, None]), Enclosure.of(P)]]
-    )
-    return block
-
-
-def inverse_bounds(P: FloatArray, rows: FloatArray) -> FloatArray:
-    """Doubles just above r P^-1 r' for given rows r, proved. Shapes: P (n, n), rows (k, n)."""
-    values = np.empty(len(rows))
-    for i, row in enumerate(rows):
-        near = float(row @ np.linalg.solve(P, row))
-        for slack in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
-            values[i] = near * (1.0 + slack) + (1e-300 if near == 0 else 0.0)
-            if prove_positive_definite(_corner(P, row, values[i]), sharp=False).all_proved:
-                break
-    return values
-
-
 def _bounds(design: QPVDesign) -> Claim:
     P, n = design.P, len(design.P)
     rows = np.concatenate([np.eye(n), design.Cz.reshape(-1, n)])
     upper = np.concatenate([design.inverse_diagonal, design.rows.ravel()])
-    margin, holds = np.inf, True
-    for row, value in zip(rows, upper, strict=True):
-        result = prove_positive_definite(_corner(P, row, float(value)))
-        holds = holds and result.all_proved
-        margin = min(margin, float(result.relative.min()))
     return Claim(
         "bounds",
         "(P^-1)_ii and the diagonal of Cz P^-1 Cz' stay below the stored values, (40)",
-        bool(holds),
-        margin,
+        *prove_inverse(P, rows, upper),
         RUMP,
     )
 

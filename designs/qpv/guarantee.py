@@ -7,7 +7,7 @@ import numpy as np
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.guard import MOST_CALLS, Watch
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import about_centre
+from obsynth.designs.core.signals import about_centre, within
 from obsynth.designs.qpv.claims import undisturbed
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.designs.qpv.step import SETTLED, allowance, found_again, measured_schedule
@@ -101,14 +101,9 @@ def _assumptions(design: QPVDesign) -> Iterator[str]:
     )
     scheduling = measured_schedule(plant)
     if scheduling:
-        listed = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in scheduling)
-        yield f"{listed}, measured without error [monitored: status bit 4]"
+        yield f"{within(scheduling)}, measured without error [monitored: status bit 4]"
     if noise is not None and plant.w:
-        listed = ", ".join(
-            f"{name} in [{low:g}, {high:g}]"
-            for name, (low, high) in zip(plant.names("w"), plant.box("w"), strict=True)
-        )
-        yield f"{listed} [monitored in part: status bit 8]"
+        yield f"{within(plant.w)} [monitored in part: status bit 8]"
     elif plant.w:
         yield (
             "disturbances are small enough that the error stays in {e'P e <= 1}; that is proved "

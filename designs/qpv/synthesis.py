@@ -15,10 +15,11 @@ from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.lmi.expression import Affine, full, scalar, symmetric, trace
 from obsynth.designs.lmi.margin import MarginSolution, largest_margin, solve_with_margin
 from obsynth.designs.lmi.problem import Problem, cap_gain, symmetric_block
+from obsynth.designs.lmi.proof import inverse_bounds
 from obsynth.designs.lmi.reductions import split_common
 from obsynth.designs.lmi.search import Knob, search_line, smallest_changes
 from obsynth.designs.lmi.solve import solve_reliably
-from obsynth.designs.qpv.claims import inverse_bounds, prove_inequalities, region_factor
+from obsynth.designs.qpv.claims import prove_inequalities, region_factor
 from obsynth.designs.qpv.error_matrix import ErrorSets
 from obsynth.designs.qpv.lmis import (
     Closed,

@@ -8,6 +8,7 @@ import numpy as np
 from obsynth.derive.rigour import ExactMatrix
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.core.signals import prove_boxes, within
 from obsynth.designs.set_adaptive.bounds import BLOCKS
 from obsynth.designs.set_adaptive.gain import settled_response
 from obsynth.designs.set_adaptive.model import SetModel
@@ -62,18 +63,9 @@ def _signs(design: SetDesign) -> Claim:
 
 
 def _boxes(design: SetDesign) -> Claim:
-    box = design.plant.box("w")
-    if not design.noisy:
-        box = np.zeros_like(box)
-    room = np.concatenate(
-        [
-            box[:, 0] - (design.w_centre - design.w_radius),
-            (design.w_centre + design.w_radius) - box[:, 1],
-        ]
-    )
-    margin = float(room.min(initial=np.inf))
+    box = design.plant.box("w") if design.noisy else np.zeros((len(design.w_centre), 2))
     what = "hold the declared disturbances" if design.noisy else "are zero, as assumed"
-    return Claim("boxes", f"the stored boxes {what}", margin >= 0.0, margin, "comparison")
+    return prove_boxes(what, box, design.w_centre, design.w_radius)
 
 
 def _metzler(design: SetDesign) -> Claim:
@@ -225,9 +217,6 @@ def guarantee(design: SetDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     plant = design.plant
     x, f = ", ".join(plant.names("x")), ", ".join(plant.names("f"))
-    where = ", ".join(
-        f"{s.name} in [{s.lower:g}, {s.upper:g}]{' ' + s.unit if s.unit else ''}" for s in plant.x
-    )
     shown = ", ".join(s.name for s in design.bounds.states)
     if design.law == "cooperative":
         claims = [
@@ -251,18 +240,15 @@ def guarantee(design: SetDesign) -> Guarantee:
     assumptions = [
         f"the plant is {plant.name} in continuous time, its inputs held between the samples "
         f"(Ts = {design.Ts:g} s)",
-        f"the states stay in {where} at all times [monitored for {shown}: status bit 8]",
+        f"the states stay in {within(plant.x, units=True)} at all times "
+        f"[monitored for {shown}: status bit 8]",
         "the faults are constant and lie in the box given to memory0, later in their ranges",
         f"a fault within {', '.join(f'[{s.lower:g}, {s.upper:g}]' for s in plant.f)} moves the "
         "outputs between the samples",
     ]
     if plant.w:
-        noise = ", ".join(
-            f"{name} in [{low:g}, {high:g}]"
-            for name, (low, high) in zip(plant.names("w"), plant.box("w"), strict=True)
-        )
         if design.noisy:
-            assumptions.append(f"{noise} [monitored in part: status bit 8]")
+            assumptions.append(f"{within(plant.w)} [monitored in part: status bit 8]")
         else:
             assumptions.append(f"the disturbances {', '.join(plant.names('w'))} are zero")
     assumptions.append(

@@ -9,6 +9,7 @@ from obsynth.derive.rigour import ExactMatrix
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.record import plain
+from obsynth.designs.core.signals import within
 from obsynth.designs.general import claims as general
 from obsynth.designs.general.model import read_again as general_again
 from obsynth.designs.set_membership.model import SetMembershipModel, read
@@ -130,7 +131,7 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
     ]
     still = ", ".join(s.name for s in plant.p if s.constant)
     moving = (*plant.w, *plant.d, *(s for s in plant.p if not s.constant))
-    where = ", ".join(f"{s.name} in [{s.lower:g}, {s.upper:g}]" for s in moving if s.bounded)
+    where = within(s for s in moving if s.bounded)
     rates = [
         f"|{s.name}(k+1) - {s.name}(k)| <= {rate:g}"
         for s, rate in zip(plant.f, rates_of(design).tolist(), strict=True)

@@ -50,7 +50,7 @@ def recursion_residual(design, tank_split, run, Wbar, shift=0):
 @pytest.fixture(scope="module")
 def scaled(design):
     """The design with the radii of v attached, to undo the scaling of the error system."""
-    stacked = NoiseBox(design.w_centre, design.w_radius, design.rate).stacked
+    stacked = np.concatenate([design.w_radius, design.rate, design.w_radius])
     object.__setattr__(design, "data_scale", stacked)
     return design
 

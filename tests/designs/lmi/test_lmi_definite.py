@@ -5,10 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from obsynth.derive.rigour import Enclosure, is_positive_definite, prove_positive_definite
+from obsynth.derive.rigour import (
+    Enclosure,
+    ExactMatrix,
+    is_positive_definite,
+    prove_positive_definite,
+)
 from obsynth.designs.lmi.expression import full, symmetric, trace
 from obsynth.designs.lmi.problem import Problem, symmetric_block
-from obsynth.designs.lmi.proof import _definite, _multipliers
+from obsynth.designs.lmi.proof import _definite, _multipliers, inverse_bounds, prove_inverse
 
 
 def decay_design():
@@ -85,3 +90,22 @@ def test_a_dual_solution_with_a_number_missing_proves_nothing():
     assert (
         _multipliers(problem, replace(solution, duals={**solution.duals, "cap": spoiled})) is None
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_an_inverse_makes_of_rows_is_bounded_from_above_alone(seed):
+    """Mutant: the row of the corner block times .99, which proves numbers that are too small."""
+    rng = np.random.default_rng(seed)
+    root, rows = rng.normal(size=(3, 3)), np.vstack([np.eye(3), rng.normal(size=(2, 3))])
+    P = root @ root.T + 0.1 * np.eye(3)
+    P, exact = 0.5 * (P + P.T), ExactMatrix.of(rows)
+    values = (exact @ ExactMatrix.of(0.5 * (P + P.T)).inverse() @ exact.T).to_fractions()
+    least = np.array([float(values[i][i]) for i in range(5)])
+    bounds = inverse_bounds(P, rows)
+    assert all(bounds[i] >= values[i][i] for i in range(5))
+    assert np.all(bounds <= least * (1.0 + 1e-6))
+    holds, margin = prove_inverse(P, rows, bounds)
+    assert holds and margin > 0.0
+    for i in range(5):
+        short = np.where(np.arange(5) == i, least * (1.0 - 1e-9), bounds)
+        assert not prove_inverse(P, rows, short)[0]
