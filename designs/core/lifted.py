@@ -186,14 +186,8 @@ class _Arithmetic:
     def subtract(self, args: list[Lifted], low: float, high: float) -> Lifted:
         a, b = args
         if _zero(a) or _zero(b):
-            return self.negate([b], low, high) if _zero(a) else a
+            return Lifted(-b.upper, -b.lower, low, high) if _zero(a) else a
         return self.rounding.interval(a.lower - b.upper, a.upper - b.lower, low, high, tiny=False)
-
-    def negate(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        return Lifted(-args[0].upper, -args[0].lower, low, high)
-
-    def twice(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        return Lifted(2.0 * args[0].lower, 2.0 * args[0].upper, low, high)
 
     def multiply(self, args: list[Lifted], low: float, high: float) -> Lifted:
         if any(map(_zero, args)):
@@ -276,21 +270,6 @@ class _Arithmetic:
             ca.fmax(ca.fmax(a.lower, -a.upper), 0.0), ca.fmax(-a.lower, a.upper), low, high
         )
 
-    def minimum(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(ca.fmin(a.lower, b.lower), ca.fmin(a.upper, b.upper), low, high)
-
-    def maximum(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(ca.fmax(a.lower, b.lower), ca.fmax(a.upper, b.upper), low, high)
-
-    def meet(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(ca.fmax(a.lower, b.lower), ca.fmin(a.upper, b.upper), low, high)
-
-    def with_zero(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        return Lifted(ca.fmin(args[0].lower, 0.0), ca.fmax(args[0].upper, 0.0), low, high)
-
     def power_const(self, args: list[Lifted], low: float, high: float) -> Lifted | None:
         a, p = args
         if p.low != p.high:
@@ -368,21 +347,6 @@ class _Arithmetic:
     def if_else_zero(self, args: list[Lifted], low: float, high: float) -> Lifted:
         return self.select([*args, Lifted.number(0.0)], low, high)
 
-    def less(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(a.upper < b.lower, a.lower < b.upper, low, high)
-
-    def less_equal(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(a.upper <= b.lower, a.lower <= b.upper, low, high)
-
-    def boundary_weight(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        a, b = args
-        return Lifted(a.upper < b.lower, a.lower <= b.upper, low, high)
-
-    def logical_not(self, args: list[Lifted], low: float, high: float) -> Lifted:
-        return Lifted(args[0].upper <= 0.0, args[0].lower <= 0.0, low, high)
-
 
 def clamped(a: Lifted) -> Lifted:
     """Keep the ends between the numbers, where an operation is not defined beyond them."""
@@ -445,20 +409,37 @@ def _increasing(function: Callable[[ca.SX], ca.SX]) -> Callable[..., Lifted]:
     return form
 
 
-_OWN = """add subtract negate twice multiply divide power_int sqrt nonnegative absolute minimum
-maximum meet with_zero power_const select if_else_zero less less_equal boundary_weight logical_not
-arctangent2 hypotenuse cosh"""
+def _unrounded(ends: Callable[..., tuple[ca.SX, ca.SX]]) -> Callable[..., Lifted]:
+    """Return the form of an operation whose ends are not rounded."""
+    return lambda self, args, low, high: Lifted(*ends(*args), low, high)
+
+
+_ENDS: Mapping[str, Callable[..., tuple[ca.SX, ca.SX]]] = {
+    "negate": lambda a: (-a.upper, -a.lower),
+    "twice": lambda a: (2.0 * a.lower, 2.0 * a.upper),
+    "minimum": lambda a, b: (ca.fmin(a.lower, b.lower), ca.fmin(a.upper, b.upper)),
+    "maximum": lambda a, b: (ca.fmax(a.lower, b.lower), ca.fmax(a.upper, b.upper)),
+    "meet": lambda a, b: (ca.fmax(a.lower, b.lower), ca.fmin(a.upper, b.upper)),
+    "with_zero": lambda a: (ca.fmin(a.lower, 0.0), ca.fmax(a.upper, 0.0)),
+    "less": lambda a, b: (a.upper < b.lower, a.lower < b.upper),
+    "less_equal": lambda a, b: (a.upper <= b.lower, a.lower <= b.upper),
+    "boundary_weight": lambda a, b: (a.upper < b.lower, a.lower <= b.upper),
+    "logical_not": lambda a: (a.upper <= 0.0, a.lower <= 0.0),
+}
+_OWN = """add subtract multiply divide power_int sqrt nonnegative absolute power_const select
+if_else_zero arctangent2 hypotenuse cosh"""
 _INCREASING = "exp expm1 log log1p sinh tanh asinh acosh atanh asin atan erf"
 _FORMS: Mapping[str, Callable[..., Lifted | None]] = {
     **{name: getattr(_Arithmetic, name) for name in _OWN.split()},
+    **{name: _unrounded(ends) for name, ends in _ENDS.items()},
     **{name: _increasing(getattr(ca, name)) for name in _INCREASING.split()},
     "tangent": _increasing(ca.tan),
     "acos": lambda self, args, *given: _increasing(ca.acos)(
         self, [Lifted(args[0].upper, args[0].lower)], *given
     ),
     "power": lambda self, *given: self.corners(lambda a, b: a**b, *given),
-    "conjunction": _Arithmetic.minimum,
-    "disjunction": _Arithmetic.maximum,
+    "conjunction": _unrounded(_ENDS["minimum"]),
+    "disjunction": _unrounded(_ENDS["maximum"]),
     "sine": lambda self, *given: self.wave(ca.sin, 0.5 * np.pi, *given),
     "cosine": lambda self, *given: self.wave(ca.cos, 0.0, *given),
 }
