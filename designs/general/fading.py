@@ -31,18 +31,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.derive.rigour import UNIT_ROUNDOFF, Enclosure, add_up, product_up, raised
+from obsynth.derive.rigour import TINY, UNIT_ROUNDOFF, Enclosure, add_up, product_up, raised
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.general.modal import (
-    SLACK,
-    Recursion,
+    REGULAR,
+    bases,
     block_norms,
     blocks_of,
-    choose,
+    contracts,
+    distance,
     enclosed_inverse,
-    prove_recursion,
     proved_decay,
+    settling,
     single,
 )
 from obsynth.designs.general.peak import small_gain_solution, spectral_radius
@@ -51,15 +52,31 @@ from obsynth.designs.general.responses import power_sum, response
 from obsynth.designs.general.system import ErrorSystem, magnitude
 from obsynth.symbolic.arrays import FloatArray
 
+Recursion = tuple[FloatArray, FloatArray, FloatArray]
+"""G, the reach R to the errors, and the start S: nonnegative matrices, rounded up."""
+# Room for other orders of summation when the numbers are computed again elsewhere: of the numbers,
+# and of the radii where nothing but rounding is left.
+SLACK, ROOM = 1.0 + 2.0**-36, 8.0
+# Of the peak bounds: a first error that adds less has settled.
+SETTLED = 0.1
 # Of the way from the slowest decay to 1, for the exponential.
 DECAYS = (0.1, 0.3, 0.6, 0.9)
 
 
 def fade(system: ErrorSystem, b: FloatArray, widest: FloatArray) -> Fading:
     """Choose the recursion that settles first from ``|e_p| <= widest``, shapes (N,)."""
-    found = choose(system.moving.mid, partial(recursion, system), b[system.size :], widest)
-    if found is not None:
-        return found
+    room, found = SETTLED * b[system.size :], []
+    for modes in bases(system.moving.mid):
+        needed = recursion(system, modes, ROOM)
+        if needed is None or not all(np.all(np.isfinite(matrix)) for matrix in needed):
+            continue
+        G, reach, start = (matrix * SLACK for matrix in needed)
+        decay = proved_decay(G)
+        if decay < 1.0:
+            fading = Fading(G, reach, start, decay, modes)
+            found.append((settling(fading, start @ widest, room), fading))
+    if found:
+        return min(found, key=lambda pair: pair[0])[1]
     G, reach, start = _best_exponential(system)
     return Fading(G, reach, start * SLACK, proved_decay(G), None)
 
@@ -146,4 +163,44 @@ def recursion(system: ErrorSystem, modes: Modes, room: float = 1.0) -> Recursion
 
 def prove_fading(system: ErrorSystem, fading: Fading) -> Iterator[Claim]:
     """Prove the stored recursion from the stored gains and family."""
-    return prove_recursion(fading, partial(recursion, system), partial(exponential, system))
+    modes, decay = fading.modes, fading.decay
+    if modes is not None:
+        room = REGULAR - distance(modes)[1]
+        yield Claim(
+            "basis",
+            "inverse times basis encloses the identity, so that the first error has coordinates",
+            bool(room > 0.0),
+            room,
+            "products enclosed, largest row sum",
+        )
+    proof = "coordinates of the error system enclosed, all numbers rounded up"
+    needed: tuple[FloatArray, ...] | None
+    try:
+        if modes is None:
+            proof = "powers of the error system divided by those of the decay, rounded up"
+            needed = exponential(system, float(fading.G[0, 0]))
+        else:
+            needed = recursion(system, modes)
+    except InfeasibleDesign as error:
+        needed, proof = None, str(error)
+    stored = (fading.G, fading.reach, fading.start)
+    margins = [
+        np.min((have - least) / np.maximum(least, TINY))
+        for have, least in zip(stored, needed or (), strict=False)
+    ]
+    margin = float(min(margins, default=-np.inf))
+    yield Claim(
+        "transient",
+        "G, reach and start bound what the first error adds, at every k",
+        bool(margin >= 0.0),
+        margin,
+        proof,
+    )
+    holds = contracts(fading.G, decay)
+    yield Claim(
+        "decay",
+        f"what the first error adds to the bounds decays with {decay:.7g} per sample",
+        holds,
+        1.0 - decay if holds else -np.inf,
+        "G v <= decay v for a positive v, rounded up",
+    )

@@ -1,59 +1,25 @@
-"""Modal coordinates in which the first error fades, and the proof that a stored recursion does.
+"""Modal coordinates in which the first error fades, and whether a recursion does.
 
 Y is the stored inverse of a stored basis V, and its own inverse is enclosed: with
 ``|I - Y V| <= D``, ``Y^-1 = V (Y V)^-1`` lies within ``|V| D (I - D)^-1`` of V. Blocks are columns
 of one or two coordinates (two for a complex pair); the norm of a block is its spectral norm.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
 from scipy.linalg import matrix_balance, schur
 
-from obsynth.derive.rigour import TINY, Enclosure, add_up, lowered, product_up, raised
-from obsynth.designs.core.certificate import Claim
-from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.derive.rigour import Enclosure, add_up, lowered, product_up, raised
 from obsynth.designs.general.peak import spectral_radius
 from obsynth.designs.general.record import Fading, Modes
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
-# Room for other orders of summation when the numbers are computed again elsewhere: of the numbers,
-# and of the radii where nothing but rounding is left.
-SLACK, ROOM = 1.0 + 2.0**-36, 8.0
 # Between the spectral radius of G and 1: the decay that is stored and proved.
 SHARES = (1e-6, 1e-3, 0.1)
 # Row sums of I - Y V below it: Y is regular.
 REGULAR = 0.5
-# Of the peak bounds: a first error that adds less has settled.
-SETTLED = 0.1
-
-Recursion = tuple[FloatArray, FloatArray, FloatArray]
-"""G, the reach R to the errors, and the start S: nonnegative matrices, rounded up."""
-
-
-def choose(
-    A: FloatArray,
-    recursion: Callable[[Modes, float], Recursion | None],
-    steady: FloatArray,
-    widest: FloatArray,
-) -> Fading | None:
-    """Choose the modal recursion that settles first from a first error; None where none contracts.
-
-    A: what moves the error; recursion: of a basis, its radii multiplied by the number given;
-    steady: peak bounds of the errors; widest: of the first one
-    """
-    room, found = SETTLED * steady, []
-    for modes in bases(A):
-        needed = recursion(modes, ROOM)
-        if needed is None or not all(np.all(np.isfinite(matrix)) for matrix in needed):
-            continue
-        G, reach, start = (matrix * SLACK for matrix in needed)
-        decay = proved_decay(G)
-        if decay < 1.0:
-            fading = Fading(G, reach, start, decay, modes)
-            found.append((_settling(fading, start @ widest, room), fading))
-    return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def blocks_of(modes: Modes) -> IntArray:
@@ -138,7 +104,7 @@ def contracts(G: FloatArray, decay: float) -> bool:
     return bool(usable and np.all(product_up(G, v) <= lowered(decay * v, 1)))
 
 
-def _settling(fading: Fading, mu: FloatArray, room: FloatArray) -> int:
+def settling(fading: Fading, mu: FloatArray, room: FloatArray) -> int:
     """Return after how many samples what mu adds is within some room, by doubling."""
     powers = [fading.G]
     while np.any(fading.reach @ (powers[-1] @ mu) > room) and len(powers) < 40:
@@ -148,52 +114,3 @@ def _settling(fading: Fading, mu: FloatArray, room: FloatArray) -> int:
         if np.any(fading.reach @ (power @ mu) > room):
             mu, count = power @ mu, count + 2**j
     return count
-
-
-def prove_recursion(
-    fading: Fading,
-    recursion: Callable[[Modes, float], Recursion | None],
-    exponential: Callable[[float], Recursion],
-) -> Iterator[Claim]:
-    """Prove a stored recursion against what the stored gains and family need."""
-    modes, decay = fading.modes, fading.decay
-    if modes is not None:
-        room = REGULAR - distance(modes)[1]
-        yield Claim(
-            "basis",
-            "inverse times basis encloses the identity, so that the first error has coordinates",
-            bool(room > 0.0),
-            room,
-            "products enclosed, largest row sum",
-        )
-    proof = "coordinates of the error system enclosed, all numbers rounded up"
-    needed: tuple[FloatArray, ...] | None
-    try:
-        if modes is None:
-            proof = "powers of the error system divided by those of the decay, rounded up"
-            needed = exponential(float(fading.G[0, 0]))
-        else:
-            needed = recursion(modes, 1.0)
-    except InfeasibleDesign as error:
-        needed, proof = None, str(error)
-    stored = (fading.G, fading.reach, fading.start)
-    margins = [
-        np.min((have - least) / np.maximum(least, TINY))
-        for have, least in zip(stored, needed or (), strict=False)
-    ]
-    margin = float(min(margins, default=-np.inf))
-    yield Claim(
-        "transient",
-        "G, reach and start bound what the first error adds, at every k",
-        bool(margin >= 0.0),
-        margin,
-        proof,
-    )
-    holds = contracts(fading.G, decay)
-    yield Claim(
-        "decay",
-        f"what the first error adds to the bounds decays with {decay:.7g} per sample",
-        holds,
-        1.0 - decay if holds else -np.inf,
-        "G v <= decay v for a positive v, rounded up",
-    )
