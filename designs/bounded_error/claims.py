@@ -17,7 +17,7 @@ from obsynth.designs.bounded_error.lmis import (
     kept_coordinates,
     lift,
 )
-from obsynth.designs.bounded_error.model import Derived, Limits, noise_box
+from obsynth.designs.bounded_error.model import MATRICES, Derived, Limits, noise_box
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
@@ -165,8 +165,7 @@ def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
 def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
     """Compare the stored split and family with those derived from the stored equations."""
     parts, family = fresh.split, fresh.bounds.family
-    names = ("A", "B", "B_f", "C", "D", "W1", "W2")
-    same = all(np.array_equal(getattr(design, name), getattr(parts, name)) for name in names)
+    same = all(np.array_equal(getattr(design, name), getattr(parts, name)) for name in MATRICES)
     yield Claim(
         "model",
         "A x + B u + D d + B_f f + W1 w + g equals the stored dynamics, C x + W2 w the outputs",

@@ -38,7 +38,7 @@ from obsynth.designs.bounded_error.synthesis import (
     synthesise,
 )
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains, refuse_idle
+from obsynth.designs.core.given import Number, changed, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
@@ -167,7 +167,7 @@ class BoundedErrorUIO(Method):
         if self.form is not None or not isinstance(model, Plant):
             return super()._design(model, bounds)
         found = self._of_the_paper(model, bounds)
-        if found is not None and (self.gamma is not None or self._named):
+        if found is not None and (self.gamma is not None or changed(self, *IDLE)):
             return super()._design(*found)
         try:
             return self._beyond(model)
@@ -196,11 +196,6 @@ class BoundedErrorUIO(Method):
         found = {"L": L, **{name: gain @ design.Pi for name, gain in given.items()}}
         return self._as_general().analyse(design.plant, found)
 
-    @property
-    def _named(self) -> list[str]:
-        """Options of the paper's class alone that differ from their defaults."""
-        return [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
-
     def _of_the_paper(
         self, model: Plant, bounds: JacobianBounds | None
     ) -> tuple[Split, JacobianBounds] | None:
@@ -208,7 +203,7 @@ class BoundedErrorUIO(Method):
 
         Options that speak of the paper's class alone keep it, and its refusals, in place.
         """
-        named = self._named
+        named = changed(self, *IDLE)
         try:
             self.CLASS.check(model)
             parts = split(model)
@@ -229,15 +224,9 @@ class BoundedErrorUIO(Method):
             raise
 
     def _as_general(self) -> GeneralUIO:
-        refuse_idle(self, "the observer of the general class", *IDLE)
-        return GeneralUIO(
-            bounds=self.bounds,
-            gamma=None if self.bounds == "peak" else self.gamma,
-            weights=self.weights,
-            horizon=self.horizon,
-            recovery=self.recovery,
-            cuts=self.cuts,
-        )
+        gamma = None if self.bounds == "peak" else self.gamma
+        own = {"bounds": self.bounds, "gamma": gamma, "weights": self.weights}
+        return GeneralUIO.instead_of(self, IDLE, **own)
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""

@@ -88,6 +88,8 @@ CLASS = PlantClass(
     },
     linear=True,
 )
+MATRICES = ("A", "B", "B_f", "C", "D", "W1", "W2")
+"""Of a split, by which a design stores them."""
 # Relative to the largest magnitude of each state: a few thousand roundings of one step.
 ROUNDING = 2.0**-40
 
@@ -154,20 +156,10 @@ def read(given: Plant | Split, bounds: JacobianBounds | None = None) -> UioModel
         linear=parts.linear,
         x_at=np.asarray(parts.at.x, dtype=float),
         u_at=np.asarray(parts.at.u, dtype=float),
-        A=parts.A,
-        B=parts.B,
-        B_f=parts.B_f,
-        C=parts.C,
-        D=parts.D,
-        W1=parts.W1,
-        W2=parts.W2,
+        **{name: getattr(parts, name) for name in MATRICES},
         family=bounds.family,
-        w_centre=noise.w_centre,
-        w_radius=noise.w_radius,
-        rate=noise.rate,
-        E=decoupling.E,
-        T=decoupling.T,
-        Pi=decoupling.Pi,
+        **vars(noise),
+        **{name: getattr(decoupling, name) for name in ("E", "T", "Pi")},
         K=np.zeros((n, m)),
         F=np.zeros((n_f, m)),
         # for the search; that of the gains replaces it

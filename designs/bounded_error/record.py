@@ -1,7 +1,7 @@
 """The stored design of the method: plain data from which step and proofs are made."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -92,20 +92,9 @@ class UioDesign(Record):
     def data(self) -> ModelData:
         """The numeric data of the error system, the rounding of the vertices enclosed."""
         vertices = _enclosed_vertices(self.family)
-        return ModelData(
-            A=self.A,
-            B_f=self.B_f,
-            C=self.C,
-            W1=self.W1,
-            W2=self.W2,
-            E=self.E,
-            T=self.T,
-            Pi=self.Pi,
-            vertices=vertices.mid,
-            vertex_radius=vertices.rad,
-            w_radius=self.w_radius,
-            rate=self.rate,
-        )
+        names = {one.name for one in fields(ModelData)} & vars(self).keys()
+        own = {name: getattr(self, name) for name in names}
+        return ModelData(**own, vertices=vertices.mid, vertex_radius=vertices.rad)
 
     @property
     def gain(self) -> FloatArray:

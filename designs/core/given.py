@@ -56,13 +56,16 @@ def check_options(method: Any) -> None:
         object.__setattr__(method, option.name, value)
 
 
+def changed(method: Any, *names: str) -> list[str]:
+    """Return which of some options differ from their default."""
+    asked = [option for option in fields(method) if option.name in names]
+    return [o.name for o in asked if getattr(method, o.name) != o.default]
+
+
 def refuse_idle(method: Any, where: str, *names: str) -> None:
     """Refuse options that differ from their default where they have no effect."""
-    for option in fields(method):
-        if option.name in names and getattr(method, option.name) != option.default:
-            raise ObsynthError(
-                f"{option.name} has no effect with {where}: leave it out", option=option.name
-            )
+    for name in changed(method, *names):
+        raise ObsynthError(f"{name} has no effect with {where}: leave it out", option=name)
 
 
 def read_option(name: str, kind: Any, value: Any) -> Any:

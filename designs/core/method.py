@@ -311,6 +311,11 @@ class Method:
         """Return the options by name, as a design stores them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    @property
+    def watched(self) -> dict[str, Any]:
+        """The options that every method has, by name."""
+        return {"horizon": self.horizon, "recovery": self.recovery, "cuts": self.cuts}
+
     def settling(self, seconds: float, Ts: float) -> Mapping[str, Any]:
         """Return the options with a default horizon of so many seconds."""
         calls = min(math.ceil(seconds / Ts), MOST_CALLS) if self.horizon is None else self.horizon

@@ -118,6 +118,12 @@ def extended(
     return ca.Function("ode", ports, [ca.densify(outputs)], names, ["dmemory"])
 
 
+def make_ode(inputs: Mapping[str, ca.SX], rates: ca.SX) -> ca.Function:
+    """Return a right-hand side with its inputs (memory, u, y[, theta]) in their order."""
+    given = {name: value for name, value in inputs.items() if name != "theta" or value.numel()}
+    return ca.Function("ode", list(given.values()), [ca.densify(rates)], list(given), ["dmemory"])
+
+
 def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:
     """Return the status from conditions (1 or 0) by the names of `STATUS`."""
     word = ca.SX(0)

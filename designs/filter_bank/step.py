@@ -12,7 +12,7 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.lifted import FAR
-from obsynth.designs.core.stepping import slices
+from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -198,16 +198,8 @@ def build_ode(design: BankDesign) -> ca.Function:
         for k, rate in enumerate(design.filters.tolist())
     ]
     rates["response"] = ca.vertcat(*response)
-    inputs = {"memory": memory, "u": u, "y": y}
-    if theta.numel():
-        inputs["theta"] = theta
-    return ca.Function(
-        "ode",
-        list(inputs.values()),
-        [ca.densify(ca.vertcat(*(rates[name] for name in layout)))],
-        list(inputs),
-        ["dmemory"],
-    )
+    inputs = {"memory": memory, "u": u, "y": y, "theta": theta}
+    return make_ode(inputs, ca.vertcat(*(rates[name] for name in layout)))
 
 
 def _from_outputs(design: BankDesign, y: ca.SX) -> tuple[ca.SX, ca.SX]:

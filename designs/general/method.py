@@ -1,6 +1,6 @@
 """The observer of the general class, as the methods that serve it design it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
@@ -86,6 +86,12 @@ class GeneralUIO(Method):
         """Refuse options that do not fit each other."""
         if self.bounds != "ellipsoid":
             refuse_idle(self, f'bounds="{self.bounds}", which has no ellipsoid', "gamma")
+
+    @classmethod
+    def instead_of(cls, other: Method, idle: Iterable[str], **options: Any) -> "GeneralUIO":
+        """Return what stands in for a method of a paper, some of whose options are of no use."""
+        refuse_idle(other, "the observer of the general class", *idle)
+        return cls(**options, **other.watched)
 
     def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive import JacobianBounds, Split
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains, read_matrix, refuse_idle
+from obsynth.designs.core.given import Number, changed, read_gains, read_matrix, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
@@ -195,12 +195,10 @@ class HinfUIO(Method):
     @property
     def _open(self) -> bool:
         """Whether no option speaks of the paper's class alone."""
-        named = [name for name in IDLE if getattr(self, name) != getattr(type(self), name)]
-        return self.form is None and not named
+        return self.form is None and not changed(self, *IDLE)
 
     def _as_general(self) -> GeneralUIO:
-        refuse_idle(self, "the observer of the general class", *IDLE)
-        return GeneralUIO(bounds="l2", horizon=self.horizon, recovery=self.recovery, cuts=self.cuts)
+        return GeneralUIO.instead_of(self, IDLE, bounds="l2")
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""

@@ -13,7 +13,7 @@ from obsynth.derive import JacobianBounds
 from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import MATRIX, read_gains, read_rows, refuse_idle
+from obsynth.designs.core.given import MATRIX, changed, read_gains, read_rows
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.step import Step
@@ -200,12 +200,7 @@ class IntervalObserver(Method):
         try:
             return super()._design(model, bounds)
         except StructureError as error:
-            idle = any(
-                getattr(self, option.name) != option.default
-                for option in fields(self)
-                if option.name not in ("form", "horizon", "recovery", "cuts")
-            )
-            if self.form is not None or idle or not isinstance(model, Plant):
+            if changed(self, "form", *self._own) or not isinstance(model, Plant):
                 raise
             try:
                 return self._general().design(model)
@@ -215,12 +210,12 @@ class IntervalObserver(Method):
 
     def _general(self) -> GeneralUIO:
         """Return the method of the general class, faults of any size divided out."""
-        own = ("form", "horizon", "recovery", "cuts")
-        names = [option.name for option in fields(self) if option.name not in own]
-        refuse_idle(self, "the observer of the general class", *names)
-        return GeneralUIO(
-            faults="divided", horizon=self.horizon, recovery=self.recovery, cuts=self.cuts
-        )
+        return GeneralUIO.instead_of(self, self._own, faults="divided")
+
+    @property
+    def _own(self) -> set[str]:
+        """Options that speak of the paper's class alone."""
+        return {option.name for option in fields(self)} - {"form", *self.watched}
 
     def read(self, given: Plant | QuasiLPV) -> IntervalModel:
         """Read the matrices and check the ranks; a form has to be the one of `prefer`."""

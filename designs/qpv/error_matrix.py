@@ -25,8 +25,7 @@ class ErrorSets:
 
     centre (n,): c of the region
     state: of x - c, all coordinates; it holds the region
-    error: of e in the coordinates `error_coordinates`; it holds {e : e'P e <= 1}
-    error_coordinates: at least those that enter Psi
+    error: of e in the first coordinates, at least those that enter Psi; it holds {e : e'P e <= 1}
     start (r, n): corners of the polytope of e(0), one of every pair v, -v; it lies in {e : e'P e <=
         1}
     state_entering, error_entering: the coordinates that enter Psi
@@ -35,15 +34,13 @@ class ErrorSets:
     centre: FloatArray
     state: Shape
     error: Shape
-    error_coordinates: tuple[int, ...]
     start: FloatArray
     state_entering: tuple[int, ...]
     error_entering: tuple[int, ...]
 
     @cached_property
     def _projected(self) -> tuple[Shape, Shape]:
-        places = [self.error_coordinates.index(k) for k in self.error_entering]
-        return self.state.onto(self.state_entering), self.error.onto(places)
+        return self.state.onto(self.state_entering), self.error.onto(self.error_entering)
 
     @cached_property
     def pairs(self) -> FloatArray:
@@ -56,24 +53,16 @@ class ErrorSets:
     @property
     def pair_radius(self) -> FloatArray:
         """What rounding may add to the offsets, by coordinate."""
-        places = [self.error_coordinates.index(k) for k in self.error_entering]
         x, e = self._projected
-        return np.concatenate(
-            [
-                x.radius + self.state.radius[list(self.state_entering)],
-                e.radius + self.error.radius[places],
-            ]
-        )
+        own = self.state.radius[[*self.state_entering]], self.error.radius[[*self.error_entering]]
+        return np.concatenate([x.radius + own[0], e.radius + own[1]])
 
     @property
     def normals(self) -> Enclosure:
         """Half-spaces of the error's polytope, one of every pair a, -a, shape (K, 1, n)."""
-        known = self.error.normals
-        places = list(self.error_coordinates)
-        mid = np.zeros((len(known.mid), 1, self.centre.size))
-        rad = np.zeros_like(mid)
-        mid[:, :, places], rad[:, :, places] = known.mid, known.rad
-        return Enclosure(mid, rad)
+        known, more = self.error.normals, self.centre.size - self.error.dimension
+        pad = ((0, 0), (0, 0), (0, more))
+        return Enclosure(np.pad(known.mid, pad), np.pad(known.rad, pad))
 
 
 def entering(N: FloatArray) -> tuple[tuple[int, ...], tuple[int, ...]]:

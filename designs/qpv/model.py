@@ -80,8 +80,7 @@ class QPVModel(Derived):
         base = self.unit.scaled(self.kappa)
         enlarged = base.scaled(OUTWARDS / eta)
         error, start = (enlarged, one_of_each_pair(base.vertices)) if not self.apart else self.apart
-        places, entering_psi = tuple(range(error.dimension)), entering(self.data.N)
-        return ErrorSets(self.region.c, enlarged, error, places, start, *entering_psi)
+        return ErrorSets(self.region.c, enlarged, error, start, *entering(self.data.N))
 
     def shrunk(self, share: float) -> QPVModel:
         """Return the same problem for a smaller region, its polytopes with it."""

@@ -154,7 +154,6 @@ class QPVDesign(Record):
     region: Ellipsoid
     state: Shape
     error: Shape
-    error_coordinates: tuple[int, ...]
     start: Annotated[FloatArray, "r n+n_f"]
     eta: float
     kappa: float
@@ -188,14 +187,8 @@ class QPVDesign(Record):
     @cached_property
     def sets(self) -> ErrorSets:
         """The polytopes over which the inequalities hold."""
-        return ErrorSets(
-            self.region.c,
-            self.state,
-            self.error,
-            self.error_coordinates,
-            self.start,
-            *entering(self.data.N),
-        )
+        sets = self.region.c, self.state, self.error, self.start
+        return ErrorSets(*sets, *entering(self.data.N))
 
     @property
     def bounded(self) -> bool:
@@ -220,7 +213,7 @@ class QPVDesign(Record):
 
     def check(self) -> None:
         """Refuse sizes, coordinates and numbers that annotations do not tell."""
-        layout, noise, places = self.layout, self.noise, self.error_coordinates
+        layout, noise = self.layout, self.noise
         n, n_x = layout.states, len(self.plant.x)
         sizes = {
             "columns of family": (self.family.constant.shape[1], layout.shape[1]),
@@ -228,7 +221,6 @@ class QPVDesign(Record):
             "ranges of family": (len(self.family.ranges), len(self.scheduling)),
             "coordinates of region": (self.region.dimension, n),
             "coordinates of state": (self.state.dimension, n),
-            "coordinates of error": (self.error.dimension, len(places)),
         }
         if noise is not None:
             wanted = layout.widths["w"] + len(noise.faults)
@@ -242,11 +234,10 @@ class QPVDesign(Record):
             raise CertificateError(f"noise.faults of the stored design are {noise.faults}")
         if len(np.unique(self.start, axis=0)) != len(self.start):
             raise CertificateError("a corner of start is twice in the stored design")
-        missing = set(self.sets.error_entering) - set(places)
-        if missing or not all(0 <= k < n for k in places) or len(set(places)) != len(places):
+        if not max(self.sets.error_entering, default=-1) < self.error.dimension <= n:
             raise CertificateError(
-                f"the polytope of the error is in the coordinates {places}; those that enter are "
-                f"{self.sets.error_entering}"
+                f"the polytope of the error has {self.error.dimension} of {n} coordinates; those "
+                f"that enter are {self.sets.error_entering}"
             )
         if self.Ts <= 0 or self.alpha < 0:
             raise CertificateError("alpha or Ts of the stored design is negative")

@@ -16,7 +16,7 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.rounding import cut_box, rounding_bound
 from obsynth.designs.core.signals import finite_box
-from obsynth.designs.core.stepping import all_finite, largest_level, select, slices
+from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, select, slices
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -170,12 +170,7 @@ def build_ode(design: QPVDesign) -> ca.Function:
     grown = ca.if_else(level <= 1.0, rate * (limit - level), 0.0)
     d_state = equations.rate(state, u, y, theta, gain)
     outputs = ca.vertcat(d_state, grown)
-    inputs = {"memory": memory, "u": u, "y": y}
-    if theta.numel():
-        inputs["theta"] = theta
-    return ca.Function(
-        "ode", list(inputs.values()), [ca.densify(outputs)], list(inputs), ["dmemory"]
-    )
+    return make_ode({"memory": memory, **found}, outputs)
 
 
 @dataclass(frozen=True, eq=False)

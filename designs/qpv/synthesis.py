@@ -260,7 +260,6 @@ def complete(setting: Setting, unknowns: Unknowns, options: Mapping[str, Any]) -
         region=model.region,
         state=sets.state,
         error=sets.error,
-        error_coordinates=sets.error_coordinates,
         start=sets.start,
         eta=setting.eta,
         kappa=model.kappa,

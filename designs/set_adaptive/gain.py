@@ -151,40 +151,19 @@ def _feasible(
     from scipy.optimize import linprog
 
     n, m = A_lower.shape[0], C.shape[0]
-    size = n + n * m + 1
-    rows, limits = [], []
 
-    W = np.arange(n, n + n * m).reshape(n, m)
-    for i in range(n):
-        for j in range(n):
-            if i == j:
-                continue
-            row = np.zeros(size)
-            row[i] = -A_lower[i, j]
-            for k in range(m):
-                row[W[i, k]] = C[k, j]
-            rows.append(row)
-            limits.append(0.0)
-        for k in range(m):
-            for sign in (1.0, -1.0):
-                row = np.zeros(size)
-                row[W[i, k]], row[i] = sign, -cap
-                rows.append(row)
-                limits.append(0.0)
-    for j in range(n):
-        row = np.zeros(size)
-        row[:n] = A_upper[:, j]
-        row[j] += alpha
-        for i in range(n):
-            for k in range(m):
-                row[W[i, k]] -= C[k, j]
-        row[-1] = 1.0
-        rows.append(row)
-        limits.append(0.0)
-    total = np.zeros((1, size))
-    total[0, :n] = 1.0
-    objective = np.zeros(size)
-    objective[-1] = -1.0
+    def row(p: FloatArray, W: FloatArray, margin: float = 0.0) -> FloatArray:
+        return np.concatenate([p, W.ravel(), [margin]])
+
+    rows, none = [], np.zeros((n, m))
+    for i, own in enumerate(np.eye(n)):
+        rows += [row(-A_lower[i, j] * own, np.outer(own, C[:, j])) for j in range(n) if j != i]
+        for unit in np.eye(m):
+            rows += [row(-cap * own, np.outer(own, sign * unit)) for sign in (1.0, -1.0)]
+    for j, own in enumerate(np.eye(n)):
+        rows.append(row(A_upper[:, j] + alpha * own, np.tile(-C[:, j], (n, 1)), 1.0))
+    total, objective = row(np.ones(n), none)[None], row(np.zeros(n), none, -1.0)
+    limits = np.zeros(len(rows))
     bounds = [(_LEAST, None)] * n + [(None, None)] * (n * m) + [(None, None)]
     found = linprog(objective, np.array(rows), limits, total, [1.0], bounds, method="highs-ds")
     if found.x is None:

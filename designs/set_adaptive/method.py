@@ -191,16 +191,8 @@ class SetAdaptiveObserver(Method):
     def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer, or that of the bank."""
         if self.robust:
-            bank = FilterBank(
-                self.filters,
-                self.region,
-                self.Ts,
-                self.precision,
-                horizon=self.horizon,
-                recovery=self.recovery,
-                cuts=self.cuts,
-            )
-            return bank.design(model)
+            own = (self.filters, self.region, self.Ts, self.precision)
+            return FilterBank(*own, **self.watched).design(model)
         return super()._design(model, bounds)
 
     def read(self, given: Plant | Split) -> SetModel:

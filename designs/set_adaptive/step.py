@@ -19,7 +19,7 @@ from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import select, slices
+from obsynth.designs.core.stepping import make_ode, select, slices
 from obsynth.designs.set_adaptive.coordinates import carried, image
 from obsynth.designs.set_adaptive.equations import (
     MONITORS,
@@ -128,7 +128,6 @@ def build_ode(design: SetDesign) -> ca.Function:
     plant = design.plant
     vector = ca.SX.sym("memory", sum(memory_sizes(design).values()))
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
-    scheduling = [s for s in design.bounds.exact if s.name in plant.names("rho")]
     theta = ca.SX.sym("theta", sum(s.measured for s in plant.rho))
     layout = slices(memory_sizes(design))
     memory = Memory({name: vector[place] for name, place in layout.items()}, design)
@@ -156,16 +155,8 @@ def build_ode(design: SetDesign) -> ca.Function:
         changed[f"b_{o}"] = N.T @ residual - forget * memory[f"b_{o}"]
     changed["weight"] = 1.0 - forget * memory["weight"]
     rates = columns(changed)
-    inputs = {"memory": vector, "u": u, "y": y}
-    if scheduling:
-        inputs["theta"] = theta
-    return ca.Function(
-        "ode",
-        list(inputs.values()),
-        [ca.densify(ca.vertcat(*(rates[name] for name in layout)))],
-        list(inputs),
-        ["dmemory"],
-    )
+    inputs = {"memory": vector, "u": u, "y": y, "theta": theta}
+    return make_ode(inputs, ca.vertcat(*(rates[name] for name in layout)))
 
 
 def _adapt(
