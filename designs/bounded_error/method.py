@@ -105,24 +105,8 @@ class BoundedErrorUIO(Method):
     -----
     M. Buciakowski, M. Witczak, V. Puig, D. Rotondo, F. Nejjari, J. Korbicz, "A
     bounded-error approach to simultaneous state and actuator fault estimation
-    for a class of nonlinear systems". What does not hold as printed:
-
-    ===========  ==============================================================
-    in print     correct
-    ===========  ==============================================================
-    (4)          rows taken at different points lose the dependences between
-                 entries; the integral mean value matrix keeps them
-    (18)         the third block of Wbar is E W2, not E W1
-    (51)         infeasible on the paper's own data for every gamma, with an
-                 exact certificate; `form="corrected"` needs no such relaxation
-    gamma = .01  above the largest feasible value (about .00903)
-    Q_w = 100 I  does not hold the cube [-.1, .1]^3; (100/3) I does
-    M bounds     differences with a 1 cm step, too narrow down to h = 5 cm
-    Remark 2     2^(n^2 - c) = 64 vertices; 16 suffice, the entries depend on
-                 each other
-    (49)         the trace of P is not the sum of the axes
-    Theorem 1    sufficient, not an equivalence; U is redundant
-    ===========  ==============================================================
+    for a class of nonlinear systems". What does not hold as printed, and what
+    shows it: docs/methods/bounded_error_uio.md.
 
     Examples
     --------

@@ -102,27 +102,8 @@ class HinfUIO(Method):
     ``method="polytopic"`` is the sharpest for given gains.
 
     M. Witczak, J. Korbicz, R. Jozefowicz, "A H-infinity approach to robust fault estimation of
-    non-linear discrete-time systems". What does not hold as printed:
-
-    ===========  ==============================================================
-    in print     correct
-    ===========  ==============================================================
-    (11)         matrices have no largest one in this order: no M within the
-                 bounds need satisfy M_x'M_x <= M'M
-    (12)-(13)    lambda is +gamma^2, and its largest value over a box is a
-                 maximum of a convex function (vertices), no generalised
-                 eigenvalue problem
-    (14)         gamma^2 I in place of (52) gives mu = 2.104, not .499
-    (15)         observability is not enough: (Abar, C) has to be detectable,
-                 that is, the zeros of (A, L, C) stable
-    (31)         the terms A'Hbar A, Hbar A and s_{k+1}'Q s_{k+1} carry a plus
-    (34), (41)   A1'Hbar is A'Hbar
-    (43)         diag(I, I, I, I, P)
-    (50)         cos(12 x1) where (51)-(53) belong to cos(12 x2); for the
-                 printed g the printed K is unstable
-    (55)         white noise is not in l2; (25) can be checked over finite
-                 horizons only
-    ===========  ==============================================================
+    non-linear discrete-time systems". What does not hold as printed, and what
+    shows it: docs/methods/hinf_uio.md.
 
     (45) with (37) holds as printed, but the factor 2 on P, Q and alpha buy nothing: one
     multiplier and V = e'Pe give a smaller mu. K is not unique.

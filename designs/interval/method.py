@@ -96,30 +96,7 @@ class IntervalObserver(Method):
     -----
     R. Lamouchi, T. Raissi, M. Amairi, M. Aoun, "Interval observer design for actuator fault
     estimation of linear parameter-varying systems", IFAC PapersOnLine 51-24, 2018. What does not
-    hold as printed:
-
-    ===============  ==========================================================
-    in print         correct
-    ===============  ==========================================================
-    Assumption 3     full rank of C and F does not give rank(C F) = q, which the
-                     decoupling needs
-    before (7)       H, N, K0, K1 have to be orthogonal
-    Section 5        with the printed P, L and DeltaA the widths grow by 8.27 per
-                     step; alpha is 21.85, not .057, and (20) is feasible for
-                     alpha < .4 only; u is not given, and the plant is unstable
-                     for u = 0
-    DeltaA           has constant entries; its middle belongs to A
-    (13)             with r_0 = P+ z_0 - P- z_0 of the other end
-    (26)             bounds H12 z2 and E1 z2 apart; (H12 - E1) z2 is bounded once
-    (29), (36)       plus signs between the nonnegative shares
-    (30)             comes from (8), not (9)
-    (31)             G3 = A11 E Ct2 - A12, with Ct2 the last n - q columns of C H
-    (32)             y_k, not y_{k+1}, in Gamma_f; the lower theta_1 in the lower
-                     bound; K0 R0^-1 multiplies bounds only by its positive and
-                     negative parts; f_k needs y_{k+1}, a delay of one sample
-    Remark 1         a nonnegative R needs real poles that can be placed freely
-    Theorem 1        also needs bounded x
-    ===============  ==========================================================
+    hold as printed, and what shows it: docs/methods/interval_observer.md.
 
     Examples
     --------

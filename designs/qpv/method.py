@@ -116,26 +116,8 @@ class QPVObserver(Method):
     Notes
     -----
     D. Rotondo, M. Buciakowski, M. Witczak, "Simultaneous state and process fault estimation in LPV
-    systems using robust QPV observers". What does not hold as printed:
-
-    =================  ===========================================================
-    in print           correct
-    =================  ===========================================================
-    (19), (20)         describe e'P^-1 e <= 1; for V = e'P e they are
-                       (x_i - c)'P(x_i - c) <= 1 and [P, eta a_k; eta a_k', 1] >= 0
-    mu = 2.0024        follows from (20) as printed; the corrected minimum for a
-                       box or cross-polytope of the example is .005 to .1
-    (47)               1 <= p_k <= N, and the permutations are those of a multiset
-    (49)               eta alpha P belongs inside the sum
-    (29), (31), (32)   Ntilde and Nbar are swapped; He{...} closes after e
-    (12)               bounds the squared ratio: the L2 gain is sqrt(gamma)
-    decay rate         V decays with alpha, the norm of e with alpha / 2
-    xhat(0), Fig. 6    xhat(0) lies outside P_e; the ellipsoid function reaches
-                       45.42 in FS1 and 2.815 in FS2, not below 1
-    w other than 0     the claims need e to stay in E, which (39)-(41) do not give;
-                       alpha_q does
-    L_4                equals L_3 in the first list, an error of copying
-    =================  ===========================================================
+    systems using robust QPV observers". What does not hold as printed, and what
+    shows it: docs/methods/qpv_observer.md.
 
     Examples
     --------

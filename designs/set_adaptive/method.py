@@ -106,27 +106,8 @@ class SetAdaptiveObserver(Method):
     -----
     D. Efimov, T. Raissi, A. Zolghadri, "Set adaptive observers for linear parameter-varying
     systems: application to fault detection", J. Dynamic Systems, Measurement, and Control 136
-    (2014). What does not hold as printed:
-
-    ==================  =======================================================================
-    in print            correct
-    ==================  =======================================================================
-    (19), row 2         the sign of a32 rho(x3 - x2) is +, as in (20)
-    gain LMI            L = p w' does not solve p'L = w', and the condition with r is vacuous;
-                        with W = diag(p) L it is a linear program (`gain.py`)
-    (8), (12)           a system with a nonnegative matrix N'N is not ordered: for coupled faults
-                        the "upper" bound may end below the fault (a counterexample is among the
-                        tests); averaging does not help, a cooperative law does
-    Theorem 1 (ii)      R_m^-1 b_m > theta_M does not hold in Section 6 unless Theta = {0}; there
-                        it is a certificate against false alarms, not one of the fault's range
-    (17)                in case (a) theta_m is the upper bound, so the test as printed is always 1
-    Theorem 1, noise    with noisy outputs the printed A_m, A_M do not bound A (11.5 per cent of
-                        samples violate an entry); y - v and y + v do, with -+ |L| v in (6), (14)
-    Section 6, delays   .35 s and .45 s cannot be reached without noise: d1 is .974 s for
-                        Gamma = .01 (s1 .695 s whatever Gamma); theta2 = 6e-5 is never detected
-    Section 6, x in X   the faulted plant leaves the range that the bounds are derived for, after
-                        221.5 s (x1), 297.3 s (x3) and 304.2 s (x2)
-    ==================  =======================================================================
+    (2014). What does not hold as printed, and what
+    shows it: docs/methods/set_adaptive_observer.md.
 
     Examples
     --------
