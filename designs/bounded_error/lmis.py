@@ -142,18 +142,14 @@ def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSyste
         return lift(value, arithmetic)
 
     top = part["T"] @ (part["A"] + part["M"])
-    if n_f:
-        Abar = block([[top, part["T"] @ one(data.B_f)], [0, one(np.eye(n_f))]])
-        Cbar = block([[part["C"], one(np.zeros((m, n_f)))]])
-        Wbar = block(
-            [
-                [part["T"] @ part["W1s"], one(np.zeros((n, n_f))), part["E"] @ part["W2s"]],
-                [one(np.zeros((n_f, n_w))), one(np.diag(data.rate)), one(np.zeros((n_f, n_w)))],
-            ]
-        )
-    else:
-        Abar, Cbar = top, part["C"]
-        Wbar = block([[part["T"] @ part["W1s"], part["E"] @ part["W2s"]]])
+    Abar = block([[top, part["T"] @ one(data.B_f)], [one(np.zeros((n_f, n))), one(np.eye(n_f))]])
+    Cbar = block([[part["C"], one(np.zeros((m, n_f)))]])
+    Wbar = block(
+        [
+            [part["T"] @ part["W1s"], one(np.zeros((n, n_f))), part["E"] @ part["W2s"]],
+            [one(np.zeros((n_f, n_w))), one(np.diag(data.rate)), one(np.zeros((n_f, n_w)))],
+        ]
+    )
     Vbar = block([[part["W2s"], one(np.zeros((m, n_f + n_w)))]])
     return ErrorSystem(Abar, Cbar, Wbar, Vbar, np.eye(n), 3)
 
@@ -169,7 +165,7 @@ def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSys
     zeta stays in the range of the projector T, so it is written in coordinates
     of that range.
     """
-    n, n_f, m, _ = data.sizes
+    n, n_f, m, n_w = data.sizes
     keep = kept_coordinates(data.T)
     part = _parts(data, arithmetic)
 
@@ -184,13 +180,11 @@ def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSys
     p = len(keep)
     Cz = part["C"] @ one(basis)
     Vw = part["Pi"] @ part["W2s"]
-    if n_f:
-        Abar = block([[top, down @ (part["T"] @ one(data.B_f))], [0, one(np.eye(n_f))]])
-        Cbar = block([[Cz, one(np.zeros((m, n_f)))]])
-        Wbar = block([[noise, one(np.zeros((p, n_f)))], [0, one(np.diag(data.rate))]])
-        Vbar = block([[Vw, one(np.zeros((m, n_f)))]])
-    else:
-        Abar, Cbar, Wbar, Vbar = top, Cz, noise, Vw
+    zero = one(np.zeros((n_f, p)))
+    Abar = block([[top, down @ (part["T"] @ one(data.B_f))], [zero, one(np.eye(n_f))]])
+    Cbar = block([[Cz, one(np.zeros((m, n_f)))]])
+    Wbar = block([[noise, zero.T], [one(np.zeros((n_f, n_w))), one(np.diag(data.rate))]])
+    Vbar = block([[Vw, one(np.zeros((m, n_f)))]])
     return ErrorSystem(Abar, Cbar, Wbar, Vbar, basis, 2)
 
 

@@ -52,68 +52,45 @@ def multiplier_problem(
     objective: Objective,
     weights: FloatArray,
     form: Literal["printed", "repaired"],
-    scale: FloatArray | None = None,
 ) -> Problem:
     """State (51) with variables P, H, alpha, beta, U (printed) or P, H, a, b (repaired).
 
     The multipliers a of the repaired form keep the sign that the paper gives to
     alpha. (s = M e would allow any sign, which is a little less conservative.)
-    As in `design_problem`, P and H stand for gamma times those of the paper, in
-    scaled coordinates.
+    As in `design_problem`, P and H stand for gamma times those of the paper.
     """
-    n, n_f, m, _ = data.sizes
-    p = n + n_f
-    scale = np.ones(p) if scale is None else scale
     problem = Problem(f"(51), {form}, at gamma = {gamma:.6g}")
-    back = np.diag(1.0 / scale)
-    P, H = symmetric("P", p), full("H", p, m)
-    if form == "printed":
-        a, b = scalar("alpha"), scalar("beta")
-        problem.add("alpha.sign", a >= 0.0)
-        block = multiplier_block(
-            data,
-            back @ P @ back,
-            back @ H,
-            1.0 - gamma,
-            np.diag(noise),
-            a * np.eye(n),
-            b * np.eye(n),
-            full("U", n, n),
-        )
-    else:
-        a = diagonal("a", n)
-        problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
-        block = multiplier_block(
-            data,
-            back @ P @ back,
-            back @ H,
-            1.0 - gamma,
-            np.diag(noise),
-            a,
-            diagonal("b", n),
-        )
-    extra = block.shape[0] - 2 * p - noise.size
-    unit = np.concatenate([scale, np.ones(n), np.ones(noise.size), scale, np.ones(extra - n)])
-    block = np.diag(unit) @ block @ np.diag(unit)
-    problem.add_lmi("(51)", block, ">>", margin=MARGIN)
-    set_objective(problem, P, objective, weights, scale)
+    P = _state(problem, data, gamma, noise, form, MARGIN)
+    set_objective(problem, P, objective, weights, np.ones(len(weights)))
     return problem
+
+
+def _state(
+    problem: Problem, data: ModelData, gamma: float, noise: FloatArray, form: str, margin: float
+) -> Affine:
+    """State the inequality and the signs of its multipliers, and return P."""
+    n, n_f, m, _ = data.sizes
+    P, H, U = symmetric("P", n + n_f), full("H", n + n_f, m), None
+    if form == "printed":
+        alpha, beta, U = scalar("alpha"), scalar("beta"), full("U", n, n)
+        problem.add("alpha.sign", alpha >= 0.0)
+        a, b = alpha * np.eye(n), beta * np.eye(n)
+    else:
+        a, b = diagonal("a", n), diagonal("b", n)
+        problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
+    block = multiplier_block(data, P, H, 1.0 - gamma, np.diag(noise), a, b, U)
+    problem.add_lmi("(51)", block, ">>", margin=margin)
+    return P
 
 
 def largest_multiplier_gamma(data: ModelData) -> float:
     """Return the largest gamma for which the repaired form is feasible; noise does not enter."""
     quiet = replace(data, w_radius=data.w_radius * 0.0, rate=data.rate * 0.0)
-    n, n_f, m, n_w = data.sizes
-    p, n_v = n + n_f, 2 * n_w + n_f
+    _, n_f, _, n_w = data.sizes
 
     def state(gamma: float) -> tuple[Problem, Affine]:
         problem = Problem(f"(51), repaired, decay at gamma = {gamma:.6g}")
-        P, H = symmetric("P", p), full("H", p, m)
-        a, b = diagonal("a", n), diagonal("b", n)
-        problem.add("a.sign", np.ones((1, n)) @ a >= 0.0)
-        block = multiplier_block(quiet, P, H, 1.0 - gamma, np.eye(n_v), a, b)
-        problem.add_lmi("(51)", block, ">>")
-        return problem, P
+        return problem, _state(problem, quiet, gamma, np.ones(2 * n_w + n_f), "repaired", 0.0)
 
     return largest_feasible(state)
 
@@ -125,15 +102,12 @@ def synthesise_multipliers(
     objective: Objective,
     weights: FloatArray,
     form: Literal["printed", "repaired"],
-    scale: FloatArray | None = None,
 ) -> EllipsoidSolution:
     """Solve (51) at a fixed gamma."""
-    p = sum(data.sizes[:2])
-    scale = np.ones(p) if scale is None else scale
-    problem = multiplier_problem(data, gamma, noise, objective, weights, form, scale)
+    problem = multiplier_problem(data, gamma, noise, objective, weights, form)
     solution = solve_reliably(problem, floor=FLOOR, gap=GAP)
-    gain = np.linalg.solve(solution["P"], solution["H"]) * scale[:, None]
-    P = gamma * solution["P"] / np.outer(scale, scale)
+    gain = np.asarray(np.linalg.solve(solution["P"], solution["H"]), dtype=float)
+    P = gamma * solution["P"]
     return EllipsoidSolution(gain, 0.5 * (P + P.T), gamma, noise)
 
 

@@ -91,6 +91,12 @@ class BankDesign(BankModel):
         return self.plant if same else with_ranges(self.plant, self.region)
 
     @property
+    def bank(self) -> list[tuple[int, float, float]]:
+        """Row, factor of the fault and rate of every filter, faults first, then rates."""
+        rows = zip(self.fault_rows.tolist(), self.gain.tolist(), strict=True)
+        return [(i, gain, rate) for i, gain in rows for rate in self.filters.tolist()]
+
+    @property
     def rounding(self) -> float:
         """What the rounding of one step may be, relative to the size of its terms."""
         return allowance(self.precision, len(self.plant.x))

@@ -175,8 +175,8 @@ def build_ode(design: BankDesign) -> ca.Function:
     parts = {name: memory[part] for name, part in layout.items()}
     low, high = _states(design, parts, _from_outputs(design, y))
     rates = {name: ca.SX(part.stop - part.start, 1) for name, part in layout.items()}
-    for side, ends in (("lower", low), ("upper", high)):
-        o = 0 if side == "lower" else 1
+    rows = set(design.fault_rows.tolist())
+    for o, (side, ends) in enumerate((("lower", low), ("upper", high))):
         hidden = [corners.rate(i, o, low, high, own=ends[i]) for i in design.hidden]
         if hidden:
             rates[f"hidden_{side}"] = ca.vertcat(*hidden)
@@ -185,19 +185,12 @@ def build_ode(design: BankDesign) -> ca.Function:
         pairs = zip(design.outputs.tolist(), own, strict=True)
         moves = [corners.rate(i, o, low, high, own=end) for i, end in pairs]
         rates[f"shown_{side}"] = ca.vertcat(*moves)
-        drift = []
-        for j, i in enumerate(design.fault_rows.tolist()):
-            balance = corners.rate(i, o, low, high, faults=False)
-            for k, rate in enumerate(design.filters.tolist()):
-                z = parts[f"filter_{side}"][j * len(design.filters) + k]
-                drift.append(balance + rate * (ends[i] - z))
+        balance = {i: corners.rate(i, o, low, high, faults=False) for i in rows}
+        filters = zip(design.bank, ca.vertsplit(parts[f"filter_{side}"]), strict=True)
+        drift = [balance[i] + rate * (ends[i] - z) for (i, _, rate), z in filters]
         rates[f"filter_{side}"] = ca.vertcat(*drift)
-    response = [
-        float(gain) - rate * parts["response"][j * len(design.filters) + k]
-        for j, gain in enumerate(design.gain.tolist())
-        for k, rate in enumerate(design.filters.tolist())
-    ]
-    rates["response"] = ca.vertcat(*response)
+    filters = zip(design.bank, ca.vertsplit(parts["response"]), strict=True)
+    rates["response"] = ca.vertcat(*(gain - rate * N for (_, gain, rate), N in filters))
     inputs = {"memory": memory, "u": u, "y": y, "theta": theta}
     return make_ode(inputs, ca.vertcat(*(rates[name] for name in layout)))
 
@@ -339,26 +332,22 @@ def _move_filters(
     hull: tuple[ca.SX, ca.SX],
 ) -> dict[str, ca.SX]:
     """Move every filter by the exact exponential of -rate."""
-    rates = design.filters.tolist()
-    largest = np.abs(design.plant.box("f")).max(axis=1)
+    rows, response = design.fault_rows.tolist(), ca.vertsplit(parts["response"])
+    largest = dict(zip(rows, np.abs(design.plant.box("f")).max(axis=1).tolist(), strict=True))
+    share = [(np.exp(-r * design.Ts), -np.expm1(-r * design.Ts) / r) for *_, r in design.bank]
     moved: dict[str, ca.SX] = {}
     for side, name, sign in ((0, "filter_lower", -1.0), (1, "filter_upper", 1.0)):
-        values = []
-        for j, i in enumerate(design.fault_rows.tolist()):
-            balance = corners.rate(i, side, *hull, faults=False)
-            for k, rate in enumerate(rates):
-                decay, gathered = np.exp(-rate * design.Ts), -np.expm1(-rate * design.Ts) / rate
-                z = parts[name][j * len(rates) + k]
-                end = X[side][i]
-                slack = ca.fabs(z) + gathered * (ca.fabs(balance) + rate * ca.fabs(end))
-                slack += largest[j] * ca.fabs(parts["response"][j * len(rates) + k])
-                new = decay * z + gathered * (balance + rate * end)
-                values.append(new + sign * design.rounding * slack)
+        balances = {i: corners.rate(i, side, *hull, faults=False) for i in rows}
+        values, filters = [], zip(design.bank, share, ca.vertsplit(parts[name]), strict=True)
+        for ((i, _, rate), (decay, gathered), z), N in zip(filters, response, strict=True):
+            balance, end = balances[i], X[side][i]
+            slack = ca.fabs(z) + gathered * (ca.fabs(balance) + rate * ca.fabs(end))
+            slack += largest[i] * ca.fabs(N)
+            new = decay * z + gathered * (balance + rate * end)
+            values.append(new + sign * design.rounding * slack)
         moved[name] = ca.vertcat(*values)
-    response = []
-    for j, gain in enumerate(design.gain.tolist()):
-        for k, rate in enumerate(rates):
-            decay, gathered = np.exp(-rate * design.Ts), -np.expm1(-rate * design.Ts) / rate
-            response.append(decay * parts["response"][j * len(rates) + k] + gathered * gain)
-    moved["response"] = ca.vertcat(*response)
+    moves = zip(design.bank, share, response, strict=True)
+    moved["response"] = ca.vertcat(
+        *(decay * N + gathered * gain for (_, gain, _), (decay, gathered), N in moves)
+    )
     return moved

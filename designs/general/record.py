@@ -177,6 +177,18 @@ class GeneralDesign(Record):
         return _extended(self.plant, self.unfollowed, self.divided)
 
     @property
+    def places(self) -> list[int]:
+        """Places of the followed faults among all."""
+        names = self.plant.names("f")
+        return [names.index(name) for name in self.extended.followed]
+
+    @property
+    def pick(self) -> list[int]:
+        """Places of the states and followed faults among states and all faults."""
+        n = len(self.plant.x)
+        return [*range(n), *(n + k for k in self.places)]
+
+    @property
     def bounds(self) -> tuple[PeakBound | EllipsoidBound, ...]:
         """What holds the errors at every instant, all at once; nothing of an energy gain."""
         if isinstance(self.bound, EnergyBound):

@@ -106,8 +106,7 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
 def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> ca.SX:
     """Return an s of every bound, for a state and a fault in boxes around a prediction."""
     low, high = (
-        ca.vertcat(x.lower, _followed(design, f.lower)),
-        ca.vertcat(x.upper, _followed(design, f.upper)),
+        ca.vertcat(a, b[design.places]) for a, b in ((x.lower, f.lower), (x.upper, f.upper))
     )
     apart = ca.fmax(high - prediction, prediction - low) * UP
     return ca.vertcat(*(_start(design, bound, apart) for bound in design.bounds))
@@ -123,11 +122,6 @@ def _start(design: GeneralDesign, bound: PeakBound | EllipsoidBound, apart: ca.S
     size = np.abs(bound.P)
     parts = [ca.sqrt(ca.dot(a, ca.DM(W) @ a)) for a, W in ((apart, M), (rest, size))]
     return (parts[0] + parts[1]) ** 2 * UP
-
-
-def _followed(design: GeneralDesign, f: ca.SX) -> ca.SX:
-    names = design.plant.names("f")
-    return ca.vertcat(*(f[names.index(name)] for name in design.extended.followed))
 
 
 def running(design: GeneralDesign) -> tuple[Running, ...]:
@@ -180,11 +174,8 @@ def start_of_ellipsoid(
 
 def per_signal(design: GeneralDesign, widths: FloatArray) -> FloatArray:
     """Return half widths of states and all faults from those of the followed ones, (n + n_f,)."""
-    n, names = len(design.plant.x), design.plant.names("f")
-    found = np.full(n + len(names), np.inf)
-    found[:n] = widths[:n]
-    for k, name in enumerate(design.extended.followed):
-        found[n + names.index(name)] = widths[n + k]
+    found = np.full(len(design.plant.x) + len(design.plant.f), np.inf)
+    found[design.pick] = widths
     return found
 
 
@@ -204,13 +195,12 @@ def settling(
     bounds = running(design)
     if not bounds:
         return None
-    n, names = len(design.plant.x), design.plant.names("f")
-    pick = [*range(n), *(n + names.index(name) for name in design.extended.followed)]
+    n, pick = len(design.plant.x), design.pick
     if not np.isfinite(box[pick]).all():
         return 0, np.full(box.shape, np.inf)
     half = box[pick]
     middle = ca.SX(ca.DM(all_steady(bounds) * (1.0 + SETTLED) + half))
-    ends = np.zeros((n + len(names), 2))
+    ends = np.zeros((len(box), 2))
     ends[pick] = np.column_stack([-half, half])
     first = start_bound(design, Ends.of(ends[:n]), Ends.of(ends[n:]), middle)
     k, widths = settle(bounds, np.array(ca.evalf(first)).ravel() * UP, calls)
@@ -233,12 +223,8 @@ def first_memory(
     design: GeneralDesign, start: Start, z0: ArrayLike | None = None
 ) -> dict[str, ArrayLike]:
     """Start at the guess, or a paper's z_0, and in the middle of the followed faults' boxes."""
-    names, x = design.plant.names("f"), start.guess
-    if z0 is not None:
-        x = read_vector(z0, "z0", design.plant.names("x"))
-    middle = start.f.mean(axis=1)
-    faults = [middle[names.index(name)] for name in design.extended.followed]
-    return {"prediction": np.concatenate([x, faults])}
+    x = start.guess if z0 is None else read_vector(z0, "z0", design.plant.names("x"))
+    return {"prediction": np.concatenate([x, start.f.mean(axis=1)[design.places]])}
 
 
 def build_core(design: GeneralDesign) -> Core:
@@ -291,7 +277,7 @@ def build_core(design: GeneralDesign) -> Core:
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         near = x.nearest(kept["prediction"][:n])
-        box = Ends(_followed(design, f.lower), _followed(design, f.upper))
+        box = Ends(f.lower[design.places], f.upper[design.places])
         return {"prediction": ca.vertcat(near, box.nearest(kept["prediction"][n:]))}
 
     return Core(run, begin, place, domain=domain)

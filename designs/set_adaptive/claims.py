@@ -1,7 +1,6 @@
 """Proofs for the numbers as they are stored, and that they speak of the stored plant."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -14,18 +13,9 @@ from obsynth.designs.set_adaptive.gain import settled_response
 from obsynth.designs.set_adaptive.model import SetModel
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
+from obsynth.symbolic.arrays import FloatArray
 
 _EXACT = "exact rational arithmetic on the stored numbers"
-
-
-def metzler_conditions(A_lower: Any, L: Any, C: Any) -> Any:
-    """Return A_lower - L C, whose entries off the diagonal must not be negative."""
-    return A_lower - L @ C
-
-
-def decay_conditions(A_upper: Any, L: Any, C: Any, p: Any, alpha: float) -> Any:
-    """Return -alpha p' - p'(A_upper - L C), whose entries must not be negative; p is a row."""
-    return (-alpha) * p - p @ (A_upper - L @ C)
 
 
 def claims(design: SetDesign) -> Iterator[Claim]:
@@ -70,8 +60,7 @@ def _boxes(design: SetDesign) -> Claim:
 
 def _metzler(design: SetDesign) -> Claim:
     own = design.coordinates is None
-    exact = metzler_conditions(*_error_system(design, design.A_lower_box))
-    entries = exact.to_fractions()
+    entries = _error_matrix(design, design.A_lower_box).to_fractions()
     outside = [entries[i][j] for i in range(len(entries)) for j in range(len(entries)) if i != j]
     margin = min(outside, default=0)
     return Claim(
@@ -85,10 +74,9 @@ def _metzler(design: SetDesign) -> Claim:
     )
 
 
-def _decay(design: SetDesign, name: str, A_upper: Any, alpha: float, what: str) -> Claim:
+def _decay(design: SetDesign, name: str, A_upper: FloatArray, alpha: float, what: str) -> Claim:
     p, own = ExactMatrix.of(design.p[None]), design.coordinates is None
-    exact = decay_conditions(*_error_system(design, A_upper), p, alpha)
-    margin = min(exact.to_fractions()[0])
+    margin = min(((-alpha) * p - p @ _error_matrix(design, A_upper)).to_fractions()[0])
     return Claim(
         name,
         f"p'{'(A_M - L C)' if own else 'D'} <= -{alpha:.7g} p' with p > 0: {what} decays",
@@ -113,12 +101,11 @@ def _uniformisation(design: SetDesign) -> Claim:
     )
 
 
-def _error_system(design: SetDesign, A: Any) -> tuple[ExactMatrix, ExactMatrix, ExactMatrix]:
-    """Return A, L and C of A - L C, or what makes D of them."""
-    if design.coordinates is None:
-        return ExactMatrix.of(A), ExactMatrix.of(design.L), ExactMatrix.of(design.C)
-    none = np.zeros((len(design.L), 1))
-    return ExactMatrix.of(design.coordinates.D), ExactMatrix.of(none), ExactMatrix.of(none.T)
+def _error_matrix(design: SetDesign, A: FloatArray) -> ExactMatrix:
+    """Return A - L C exactly, or D in coordinates of their own."""
+    if design.coordinates is not None:
+        return ExactMatrix.of(design.coordinates.D)
+    return ExactMatrix.of(A) - ExactMatrix.of(design.L) @ ExactMatrix.of(design.C)
 
 
 def _coordinates(design: SetDesign) -> Claim:
