@@ -23,8 +23,9 @@ from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error.model import Limits, rounding_allowance
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import equations
+from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.certificate import Claim
-from obsynth.designs.core.rounding import cut_box, rounding_bound
+from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic.arrays import FloatArray
 
@@ -82,7 +83,7 @@ def of_step(design: UioDesign, precision: str = "double") -> FloatArray:
     w_radius = np.abs(design.W2) @ design.w_radius
     y = _product(C, X) + shift[:, None] + w_radius[:, None] * [-1.0, 1.0]
     y = _outward(y)
-    lo, hi = cut_box(X, max(1, min(16, int(CELLS ** (1.0 / n)))))
+    lo, hi = cut_box(X, CELLS)
     shown = _outward(y - shift[:, None])[:, :, None]
     # one step of rounding may take the exact estimate out of a box that the computed one is in
     cell = _outward(np.stack([lo, hi], axis=1))

@@ -1,12 +1,32 @@
-"""Boxes of code: columns of lower and upper ends."""
+"""Boxes: cut into cells, and those of code, columns of lower and upper ends."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.rigour import Interval
 from obsynth.designs.core.lifted import FAR
 from obsynth.symbolic.arrays import FloatArray
+
+
+def cut_box(
+    box: FloatArray, cells: int, along: Sequence[int] | None = None, most: int = 16
+) -> Interval:
+    """Cut sides of a box, (n, 2), alike, into about so many cells in all: their ends, (n, N).
+
+    along: which sides, all by default; most: pieces of a side
+    """
+    sides = [*range(len(box))] if along is None else [*along]
+    pieces = max(1, min(most, int(cells ** (1.0 / max(len(sides), 1)))))
+    edges = np.linspace(box[sides, 0], box[sides, 1], pieces + 1)
+    edges[-1] = box[sides, 1]
+    count, rows = pieces ** len(sides), np.arange(len(sides))[:, None]
+    index = np.indices((pieces,) * len(sides)).reshape(len(sides), count)
+    lower, upper = (np.repeat(box[:, [side]], count, axis=1) for side in (0, 1))
+    lower[sides], upper[sides] = edges[index, rows], edges[index + 1, rows]
+    return lower, upper
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import Program, evaluate
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, cut_box
 from obsynth.designs.core.lifted import FAR, Lifted, Rounding, combine, lift
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
@@ -92,10 +92,9 @@ class Equations:
         whole = np.vstack([self.box, self.known_box])
         for (i, j), k in self.entries.items():
             support = list(self.program.support(k))
-            pieces = int(CELLS ** (1.0 / len(support))) if support else 1
-            cells = _cells(whole, support, max(1, min(64, pieces)))
             with np.errstate(all="ignore"):
-                low, high = evaluate(self.program, cells[0], cells[1], [k])
+                cells = cut_box(whole, CELLS, support, most=64)
+                low, high = evaluate(self.program, *cells, [k])
             slopes[i, j] = low.min(), high.max()
         return slopes
 
@@ -334,17 +333,3 @@ def _known_box(plant: Plant, rows: ca.SX, v: ca.SX, known: ca.SX) -> FloatArray:
     measured = [k for k, signal in enumerate(plant.rho) if signal.measured]
     u = np.where(covered_inputs(plant)[:, None], plant.box("u").reshape(-1, 2), [-np.inf, np.inf])
     return np.vstack([u.reshape(-1, 2), plant.box("rho").reshape(-1, 2)[measured]])
-
-
-def _cells(whole: FloatArray, support: list[int], pieces: int) -> tuple[FloatArray, FloatArray]:
-    """Cut a box into cells along some variables, lower and upper ends of shape (variables, N)."""
-    if not support:
-        return whole[:, [0]], whole[:, [1]]
-    edges = [np.linspace(whole[j, 0], whole[j, 1], pieces + 1) for j in support]
-    for j, edge in zip(support, edges, strict=True):
-        edge[0], edge[-1] = whole[j]
-    index = np.indices((pieces,) * len(support)).reshape(len(support), -1)
-    lower, upper = (np.repeat(whole[:, [side]], index.shape[1], axis=1) for side in (0, 1))
-    for place, (j, edge) in enumerate(zip(support, edges, strict=True)):
-        lower[j], upper[j] = edge[index[place]], edge[index[place] + 1]
-    return lower, upper

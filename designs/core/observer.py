@@ -145,18 +145,13 @@ class Observer:
     @property
     def outputs(self) -> Mapping[str, tuple[str, ...]]:
         """Labels of every output of the step, by the names of the plant's signals."""
-        x, f = self.model.names("x"), self.model.names("f")
-        bounds = {
-            "x_lower": tuple(f"{name}_lower" for name in x),
-            "x_upper": tuple(f"{name}_upper" for name in x),
-            "f_lower": tuple(f"{name}_lower" for name in f),
-            "f_upper": tuple(f"{name}_upper" for name in f),
+        parts = [(kind, "hat") for kind in "xf"]
+        parts += [(kind, end) for kind in "xf" for end in ("_lower", "_upper")]
+        labels = {
+            kind + end: tuple(f"{name}_{end.strip('_')}" for name in self.model.names(kind))
+            for kind, end in parts
         }
-        hats = {
-            "xhat": tuple(f"{name}_hat" for name in x),
-            "fhat": tuple(f"{name}_hat" for name in f),
-        }
-        return {**hats, **bounds, "status": ("status",)}
+        return {**labels, "status": ("status",)}
 
     def memory0(
         self,

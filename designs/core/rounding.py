@@ -67,15 +67,6 @@ class Bound(NamedTuple):
     size: FloatArray
 
 
-def cut_box(box: FloatArray, pieces: int) -> Interval:
-    """Cut every side of a box, shape (n, 2), into pieces: ends of the cells, (n, pieces^n)."""
-    edges = np.linspace(box[:, 0], box[:, 1], pieces + 1)
-    edges[-1] = box[:, 1]
-    index = np.indices((pieces,) * len(box)).reshape(len(box), -1)
-    rows = np.arange(len(box))[:, None]
-    return edges[index, rows], edges[index + 1, rows]
-
-
 def rounding_bound(
     function: ca.Function,
     box: Mapping[str, Interval],

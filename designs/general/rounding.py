@@ -9,8 +9,9 @@ rounding of the first stage. All of it is at most `GeneralDesign.rounding`.
 import casadi as ca
 import numpy as np
 
+from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.certificate import Claim
-from obsynth.designs.core.rounding import Bound, cut_box, rounding_bound
+from obsynth.designs.core.rounding import Bound, rounding_bound
 from obsynth.designs.general.record import GeneralDesign, Rounding
 from obsynth.designs.general.step import Limits, curved, stages
 from obsynth.symbolic.arrays import FloatArray
@@ -20,10 +21,6 @@ CELLS = 256
 UP = 1.0 + 2.0**-40
 # What is stored above what was found, so that another library finds it proved too.
 ROOM = 1.0 + 2.0**-10
-
-
-def _ends(box: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return box[:, :1], box[:, 1:]
 
 
 def shown(design: GeneralDesign, limits: Limits) -> FloatArray:
@@ -40,17 +37,11 @@ def _over(
 ) -> dict[str, Bound]:
     """Bound the rounding of a function over boxes, cut along the states that matter."""
     plant = design.extended.plant
-    bends = np.flatnonzero(curved(plant))
-    x_lo, x_hi = _ends(boxes["x"])
-    pieces = min(16, int(CELLS ** (1.0 / max(len(bends), 1))))
-    if bends.size and pieces > 1:
-        lo, hi = cut_box(boxes["x"][bends], pieces)
-        x_lo, x_hi = (np.repeat(end, lo.shape[1], axis=1) for end in (x_lo, x_hi))
-        x_lo[bends], x_hi[bends] = lo, hi
-    cells = {"x": (x_lo, x_hi)}
+    cells = {"x": cut_box(boxes["x"], CELLS, np.flatnonzero(curved(plant)).tolist())}
     for name in function.name_in():
         if name != "x":
-            cells[name] = _ends(boxes[name].reshape(-1, 2))
+            box = boxes[name].reshape(-1, 2)
+            cells[name] = box[:, :1], box[:, 1:]
     return rounding_bound(function, cells)
 
 

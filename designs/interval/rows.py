@@ -141,8 +141,7 @@ class Part:
             least, largest = image(self.on_w(vertex[:, a]), low, high)
             rest = self.X @ vertex[:, o]
             known = {"y": N, "u": self.X @ vertex[:, b]}
-            up = {"r_upper": positive(M), "r_lower": -negative(M)}
-            down = {"r_lower": positive(M), "r_upper": -negative(M)}
+            up, down = _both_ends("r", M)
             upper.append(_stack(sizes, count, {**known, **up, "one": rest + largest[:, None]}))
             lower.append(_stack(sizes, count, {**known, **down, "one": rest + least[:, None]}))
         r, y, u, one = self.radius
@@ -253,6 +252,12 @@ def _sizes(part: Part, names: tuple[str, ...]) -> dict[str, int]:
     return {name: known.get(name.rstrip("+-"), n2) for name in names}
 
 
+def _both_ends(name: str, M: Exact) -> tuple[dict[str, Exact], dict[str, Exact]]:
+    """Return what the ends of a vector add to the upper and the lower end of M times it."""
+    up = {f"{name}_upper": positive(M), f"{name}_lower": -negative(M)}
+    return up, {f"{name}_lower": positive(M), f"{name}_upper": -negative(M)}
+
+
 def _linear(
     sizes: Mapping[str, int],
     r: Exact,
@@ -262,10 +267,10 @@ def _linear(
 ) -> Rows:
     """One linear function of r and y with a box of noise."""
     count = len(r)
-    up = {"r_upper": positive(r), "r_lower": -negative(r), "y": y, "one": noise[1][:, None]}
-    down = {"r_lower": positive(r), "r_upper": -negative(r), "y": y, "one": noise[0][:, None]}
-    upper = {**up, **{k: v for k, v in more.items() if k.endswith("upper")}}
-    lower = {**down, **{k: v for k, v in more.items() if k.endswith("lower")}}
+    up, down = _both_ends("r", r)
+    own = {"y": y, "one": noise[1][:, None]}, {"y": y, "one": noise[0][:, None]}
+    upper = {**up, **own[0], **{k: v for k, v in more.items() if k.endswith("upper")}}
+    lower = {**down, **own[1], **{k: v for k, v in more.items() if k.endswith("lower")}}
     nothing = _stack(sizes, count, {})
     return Rows(sizes, (_stack(sizes, count, upper),), (_stack(sizes, count, lower),), nothing)
 
@@ -296,8 +301,7 @@ def estimate_rows(part: Part, faults: int) -> Rows:
 def first_rows(r: Exact) -> Rows:
     """Bounds of r x for a box of states x."""
     sizes = {"x_upper": r.shape[1], "x_lower": r.shape[1], "one": 1}
-    up = {"x_upper": positive(r), "x_lower": -negative(r)}
-    down = {"x_lower": positive(r), "x_upper": -negative(r)}
+    up, down = _both_ends("x", r)
     upper, lower, nothing = (_stack(sizes, len(r), parts) for parts in (up, down, {}))
     return Rows(sizes, (upper,), (lower,), nothing)
 

@@ -103,11 +103,10 @@ class WidthMap:
 
 def part_width(part: Part, rows: Rows, slack: FloatArray, nominal: Exact | None) -> PartWidth:
     """Return the recursion of a part, for the vertex form or, with a nominal A, for the paper's."""
-    size_r, size_y, size_u = _sizes_of_signals(part)
-    widening = _widening(rows, slack, size_r, size_y, size_u)
+    widening = _widening(part, rows, slack)
     if nominal is None:
         return _vertex_width(part, widening)
-    return _paper_width(part, nominal, size_r, size_y, widening)
+    return _paper_width(part, nominal, widening)
 
 
 def _sizes_of_signals(part: Part) -> tuple[Exact, Exact, Exact]:
@@ -118,22 +117,16 @@ def _sizes_of_signals(part: Part) -> tuple[Exact, Exact, Exact]:
     return r, magnitude(model.C) @ x + magnitude(model.W2) @ w, model.size("u")
 
 
-def _widening(rows: Rows, slack: FloatArray, r: Exact, y: Exact, u: Exact) -> tuple[Exact, Exact]:
+def _widening(part: Part, rows: Rows, slack: FloatArray) -> tuple[Exact, Exact]:
     """Return (coefficient of the error in r, constant): twice what a bound is widened by."""
     table = exact(2.0 * slack)
-    of_e = np.zeros((rows.count, len(r)), dtype=object)
+    sizes = dict(zip("ryuo", (*_sizes_of_signals(part), exact(np.ones(1))), strict=True))
+    of_e = np.zeros((rows.count, len(sizes["r"])), dtype=object)
     constant = np.zeros(rows.count, dtype=object)
     for name, place in rows.places.items():
         block = table[:, place]
-        if name.startswith("r_"):
-            of_e = of_e + block
-            constant = constant + block @ r
-        elif name.startswith("y"):
-            constant = constant + block @ y
-        elif name == "u":
-            constant = constant + block @ u
-        elif name == "one":
-            constant = constant + block[:, 0]
+        of_e = of_e + block if name.startswith("r_") else of_e
+        constant = constant + block @ sizes[name[0]]
     return of_e, constant
 
 
@@ -178,10 +171,9 @@ def _spread(part: Part) -> Exact:
     return total
 
 
-def _paper_width(
-    part: Part, nominal: Exact, size_r: Exact, size_y: Exact, widening: tuple[Exact, Exact]
-) -> PartWidth:
+def _paper_width(part: Part, nominal: Exact, widening: tuple[Exact, Exact]) -> PartWidth:
     """Comparison matrix |R| + sigma_upper+ + sigma_lower- of errors and widths."""
+    size_r, size_y, _ = _sizes_of_signals(part)
     parts = part.split(nominal)
     grown = positive(parts.sigma_upper) + negative(parts.sigma_lower)
     V = magnitude(parts.R) + grown
@@ -198,8 +190,7 @@ def _paper_width(
 
 def contraction_width(rows: Rows, slack: FloatArray, part: Part, component: int) -> Contraction:
     """Return what one row of the contraction does to errors and widths."""
-    size_r, size_y, size_u = _sizes_of_signals(part)
-    of_e, constant = _widening(rows, slack, size_r, size_y, size_u)
+    of_e, constant = _widening(part, rows, slack)
     places, upper = rows.places, rows.upper[0][0]
     others = upper[places["r_upper"]] - upper[places["r_lower"]]
     noise = upper[-1] - rows.lower[0][0, -1]

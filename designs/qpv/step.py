@@ -11,10 +11,10 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, cut_box
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.rounding import cut_box, rounding_bound
+from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, select, slices
 from obsynth.designs.qpv.record import QPVDesign
@@ -358,10 +358,7 @@ def allowance(design: QPVDesign) -> Allowance:
     """
     plant, equations = design.plant, _Equations(design)
     half = design.region.half_widths + 1.01 * np.sqrt(design.inverse_diagonal)
-    cells = cut_box(
-        design.region.c[:, None] + half[:, None] * [-1.0, 1.0],
-        max(1, min(16, int(_CELLS ** (1.0 / len(half))))),
-    )
+    cells = cut_box(design.region.c[:, None] + half[:, None] * [-1.0, 1.0], _CELLS)
     ranges = {kind: finite_box(plant, kind).reshape(-1, 2) for kind in ("u", "rho", "w")}
     ranges["theta"] = ranges.pop("rho")[[s.measured for s in plant.rho]]
     box = {"state": cells, **{k: (v[:, :1], v[:, 1:]) for k, v in ranges.items()}}

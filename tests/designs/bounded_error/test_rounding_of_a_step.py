@@ -14,7 +14,8 @@ from obsynth.designs.bounded_error.claims import claims, covers, guarantee
 from obsynth.designs.bounded_error.model import Limits, rounding_allowance
 from obsynth.designs.bounded_error.rounding import of_matrices, of_step, settle
 from obsynth.designs.bounded_error.step import equations
-from obsynth.designs.core.rounding import cut_box, rounding_bound
+from obsynth.designs.core.boxes import cut_box
+from obsynth.designs.core.rounding import rounding_bound
 
 
 def designed(plant, **options):
@@ -34,7 +35,7 @@ def tanks(tank, base):
 
 def narrow(design, spread=1.0, faults=5.0, correction=0.2):
     """Cells of estimates in their ranges, readings within `spread` of them, small faults."""
-    lo, hi = cut_box(design.plant.box("x"), 4)
+    lo, hi = cut_box(design.plant.box("x"), 4 ** len(design.plant.x))
     kept = np.abs(design.E).sum(axis=1) == 0.0
     z = [np.where(kept[:, None], end, side * correction) for end, side in ((lo, -1), (hi, 1))]
     f = np.full((2, 1), faults)
