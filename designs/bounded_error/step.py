@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike
 from obsynth.designs.bounded_error.lmis import kept_coordinates
 from obsynth.designs.bounded_error.model import Limits
 from obsynth.designs.bounded_error.record import UioDesign
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.running import SETTLED, UP, Running, all_around, settle
-from obsynth.designs.core.stepping import clip, inside, select
+from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
@@ -204,9 +204,7 @@ def build_core(design: UioDesign) -> Core:
         x = Ends(xhat - half[:n], xhat + half[:n])
         f = Ends(fhat - half[n:], fhat + half[n:])
         allowed = ca.fabs(C) @ half[:n] + noise
-        empty = ca.SX(0)
-        for i in range(allowed.numel()):
-            empty = ca.logic_or(empty, ca.fabs(innovation[i]) > allowed[i])
+        empty = some(ca.fabs(innovation[i]) > allowed[i] for i in range(allowed.numel()))
         # a state on which a derivative depends is itself in its range by assumption
         near = inside(pick(xhat, x.lower), pick(xhat, x.upper), limits.x)
         sound = ca.logic_and(near, inside(fhat, fhat, limits.f))

@@ -1,7 +1,8 @@
-"""Boxes: cut into cells, and those of code, columns of lower and upper ends."""
+"""Boxes: cut into cells, and those of code, columns of lower and upper ends with conditions."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -29,6 +30,27 @@ def cut_box(
     return lower, upper
 
 
+def every(conditions: Iterable[ca.SX]) -> ca.SX:
+    """Return 1 where all conditions hold, else 0."""
+    return reduce(ca.logic_and, conditions, ca.SX(1))
+
+
+def some(conditions: Iterable[ca.SX]) -> ca.SX:
+    """Return 1 where a condition holds, else 0."""
+    return reduce(ca.logic_or, conditions, ca.SX(0))
+
+
+def column(entries: Iterable[ca.SX]) -> ca.SX:
+    """Return a column of entries, of which there may be none."""
+    given = [*entries]
+    return ca.vertcat(*given) if given else ca.SX(0, 1)
+
+
+def select(condition: ca.SX, then: ca.SX, otherwise: ca.SX) -> ca.SX:
+    """Return one of two vectors, entry by entry, without letting infinities of the other one in."""
+    return column(ca.if_else(condition, then[i], otherwise[i]) for i in range(then.numel()))
+
+
 @dataclass(frozen=True, eq=False)
 class Ends:
     """A box of code: lower and upper ends, columns."""
@@ -50,12 +72,8 @@ class Ends:
     @property
     def middle(self) -> ca.SX:
         """The middle, rounded to any side; zero where there is no bound."""
-        middle = 0.5 * self.lower + 0.5 * self.upper
-        entries = [
-            ca.if_else(self.upper[i] - self.lower[i] < FAR, middle[i], 0.0)
-            for i in range(middle.numel())
-        ]
-        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+        middle, width = 0.5 * self.lower + 0.5 * self.upper, self.upper - self.lower
+        return column(ca.if_else(width[i] < FAR, middle[i], 0.0) for i in range(middle.numel()))
 
     def meet(self, other: "Ends") -> "Ends":
         """Cut with another box; an end of it that is not a number cuts nothing."""
@@ -63,23 +81,19 @@ class Ends:
 
     def empty(self) -> ca.SX:
         """Return 1 where some coordinate has nothing left, or is not a number."""
-        result = ca.SX(0)
-        for i in range(self.lower.numel()):
-            result = ca.logic_or(result, ca.logic_not(self.lower[i] <= self.upper[i]))
-        return result
+        rows = range(self.lower.numel())
+        return some(ca.logic_not(self.lower[i] <= self.upper[i]) for i in rows)
 
     def nearest(self, value: ca.SX) -> ca.SX:
         """Return the nearest point of the box; of zero for what is not a number."""
-        entries = []
-        for i in range(value.numel()):
-            number = ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0)
-            entries.append(ca.fmin(ca.fmax(number, self.lower[i]), self.upper[i]))
-        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+        numbers = [ca.if_else(ca.fabs(one) <= FAR, one, 0.0) for one in ca.vertsplit(value)]
+        ends = zip(numbers, *map(ca.vertsplit, (self.lower, self.upper)), strict=True)
+        return column(ca.fmin(ca.fmax(number, low), high) for number, low, high in ends)
 
     def where(self, condition: ca.SX, other: "Ends") -> "Ends":
         """Return this box where a condition holds, the other elsewhere."""
         return Ends(
-            _choose(condition, self.lower, other.lower), _choose(condition, self.upper, other.upper)
+            select(condition, self.lower, other.lower), select(condition, self.upper, other.upper)
         )
 
 
@@ -89,7 +103,3 @@ def _larger(a: ca.SX, b: ca.SX) -> ca.SX:
 
 def _smaller(a: ca.SX, b: ca.SX) -> ca.SX:
     return ca.vertcat(*(ca.if_else(b[i] < a[i], b[i], a[i]) for i in range(a.numel())))
-
-
-def _choose(condition: ca.SX, a: ca.SX, b: ca.SX) -> ca.SX:
-    return ca.vertcat(*(ca.if_else(condition, a[i], b[i]) for i in range(a.numel())))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, every
 from obsynth.designs.core.sweeps import Pair
 from obsynth.symbolic.arrays import FloatArray
 
@@ -34,10 +34,7 @@ class Seen:
     @property
     def all_used(self) -> ca.SX:
         """1 where no reading is missing."""
-        result = ca.SX(1)
-        for bit in self.used:
-            result = ca.logic_and(result, bit)
-        return result
+        return every(self.used)
 
     def readings(self, expected: ca.SX) -> ca.SX:
         """Return the readings, what is expected in place of those that are not used."""

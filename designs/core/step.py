@@ -6,19 +6,12 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, column, every, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before, covered_inputs
 from obsynth.designs.core.guard import YOUNG, Guard
 from obsynth.designs.core.lifted import FAR
-from obsynth.designs.core.stepping import (
-    FINITE,
-    all_finite,
-    finite_or,
-    make_step,
-    select,
-    status_word,
-)
+from obsynth.designs.core.stepping import FINITE, all_finite, finite_or, make_step, status_word
 from obsynth.designs.core.sweeps import Pair
 
 HUGE = 1e50
@@ -95,10 +88,8 @@ class Step:
         u, theta = finite_or(self.u, nominal), finite_or(self.theta, middle)
         matters = covered_inputs(plant).tolist()
         held = [(u[i], s) for i, s in enumerate(plant.u) if matters[i]]
-        covered = ca.SX(1)
-        for value, signal in [(theta[i], s) for i, s in enumerate(measured)] + held:
-            fits = ca.logic_and(value >= signal.lower, value <= signal.upper)
-            covered = ca.logic_and(covered, fits)
+        pairs = [(theta[i], s) for i, s in enumerate(measured)] + held
+        covered = every(ca.logic_and(value >= s.lower, value <= s.upper) for value, s in pairs)
         return u, theta, covered
 
     def _readings(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
@@ -170,9 +161,8 @@ class Step:
         told = ca.SX(1) if core.bridges else seen.all_used
         huge = ca.SX(0)
         if known.x is not None:
-            for i in range(known.x.lower.numel()):
-                near = known.x.upper[i] - known.x.lower[i] < HUGE
-                huge = ca.logic_or(huge, ca.logic_not(near))
+            widths = ca.vertsplit(known.x.upper - known.x.lower)
+            huge = some(ca.logic_not(width < HUGE) for width in widths)
             X = X.meet(known.x).where(told, X)
         late = before.faults
         if self.guard.discrete:
@@ -310,7 +300,6 @@ def _declared(X: Ends, declared: Ends) -> Ends:
 
 def _open(ends: ca.SX, sign: float) -> ca.SX:
     """Write infinity for ends that are none."""
-    entries = [
+    return column(
         ca.if_else(sign * ends[i] > 0.5 * FAR, sign * ca.inf, ends[i]) for i in range(ends.numel())
-    ]
-    return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+    )

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.designs.core.boxes import column, every, select
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
@@ -65,33 +66,19 @@ def clip(value: ca.SX, box: FloatArray) -> ca.SX:
 
 def inside(lower: ca.SX, upper: ca.SX, box: FloatArray) -> ca.SX:
     """Return 1 where the interval [lower, upper] lies in a box of shape (n, 2), else 0."""
-    result = ca.SX(1)
-    for i, (low, high) in enumerate(box):
-        result = ca.logic_and(result, ca.logic_and(lower[i] >= low, upper[i] <= high))
-    return result
+    ends = enumerate(box)
+    return every(ca.logic_and(lower[i] >= a, upper[i] <= b) for i, (a, b) in ends)
 
 
 def all_finite(vector: ca.SX) -> ca.SX:
     """Return 1 where every entry is a finite number, else 0."""
-    result = ca.SX(1)
-    for i in range(vector.numel()):
-        result = ca.logic_and(result, ca.fabs(vector[i]) <= FINITE)
-    return result
+    return every(ca.fabs(vector[i]) <= FINITE for i in range(vector.numel()))
 
 
 def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float]) -> ca.SX:
     """Return the vector with every entry that is no finite number replaced."""
-    return ca.vertcat(
-        *(
-            ca.if_else(ca.fabs(vector[i]) <= FINITE, vector[i], other[i])
-            for i in range(vector.numel())
-        )
-    )
-
-
-def select(condition: ca.SX, then: ca.SX, otherwise: ca.SX) -> ca.SX:
-    """Return one of two vectors, entry by entry, without letting infinities of the other one in."""
-    return ca.vertcat(*(ca.if_else(condition, then[i], otherwise[i]) for i in range(then.numel())))
+    rows = range(vector.numel())
+    return column(ca.if_else(ca.fabs(vector[i]) <= FINITE, vector[i], other[i]) for i in rows)
 
 
 def extended(

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, column, every, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.lifted import FAR
@@ -95,16 +95,16 @@ class Corners:
             signs = design.signs[kind][row]
             box = design.plant.box(kind)
             ends = (low, high) if kind == "x" else (ca.SX(box[:, 0]), ca.SX(box[:, 1]))
-            column = [ends[side if signs[j] >= 0 else 1 - side][j] for j in range(len(signs))]
+            corner = [ends[side if signs[j] >= 0 else 1 - side][j] for j in range(len(signs))]
             if kind == "x" and own is not None:
-                column[row] = own
+                corner[row] = own
             if kind == "f" and not faults:
-                column = [ca.SX(0)] * len(signs)
+                corner = [ca.SX(0)] * len(signs)
             if kind == "rho":
                 measured = [s for s in design.plant.rho if s.measured]
                 for k, signal in enumerate(measured):
-                    column[design.plant.rho.index(signal)] = self.theta[k]
-            arguments[kind] = ca.vertcat(*column) if column else ca.SX(0, 1)
+                    corner[design.plant.rho.index(signal)] = self.theta[k]
+            arguments[kind] = column(corner)
         rhs = design.plant.function()
         value: ca.SX = rhs(
             arguments["x"],
@@ -141,10 +141,10 @@ def build_core(design: BankDesign) -> Core:
             ca.vertcat(*(ca.if_else(bit, now[k], then[k]) for k, bit in enumerate(seen.used)))
             for now, then in zip(told, expected, strict=True)
         )
-        contradicted = ca.SX(0)
-        for k in range(len(outputs)):
-            apart = ca.logic_or(shown[0][k] > expected[1][k], shown[1][k] < expected[0][k])
-            contradicted = ca.logic_or(contradicted, apart)
+        contradicted = some(
+            ca.logic_or(shown[0][k] > expected[1][k], shown[1][k] < expected[0][k])
+            for k in range(len(outputs))
+        )
         low, high = _states(design, parts, shown)
         low, high = ca.fmax(low, region[:, 0]), ca.fmin(high, region[:, 1])
         f = telling(fault_intervals(design, parts, shown))
@@ -291,11 +291,8 @@ def _envelope(
         X = ca.fmax(first, region[:, 0]), ca.fmin(second, region[:, 1])
     image = reached(X)
     image = ca.fmax(image[0], region[:, 0]), ca.fmin(image[1], region[:, 1])
-    contained = ca.SX(1)
-    for i in range(n):
-        inner = ca.logic_and(image[0][i] >= X[0][i], image[1][i] <= X[1][i])
-        contained = ca.logic_and(contained, inner)
-    return image, contained
+    inner = (ca.logic_and(image[0][i] >= X[0][i], image[1][i] <= X[1][i]) for i in range(n))
+    return image, every(inner)
 
 
 def _move_hidden(

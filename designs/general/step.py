@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import add_up
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, column
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.lifted import FAR
@@ -243,10 +243,9 @@ def build_core(design: GeneralDesign) -> Core:
     empty = ca.DM(0, 1)
 
     def spread(values: ca.SX, other: float) -> ca.SX:
-        entries = [
+        return column(
             values[n + followed.index(name)] if name in followed else ca.SX(other) for name in names
-        ]
-        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+        )
 
     def run(seen: Seen) -> Known:
         prediction = seen.memory["prediction"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import nearest
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, column
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.interval.record import SWEEPS, IntervalDesign
@@ -88,7 +88,7 @@ class _Evaluated:
                 largest = ca.fmax(largest, _sum(row, entries))
             lower.append(least - widening)
             upper.append(largest + widening)
-        return Ends(_column(lower), _column(upper))
+        return Ends(column(lower), column(upper))
 
 
 def _sum(coefficients: FloatArray, entries: list[ca.SX]) -> ca.SX:
@@ -97,10 +97,6 @@ def _sum(coefficients: FloatArray, entries: list[ca.SX]) -> ca.SX:
         if coefficient != 0.0:
             total = total + float(coefficient) * entry
     return total
-
-
-def _column(parts: list[ca.SX]) -> ca.SX:
-    return ca.vertcat(*parts) if parts else ca.SX(0, 1)
 
 
 def _signs(name: str, value: ca.SX) -> dict[str, ca.SX]:

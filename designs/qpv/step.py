@@ -11,12 +11,12 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends, cut_box
+from obsynth.designs.core.boxes import Ends, cut_box, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
-from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, select, slices
+from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices
 from obsynth.designs.qpv.record import QPVDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -21,6 +21,7 @@ from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.rigour import substitute
+from obsynth.designs.core.boxes import column
 from obsynth.designs.core.record import Context
 from obsynth.symbolic import Plant, Signal, read_text, to_sx, write_text
 from obsynth.symbolic.arrays import FloatArray
@@ -169,13 +170,12 @@ def substitute_all(matrix: sp.Matrix, plant: Plant) -> sp.Matrix:
 
 
 def _columns(count: int) -> ca.SX:
-    return ca.vertcat(*[ca.SX.sym(f"s{i}") for i in range(count)]) if count else ca.SX(0, 1)
+    return column(ca.SX.sym(f"s{i}") for i in range(count))
 
 
 def _matrix(matrix: sp.Matrix, table: Mapping[sp.Symbol, ca.SX], label: str) -> ca.SX:
-    entries = to_sx(list(matrix.T), table, [label] * len(matrix))
-    column = ca.vertcat(*entries) if entries else ca.SX(0, 1)
-    return ca.densify(ca.reshape(column, *matrix.shape))
+    entries = column(to_sx(list(matrix.T), table, [label] * len(matrix)))
+    return ca.densify(ca.reshape(entries, *matrix.shape))
 
 
 def _signal(signals: tuple[Signal, ...], name: str) -> Signal:

@@ -16,10 +16,10 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, column, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import make_ode, select, slices
+from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.set_adaptive.coordinates import carried, image
 from obsynth.designs.set_adaptive.equations import (
     MONITORS,
@@ -91,10 +91,9 @@ def build_core(design: SetDesign) -> Core:
         theta_m = select(seen.all_used, theta_m, memory["theta_m"])
         theta_M = select(seen.all_used, theta_M, memory["theta_M"])
         smallest, largest = ca.fmin(theta_m, theta_M), ca.fmax(theta_m, theta_M)
-        xi, empty = (memory["xi_m"], memory["xi_M"]), ca.SX(0)
+        xi = memory["xi_m"], memory["xi_M"]
         least, most = carried(design.frame.C, *xi, design.rounding)
-        for k in range(m):
-            empty = ca.logic_or(empty, ca.logic_or(least[k] > high[k], most[k] < low[k]))
+        empty = some(ca.logic_or(least[k] > high[k], most[k] < low[k]) for k in range(m))
         exact = _exact_arguments(design, seen.u, seen.theta)
         x = Ends(*carried(design.frame.back, *xi, design.rounding))
         lower, upper = _frozen(design, low, high, x, seen.u, exact)
@@ -282,8 +281,7 @@ def _exact_arguments(design: SetDesign, u: ca.SX, theta: ca.SX) -> ca.SX:
     """Return the arguments of the bounds that are known exactly, from inputs and scheduling."""
     names = design.plant.names("u")
     measured = [s.name for s in design.plant.rho if s.measured]
-    values = [
+    return column(
         u[names.index(s.name)] if s.name in names else theta[measured.index(s.name)]
         for s in design.bounds.exact
-    ]
-    return ca.vertcat(*values) if values else ca.SX(0, 1)
+    )

@@ -14,14 +14,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, every, select
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.lifted import FAR
-from obsynth.designs.core.stepping import select
 from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.general import step as general
 from obsynth.designs.general.record import GeneralDesign
@@ -195,9 +194,7 @@ class Bank:
         nothing = Ends.unbounded(self.N)
         told = seen.all_used
         width = held.upper - held.lower
-        near = ca.SX(1)
-        for i in range(self.N):
-            near = ca.logic_and(near, width[i] < 0.5 * FAR)
+        near = every(width[i] < 0.5 * FAR for i in range(self.N))
         sound = ca.logic_and(ca.logic_and(told, known.sound), near)
         return held.where(told, nothing), {**known.moved, "anew": ca.logic_not(sound)}
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from luenberger.record import LuenbergerDesign
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import clip, select
+from obsynth.designs.core.stepping import clip
 from obsynth.symbolic.arrays import FloatArray
 
 UP = 1.0 + 2.0**-40
