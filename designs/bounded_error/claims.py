@@ -24,7 +24,7 @@ from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, prove_boxes, within
+from obsynth.designs.core.signals import DECLARED, covers_jacobian, prove_boxes, within
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
@@ -182,13 +182,7 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
         room,
         "bounds of |exact - double| times the limits of the signals",
     )
-    yield Claim(
-        "jacobian",
-        "every Jacobian of g over the box lies in the stored family",
-        design.family.covers(family),
-        design.family.room(family),
-        "interval branch and bound with outward rounding; dependences proved symbolically",
-    )
+    yield covers_jacobian("g", design.family, family)
 
 
 def numbers(design: UioDesign) -> Numbers:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.certificate import Claim
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
@@ -41,6 +42,17 @@ def prove_boxes(
     room = np.concatenate([box[:, 0] - (centre - radius), (centre + radius) - box[:, 1], more])
     margin = float(room.min(initial=np.inf))
     return Claim("boxes", f"the stored boxes {what}", bool(margin >= 0.0), margin, "comparison")
+
+
+def covers_jacobian(what: str, stored: AffineFamily, derived: AffineFamily) -> Claim:
+    """Claim that a stored family holds the Jacobians that were derived anew."""
+    return Claim(
+        "jacobian",
+        f"every Jacobian of {what} over the box lies in the stored family",
+        stored.covers(derived),
+        stored.room(derived),
+        "interval branch and bound with outward rounding; dependences proved symbolically",
+    )
 
 
 def noise_centre(plant: Plant) -> FloatArray:

@@ -9,7 +9,7 @@ from obsynth.derive.structure.following import NO_RATE, untold
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, prove_boxes, within
+from obsynth.designs.core.signals import DECLARED, covers_jacobian, prove_boxes, within
 from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
@@ -80,13 +80,7 @@ def covers(design: GeneralDesign, fresh: GeneralModel) -> Iterator[Claim]:
         0.0,
         "constant directions proved symbolically, L0 in exact arithmetic" if free else "comparison",
     )
-    yield Claim(
-        "jacobian",
-        "every Jacobian of rows and outputs over the box lies in the stored family",
-        design.family.covers(fresh.bounds.family),
-        design.family.room(fresh.bounds.family),
-        "interval branch and bound with outward rounding; dependences proved symbolically",
-    )
+    yield covers_jacobian("rows and outputs", design.family, fresh.bounds.family)
 
 
 def numbers(design: GeneralDesign) -> Numbers:

@@ -15,6 +15,7 @@ from obsynth.designs.core.signals import (
     LARGEST_SIGNAL,
     about_centre,
     at_centre,
+    covers_jacobian,
     finite_box,
     noise_centre,
     within,
@@ -186,19 +187,9 @@ def covers(design: HinfDesign, fresh: Derived) -> Iterator[Claim]:
         "bounds of |exact - double| times the ranges",
     )
     # The step and the refusal of unstable gains use the vertices in every form.
-    yield _covers_family(design, fresh)
+    yield covers_jacobian("g", design.family, fresh.bounds.family)
     if design.sector is not None:
         yield _covers_sector(design, fresh)
-
-
-def _covers_family(design: HinfDesign, fresh: Derived) -> Claim:
-    return Claim(
-        "jacobian",
-        "every Jacobian of g over the box lies in the stored family",
-        design.family.covers(fresh.bounds.family),
-        design.family.room(fresh.bounds.family),
-        "interval branch and bound with outward rounding; dependences proved symbolically",
-    )
 
 
 def _covers_sector(design: HinfDesign, fresh: Derived) -> Claim:

@@ -98,19 +98,14 @@ class HinfDesign(Record):
         # An exact inverse stays exact where the columns are those of the identity.
         null = np.linalg.svd(CL)[0][:, CL.shape[1] :].T
         null = np.where(np.abs(null) < 1e-15, 0.0, null)
+        own = ("A", "C", "L", "W", "A_radius", "W_radius", "sector")
         return FilterData(
-            A=self.A,
-            C=self.C,
-            L=self.L,
-            W=self.W,
+            **{name: getattr(self, name) for name in own},
             H=np.asarray(H, dtype=float),
             n_f=len(self.plant.f),
             null=null,
-            A_radius=self.A_radius,
-            W_radius=self.W_radius,
             vertices=vertices.mid,
             vertex_radius=np.broadcast_to(vertices.rad, vertices.mid.shape),
-            sector=self.sector,
         )
 
     def check(self) -> None:

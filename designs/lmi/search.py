@@ -124,10 +124,10 @@ def search_line(
     from rich.console import Console
     from rich.progress import track
 
-    record = _Record(objective)
+    record = _Record(design, objective)
     terminal = Console().is_terminal
     for value in track(grid, description=name, disable=not terminal, transient=True):
-        record.add(value, _attempt(design, value))
+        record.measure(value)
     if record.best is None:
         raise record.refusal(
             f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design"
@@ -136,7 +136,7 @@ def search_line(
         values = sorted(grid)
         place = values.index(record.best[0])
         low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
-        _refine(lambda value: record.add(value, _attempt(design, value)), low, high, refine)
+        _refine(record.measure, low, high, refine)
     value, least, result = record.best
     return Search(value, result, least, tuple(record.tried))
 
@@ -155,7 +155,7 @@ def search_log_convex(
     Such an objective has one minimum, its feasible values are one interval, and the chords
     through the points tried bound it from below, so that the search knows when to stop.
     """
-    record = _Record(objective)
+    record = _Record(design, objective)
 
     def left_over() -> float:
         return _lower_bound(record, low, high)
@@ -163,7 +163,7 @@ def search_log_convex(
     def enough() -> bool:
         return record.best is not None and left_over() >= (1.0 - rtol) * record.best[1]
 
-    _refine(lambda value: record.add(value, _attempt(design, value)), low, high, most, enough)
+    _refine(record.measure, low, high, most, enough)
     if record.best is None:
         raise record.refusal(f"no value between {low:.4g} and {high:.4g} gives a design")
     _require_log_convex(record, rtol)
@@ -219,22 +219,26 @@ def _lower_bound(record: _Record[Result], low: float, high: float) -> float:
 class _Record(Generic[Result]):
     """Everything tried so far and the best of it."""
 
-    def __init__(self, objective: Callable[[Result], float]) -> None:
-        self.objective = objective
+    def __init__(
+        self, design: Callable[[float], Result], objective: Callable[[Result], float]
+    ) -> None:
+        self.design, self.objective = design, objective
         self.tried: list[tuple[float, float]] = []
         self.troubles: list[str] = []
         self.best: tuple[float, float, Result] | None = None
         self.all_infeasible = True
 
-    def add(self, value: float, outcome: Result | Exception) -> float:
-        if isinstance(outcome, Exception):
-            self.troubles.append(f"{value:.4g}: {str(outcome).splitlines()[0]}")
-            measured = np.inf
-            self.all_infeasible &= isinstance(outcome, InfeasibleDesign)
-        else:
-            measured = float(self.objective(outcome))
+    def measure(self, value: float) -> float:
+        """Design at a value and return the objective, infinite where that is refused."""
+        measured = np.inf
+        try:
+            result = self.design(value)
+            measured = float(self.objective(result))
             if self.best is None or measured < self.best[1]:
-                self.best = (value, measured, outcome)
+                self.best = (value, measured, result)
+        except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
+            self.troubles.append(f"{value:.4g}: {str(refusal).splitlines()[0]}")
+            self.all_infeasible &= isinstance(refusal, InfeasibleDesign)
         self.tried.append((value, measured))
         return measured
 
@@ -265,10 +269,3 @@ def _refine(
             low, left, at_left = left, right, at_right
             right = low + _GOLDEN * (high - low)
             at_right = measure(right)
-
-
-def _attempt(design: Callable[[float], Result], value: float) -> Result | Exception:
-    try:
-        return design(value)
-    except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
-        return refusal

@@ -168,6 +168,7 @@ def check_polytope(model: QPVModel, eta: float | None) -> QPVModel:
     needed, kappa = cover(model.unit, model.region), model.kappa
     largest = 1.0 / reach(model.unit, model.region)
     smallest = 0.0 if eta is None else eta * needed
+    limits = {"kappa": kappa, "smallest": smallest, "largest": largest}
     if kappa < smallest * (1.0 - TOLERANCE):
         raise InfeasibleDesign(
             f"kappa = {kappa:.6g} is too small for eta = {eta:g}: the region X does not "
@@ -176,18 +177,14 @@ def check_polytope(model: QPVModel, eta: float | None) -> QPVModel:
                 f"kappa has to be at least {smallest:.6g} at this eta",
                 f"or eta at most {kappa / needed:.6g} at this kappa",
             ],
-            kappa=kappa,
-            smallest=smallest,
-            largest=largest,
+            **limits,
         )
     if not model.apart and kappa > largest * (1.0 + TOLERANCE):
         raise InfeasibleDesign(
             f"kappa = {kappa:.6g} is too large: the polytope P_x leaves the region X, "
             "which Assumption 2 of the paper does not allow",
             [f"kappa has to be at most {largest:.6g} for this polytope and region"],
-            kappa=kappa,
-            smallest=smallest,
-            largest=largest,
+            **limits,
         )
     return model
 

@@ -5,13 +5,14 @@ what enters several rows is a generator of its own, as is every fault that is no
 enters one row only widens it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.intervals.program import Program
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.relaxation import Affine, relax
@@ -82,18 +83,12 @@ class Enclosures:
 
     def rows(self, before: Before) -> Rows:
         """Enclose the next z over the boxes of an instant."""
-        equations, n, N = self.sweeps.equations, self.sweeps.n, self.size
-        variables = equations.variables(before)
-        program = equations.program
-        found = relax(program, program.outputs[:n], variables, self.sweeps.rounding)
-        boxes = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
+        program, n, N = self.sweeps.equations.program, self.sweeps.n, self.size
         J, columns = ca.SX(N, N), {j: ca.SX(N, 1) for j in self.alone}
         offset, spread = [], []
-        for i, form in enumerate(found):
-            for j, k in self.place.items():
-                if j in form.slopes:
-                    J[i, k] = form.slopes[j]
-            middle, reach, own = self._beside(form, boxes)
+        found = self._forms(program, program.outputs[:n], before)
+        for i, (slopes, middle, reach, own) in enumerate(found):
+            J[i, :] = slopes
             for j, value in own.items():
                 columns[j][i] = value
             offset.append(middle)
@@ -107,21 +102,26 @@ class Enclosures:
 
     def outputs(self, now: Before) -> Shown:
         """Enclose the outputs over the boxes of an instant."""
-        equations, N = self.sweeps.equations, self.size
-        variables = equations.variables(now)
-        program = equations.outputs
-        found = relax(program, program.outputs, variables, self.sweeps.rounding)
-        boxes = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
-        H = ca.SX(len(found), N)
-        offset, sigma = [], []
-        for q, form in enumerate(found):
-            for j, k in self.place.items():
-                if j in form.slopes:
-                    H[q, k] = form.slopes[j]
-            middle, reach, own = self._beside(form, boxes)
+        program = self.sweeps.equations.outputs
+        H, offset, sigma = [], [], []
+        for slopes, middle, reach, own in self._forms(program, program.outputs, now):
+            H.append(slopes)
             offset.append(middle)
             sigma.append((reach + sum((ca.fabs(v) for v in own.values()), ca.SX(0))) * _UP)
-        return Shown(H, ca.vertcat(*offset), ca.vertcat(*sigma))
+        return Shown(ca.vertcat(*H), ca.vertcat(*offset), ca.vertcat(*sigma))
+
+    def _forms(
+        self, program: Program, nodes: Sequence[int], boxes: Before
+    ) -> Iterator[tuple[ca.SX, ca.SX, ca.SX, dict[int, ca.SX]]]:
+        """Yield the slopes of nodes by z, a row each, and what `_beside` says of them."""
+        variables = self.sweeps.equations.variables(boxes)
+        rest = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
+        for form in relax(program, nodes, variables, self.sweeps.rounding):
+            slopes = ca.SX(1, self.size)
+            for j, k in self.place.items():
+                if j in form.slopes:
+                    slopes[k] = form.slopes[j]
+            yield slopes, *self._beside(form, rest)
 
     @cached_property
     def beside(self) -> list[int]:
