@@ -240,10 +240,7 @@ def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: flo
 
 
 def search_gamma(
-    solve: Callable[[float], EllipsoidSolution],
-    weights: FloatArray,
-    top: float,
-    xatol: float = 5e-3,
+    solve: Callable[[float], EllipsoidSolution], weights: FloatArray, top: float
 ) -> EllipsoidSolution:
     """Search gamma for the smallest sum of the (weighted) half widths. Shapes: weights (p,)."""
     found = search_line(

@@ -86,9 +86,9 @@ class Ends:
 
     def nearest(self, value: ca.SX) -> ca.SX:
         """Return the nearest point of the box; of zero for what is not a number."""
-        numbers = [ca.if_else(ca.fabs(one) <= FAR, one, 0.0) for one in ca.vertsplit(value)]
-        ends = zip(numbers, *map(ca.vertsplit, (self.lower, self.upper)), strict=True)
-        return column(ca.fmin(ca.fmax(number, low), high) for number, low, high in ends)
+        rows = range(value.numel())
+        numbers = [ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0) for i in rows]
+        return column(ca.fmin(ca.fmax(numbers[i], self.lower[i]), self.upper[i]) for i in rows)
 
     def where(self, condition: ca.SX, other: "Ends") -> "Ends":
         """Return this box where a condition holds, the other elsewhere."""

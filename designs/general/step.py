@@ -106,7 +106,8 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
 def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> ca.SX:
     """Return an s of every bound, for a state and a fault in boxes around a prediction."""
     low, high = (
-        ca.vertcat(a, b[design.places]) for a, b in ((x.lower, f.lower), (x.upper, f.upper))
+        ca.vertcat(a, *(b[k] for k in design.places))
+        for a, b in ((x.lower, f.lower), (x.upper, f.upper))
     )
     apart = ca.fmax(high - prediction, prediction - low) * UP
     return ca.vertcat(*(_start(design, bound, apart) for bound in design.bounds))
@@ -276,7 +277,7 @@ def build_core(design: GeneralDesign) -> Core:
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         near = x.nearest(kept["prediction"][:n])
-        box = Ends(f.lower[design.places], f.upper[design.places])
-        return {"prediction": ca.vertcat(near, box.nearest(kept["prediction"][n:]))}
+        ends = (column(end[k] for k in design.places) for end in (f.lower, f.upper))
+        return {"prediction": ca.vertcat(near, Ends(*ends).nearest(kept["prediction"][n:]))}
 
     return Core(run, begin, place, domain=domain)
