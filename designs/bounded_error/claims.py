@@ -14,7 +14,6 @@ from obsynth.designs.bounded_error.lmis import (
     ModelData,
     build_error_system,
     fixed_gain_block,
-    kept_coordinates,
     lift,
 )
 from obsynth.designs.bounded_error.model import MATRICES, Derived, Limits, noise_box
@@ -55,13 +54,6 @@ def _prove_decoupling(design: UioDesign) -> Claim:
     )
 
 
-def reduced_gain(design: UioDesign, error: str) -> FloatArray:
-    """Kbar in the coordinates of the error system, shape (p, m)."""
-    if error == "plain":
-        return design.gain
-    return np.vstack([design.K[kept_coordinates(design.T)], design.F])
-
-
 def recursion_block(
     data: ModelData,
     gain: FloatArray,
@@ -84,7 +76,7 @@ def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
     bound = design.bound
     claims = [_prove_weights(bound), _prove_lmi(design, bound), _prove_half_widths(bound)]
     if bound.error == "shifted":
-        kept = kept_coordinates(design.T)
+        kept = design.kept(bound.error)
         dropped = [i for i in range(len(design.A)) if i not in kept]
         largest = float(np.abs(design.K[dropped]).max(initial=0.0))
         claims.append(
@@ -118,7 +110,7 @@ def _prove_weights(bound: EllipsoidBound) -> Claim:
 
 
 def _prove_lmi(design: UioDesign, bound: EllipsoidBound) -> Claim:
-    gain = reduced_gain(design, bound.error)
+    gain = design.gain(bound.error)
     holds, exact, margin = True, True, np.inf
     count = len(design.data.vertices)
     for number in range(len(bound.P)):

@@ -21,7 +21,6 @@ from obsynth.designs.bounded_error.lmis import (
     ErrorKind,
     ErrorSystem,
     build_error_system,
-    kept_coordinates,
 )
 from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read, read_again
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
@@ -233,16 +232,16 @@ class BoundedErrorUIO(Method):
 
     def solve(self, model: UioModel) -> UioDesign:
         """Find gains and their bounds."""
-        return _settled(self._design_ellipsoid(model), model)
+        return settle(self._design_ellipsoid(model), model.split.proof.rounding)
 
     def fix(self, model: UioModel, gains: Mapping[str, ArrayLike]) -> UioDesign:
         """Bound the errors of given ``K`` of shape (n, m) and ``F`` of shape (n_f, m)."""
         blank = model.design
         found = read_gains(gains, {"K": blank.K.shape, "F": blank.F.shape})
         given = replace(blank, K=found["K"], F=found["F"], options=self.options())
-        given = _settled(given, model)
+        given = settle(given, model.split.proof.rounding)
         system, noise, weights = self._setting(model)
-        gain = np.vstack([given.K[self._kept(given)], given.F])
+        gain = given.gain(self.error)
         if self.gamma is None:
             solution = analyse_gain(system, gain, noise, weights)
         else:
@@ -269,11 +268,6 @@ class BoundedErrorUIO(Method):
         system, free_or_fixed, weights = self._setting(model)
         return design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
 
-    def _kept(self, design: UioDesign) -> list[int]:
-        if self.error == "plain":
-            return list(range(len(design.A)))
-        return kept_coordinates(design.T)
-
     def _weights(self, model: UioModel) -> FloatArray:
         design = model.design
         n, n_f = design.A.shape[0], design.rate.size
@@ -284,7 +278,7 @@ class BoundedErrorUIO(Method):
                 f"weights are {weights.size} numbers; {n + n_f} are needed ({', '.join(names)})",
                 option="weights",
             )
-        return np.concatenate([weights[:n][self._kept(design)], weights[n:]])
+        return np.concatenate([weights[:n][design.kept(self.error)], weights[n:]])
 
     @staticmethod
     def _noise(model: UioModel, blocks: int) -> FloatArray:
@@ -312,7 +306,7 @@ class BoundedErrorUIO(Method):
         solution = _solve_or_explain(solve, top, weights, self.gamma, system)
         gain = solution.gain
         n, m = model.design.K.shape
-        kept = self._kept(model.design)
+        kept = model.design.kept(self.error)
         K = np.zeros((n, m))
         K[kept] = gain[: len(kept)]
         F = gain[len(kept) :]
@@ -353,7 +347,7 @@ class BoundedErrorUIO(Method):
         weights: FloatArray,
     ) -> UioDesign:
         """Attach the ellipsoids to a design with gains, backed off until they are proved."""
-        gain = np.vstack([given.K[self._kept(given)], given.F])
+        gain = given.gain(self.error)
         solutions = [solution]
         if self.post == "per_component":
             solutions = [analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))]
@@ -369,10 +363,6 @@ class BoundedErrorUIO(Method):
             if all(claim.holds for claim in prove_ellipsoid(design)):
                 break
         return design
-
-
-def _settled(design: UioDesign, model: UioModel) -> UioDesign:
-    return settle(design, model.split.proof.rounding)
 
 
 def _with_vertices(model: UioModel, vertices: FloatArray) -> Any:

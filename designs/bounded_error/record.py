@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
-from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData
+from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData, kept_coordinates
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
@@ -96,10 +96,13 @@ class UioDesign(Record):
         own = {name: getattr(self, name) for name in names}
         return ModelData(**own, vertices=vertices.mid, vertex_radius=vertices.rad)
 
-    @property
-    def gain(self) -> FloatArray:
-        """Kbar = [K; F], shape (n + n_f, m)."""
-        return np.vstack([self.K, self.F])
+    def kept(self, error: ErrorKind) -> list[int]:
+        """Return which coordinates of x an error of a kind has."""
+        return [*range(len(self.A))] if error == "plain" else kept_coordinates(self.T)
+
+    def gain(self, error: ErrorKind) -> FloatArray:
+        """Return Kbar = [K; F] in the coordinates of the error system, (p, m)."""
+        return np.vstack([self.K[self.kept(error)], self.F])
 
 
 def _enclosed_vertices(family: AffineFamily) -> Enclosure:

@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.lmis import kept_coordinates
 from obsynth.designs.bounded_error.model import Limits
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.core.boxes import Ends, select, some
@@ -25,12 +24,9 @@ def noise_offset(design: UioDesign) -> FloatArray:
 
 def _component_map(design: UioDesign) -> list[int | None]:
     """For each of the n + n_f errors the component of xi that bounds it, or None."""
-    n, n_f = design.A.shape[0], design.rate.size
-    if design.bound.error == "plain":
-        return list(range(n + n_f))
-    kept = kept_coordinates(design.T)
-    states: list[int | None] = [kept.index(i) if i in kept else None for i in range(n)]
-    return states + [len(kept) + j for j in range(n_f)]
+    kept, rows = design.kept(design.bound.error), range(len(design.A))
+    states: list[int | None] = [kept.index(i) if i in kept else None for i in rows]
+    return states + [len(kept) + j for j in range(design.rate.size)]
 
 
 def running_bound(design: UioDesign) -> Running:
@@ -176,7 +172,7 @@ def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
     if bound.error == "plain":
         reach = ca.vertcat((zeta + ca.DM(noise_offset(design))) * UP, e_f)
     else:
-        reach = ca.vertcat(*(zeta[i] for i in kept_coordinates(design.T)), e_f)
+        reach = ca.vertcat(*(zeta[i] for i in design.kept(bound.error)), e_f)
     levels = [ca.dot(reach, ca.DM(np.abs(P)) @ reach) * UP for P in bound.P]
     components = _component_map(design)
     return ca.vertcat(*(0.0 if c is None else levels[bound.shape_of(c)] for c in components))

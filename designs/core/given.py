@@ -82,7 +82,7 @@ def read_option(name: str, kind: Any, value: Any) -> Any:
     allowed = [one for one in allowed if one is not NoneType]
     literals = [v for one in allowed if get_origin(one) is Literal for v in get_args(one)]
     if literals and len(allowed) == 1:
-        return _one_of(name, value, [*literals, *([None] if _optional(kind) else [])])
+        return _one_of(name, value, [*literals, *([None] if NoneType in get_args(kind) else [])])
     if allowed == [bool]:
         return _one_of(name, value, [True, False])
     if allowed in ([float], [int]):
@@ -94,10 +94,6 @@ def read_option(name: str, kind: Any, value: Any) -> Any:
     if allowed == [tuple[tuple[float, float], ...]]:
         return _pairs(name, value)
     return value
-
-
-def _optional(kind: Any) -> bool:
-    return get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind)
 
 
 def _one_of(name: str, value: Any, allowed: list[Any]) -> Any:

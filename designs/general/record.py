@@ -14,11 +14,8 @@ from obsynth.designs.core.record import Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
-
-@lru_cache(maxsize=16)
-def _extended(plant: Plant, unfollowed: tuple[str, ...], divided: tuple[str, ...]) -> Extended:
-    """Return the extended plant, one for all designs of a plant."""
-    return extend(plant, unfollowed, divided)
+_extended = lru_cache(maxsize=16)(extend)
+"""One extended plant for all designs of a plant."""
 
 
 @dataclass(frozen=True, eq=False)

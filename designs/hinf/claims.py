@@ -32,6 +32,7 @@ from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.sector import build_sector, covers_sector
 from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
+from obsynth.designs.lmi.problem import he
 from obsynth.designs.lmi.proof import RUMP
 from obsynth.symbolic.arrays import FloatArray
 
@@ -103,7 +104,7 @@ def prove_level(design: HinfDesign) -> Iterator[Claim]:
         worst = int(result.worst()[0]) if data.sector is None else 0
         if worst not in exact:
             exact[worst] = proof_blocks(design, "exact", data.vertex(worst))
-        confirmed = is_positive_definite(_symmetric(exact[worst][name]))
+        confirmed = is_positive_definite(he(exact[worst][name]) * Fraction(1, 2))
         yield Claim(
             name,
             statements[name],
@@ -122,10 +123,6 @@ def prove_level(design: HinfDesign) -> Iterator[Claim]:
             least,
             "comparison",
         )
-
-
-def _symmetric(matrix: ExactMatrix) -> ExactMatrix:
-    return (matrix + matrix.T) * Fraction(1, 2)
 
 
 def decoupling_residual(design: HinfDesign) -> tuple[float, float]:
@@ -252,16 +249,10 @@ def _gains(design: HinfDesign) -> dict[str, FloatArray]:
 
 
 def _performance(design: HinfDesign) -> dict[str, float]:
-    values = {
-        "l2_gain": design.bound.mu,
-        "mu": design.bound.mu,
-        "trace_P": float(np.trace(design.bound.P)),
-    }
-    if design.bound.least_mu is not None:
-        values["least_mu"] = design.bound.least_mu
-    if design.bound.decay is not None:
-        values["decay"] = design.bound.decay
-    return values
+    bound = design.bound
+    found = {"l2_gain": bound.mu, "mu": bound.mu, "trace_P": float(np.trace(bound.P))}
+    more = {"least_mu": bound.least_mu, "decay": bound.decay}
+    return found | {name: value for name, value in more.items() if value is not None}
 
 
 def guarantee(design: HinfDesign) -> Guarantee:

@@ -199,7 +199,7 @@ class IntervalDesign(Record):
 
         Of r at an instant and the one before.
         """
-        share = row_widths(self._share_width, e, w)
+        share = row_widths(self._width_of(self.share, self.share_rows), e, w)
         size = self.share.size + exact(share)
         x = self._linear_widths(self.state_rows, w)
         f = self._linear_widths(self.estimate_rows, w, share_upper=size, share_lower=size)
@@ -215,10 +215,6 @@ class IntervalDesign(Record):
         if not np.isfinite(used).all():
             return np.full(len(table), np.inf)
         return above(table @ exact(2.0 * used) + slack @ size)
-
-    @cached_property
-    def _share_width(self) -> PartWidth:
-        return self._width_of(self.share, self.share_rows)
 
     def _linear_widths(self, rows: Rows, w: FloatArray, **more: Exact) -> FloatArray:
         return linear_widths(rows, rows.slack(self.precision), self.prediction, w, more)

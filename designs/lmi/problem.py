@@ -71,16 +71,17 @@ def symmetric_block(rows: Sequence[Sequence[Any]]) -> Any:
             )
     n = len(rows)
     return block(
-        [[rows[i][j] if j <= i else _transpose(rows[j][i]) for j in range(n)] for i in range(n)]
+        [[rows[i][j] if j <= i else transpose(rows[j][i]) for j in range(n)] for i in range(n)]
     )
 
 
 def he(matrix: Any) -> Any:
     """X + X' of a square matrix in any arithmetic."""
-    return matrix + _transpose(matrix)
+    return matrix + transpose(matrix)
 
 
-def _transpose(cell: Any) -> Any:
+def transpose(cell: Any) -> Any:
+    """Transpose a matrix, or every member of a family, in any arithmetic; 0 stays 0."""
     if is_zero(cell):
         return 0
     return np.swapaxes(cell, -1, -2) if isinstance(cell, np.ndarray) else cell.T

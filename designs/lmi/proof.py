@@ -261,8 +261,10 @@ def excluded_size(problem: Problem, solution: Solution) -> float:
 
 def _multipliers(problem: Problem, solution: Solution) -> dict[str, NDArray[np.float64]] | None:
     """Return the dual solution moved into its cones, exactly."""
-    multipliers = {}
-    traces = [np.trace(z, axis1=-2, axis2=-1).sum() for z in _matrix_duals(problem, solution)]
+    multipliers: dict[str, NDArray[np.float64]] = {}
+    names = [name for name, item in problem.blocks.items() if item.cone == "psd"]
+    psd = [solution.duals[name] for name in names if name in solution.duals]
+    traces = [np.trace(z, axis1=-2, axis2=-1).sum() for z in psd]
     weight = _NEGLIGIBLE * float(sum(traces))
     for name, item in problem.blocks.items():
         dual = solution.duals.get(name)
@@ -280,22 +282,14 @@ def _pairings(
     problem: Problem, multipliers: Mapping[str, NDArray[np.float64]]
 ) -> tuple[Fraction, dict[tuple[str, int], Fraction]]:
     """Return c0 and r of the weighted sum of all constraints, exactly."""
-    constant, residuals = Fraction(0), dict.fromkeys(_unknowns(problem), Fraction(0))
+    unknowns = [(name, k) for name, v in problem.variables.items() for k in range(v.size)]
+    constant, residuals = Fraction(0), dict.fromkeys(unknowns, Fraction(0))
     for name, weights in multipliers.items():
         offset, slopes = _pairing(problem.blocks[name].expression, weights)
         constant += offset
         for key, slope in slopes.items():
             residuals[key] += slope
     return constant, residuals
-
-
-def _matrix_duals(problem: Problem, solution: Solution) -> list[NDArray[np.float64]]:
-    names = [name for name, item in problem.blocks.items() if item.cone == "psd"]
-    return [solution.duals[name] for name in names if name in solution.duals]
-
-
-def _unknowns(problem: Problem) -> list[tuple[str, int]]:
-    return [(name, k) for name, v in problem.variables.items() for k in range(v.size)]
 
 
 def _definite(dual: NDArray[np.float64], negligible: float) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from obsynth.designs.lmi.expression import (
     scalar,
     symmetric,
 )
-from obsynth.designs.lmi.problem import Problem, block, he
+from obsynth.designs.lmi.problem import Problem, block, he, transpose
 from obsynth.designs.lmi.reductions import present_entries
 
 
@@ -128,8 +128,7 @@ def corner_block(Q: Any, S: Any, R: Any, vertices: Any) -> Any:
 
     Shapes: Q, S, R (c, c), (c, 1), (1, 1).
     """
-    columns = np.swapaxes(vertices, -1, -2) if isinstance(vertices, np.ndarray) else vertices.T
-    return Q + he(S @ vertices) - R * (columns @ vertices)
+    return Q + he(S @ vertices) - R * (transpose(vertices) @ vertices)
 
 
 def relax_sum(

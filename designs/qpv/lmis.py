@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.designs.lmi.problem import he, symmetric_block
+from obsynth.designs.lmi.problem import he, symmetric_block, transpose
 from obsynth.symbolic.errors import ObsynthError
 
 
@@ -145,8 +145,4 @@ def inside_block(P: Any, normals: Any) -> Any:
 
 def start_block(P: Any, corners: Any) -> Any:
     """(19) corrected: 1 - v'P v, v' in `corners`."""
-    return np.ones((1, 1)) - corners @ P @ _transposed(corners)
-
-
-def _transposed(corners: Any) -> Any:
-    return np.swapaxes(corners, -1, -2) if isinstance(corners, np.ndarray) else corners.T
+    return np.ones((1, 1)) - corners @ P @ transpose(corners)

@@ -33,8 +33,8 @@ def run(tank, base, alone):
 def recursion_residual(design, tank_split, run, Wbar, shift=0):
     """Largest violation of eq. (16) along a simulated run."""
     system = plain_error(design.data.without_nonlinearity())
-    X = system.Abar[0] - design.gain @ system.Cbar
-    Z = (Wbar - design.gain @ system.Vbar) / design.data_scale
+    X = system.Abar[0] - design.gain("plain") @ system.Cbar
+    Z = (Wbar - design.gain("plain") @ system.Vbar) / design.data_scale
     Y = np.vstack([design.T, np.zeros((2, 4))])
     g = tank_split.g_function().map(len(run.x))
     s = np.array(g(run.x.T, run.u.T) - g(run.xhat.T, run.u.T)).T
