@@ -23,7 +23,7 @@ from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, covers_jacobian, prove_boxes, within
+from obsynth.designs.core.signals import DECLARED, beyond, covers_jacobian, prove_boxes, within
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
@@ -218,11 +218,8 @@ def _on_rounding(design: UioDesign) -> Iterator[str]:
         yield f"{said}, which is not proved for this plant"
         return
     plant, limits = design.plant, Limits.of(design.plant)
-    signals = zip((*plant.x, *plant.f, *plant.u), np.concatenate(limits).tolist(), strict=True)
-    listed = [
-        f"{s.name} in [{a:g}, {b:g}]" for s, (a, b) in signals if (a, b) != (s.lower, s.upper)
-    ]
-    where = f"{', '.join(listed)}, estimates too: there " if listed else ""
+    listed = beyond((*plant.x, *plant.f, *plant.u), np.concatenate(limits))
+    where = f"{listed}, estimates too: there " if listed else ""
     yield f"{where}{said}, which is proved for IEEE doubles rounded to nearest"
 
 

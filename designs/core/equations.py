@@ -305,14 +305,15 @@ def symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
     return ca.vertcat(s["x"], s["f"], rest), known, ca.densify(rows), ca.densify(outputs), ranges
 
 
-def curved_states(plant: Plant) -> BoolArray:
+def curved_states(plant: Plant, noise: bool = False) -> BoolArray:
     """Return on which states a derivative by a state or a fault depends, (n,).
 
     What multiplies a disturbance or a parameter does so whatever the size of the state.
+    noise: whether derivatives by these count too
     """
     v, _, rows, outputs, _ = symbols(plant)
     n, n_f = len(plant.x), len(plant.f)
-    slopes = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : n + n_f]
+    slopes = ca.jacobian(ca.vertcat(rows, outputs), v)[:, : None if noise else n + n_f]
     found = ca.which_depends(ca.vec(slopes), v[:n], 1, False)
     return np.array(found, dtype=bool).reshape(-1)
 

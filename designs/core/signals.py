@@ -35,6 +35,13 @@ def within(signals: Iterable[Signal], units: bool = False) -> str:
     )
 
 
+def beyond(signals: Iterable[Signal], boxes: FloatArray) -> str:
+    """Write the boxes of signals, (k, 2), that are not their declared ranges."""
+    pairs = zip(signals, boxes.tolist(), strict=True)
+    other = [(s.name, a, b) for s, (a, b) in pairs if (a, b) != (s.lower, s.upper)]
+    return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, a, b in other)
+
+
 def prove_boxes(
     what: str, box: FloatArray, centre: FloatArray, radius: FloatArray, more: FloatArray = NOTHING
 ) -> Claim:

@@ -7,16 +7,17 @@ import numpy as np
 
 from obsynth.derive.structure.following import NO_RATE, untold
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, covers_jacobian, prove_boxes, within
+from obsynth.designs.core.signals import DECLARED, beyond, covers_jacobian, prove_boxes, within
 from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
 from obsynth.designs.general.peak import error_sums, prove_peak
 from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import prove_rounding
-from obsynth.designs.general.step import Limits, curved, steady
+from obsynth.designs.general.step import Limits, steady
 from obsynth.designs.general.storage import prove_storage
 from obsynth.designs.general.system import error_system, extra_inputs
 
@@ -105,7 +106,9 @@ def guarantee(design: GeneralDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     plant, extended = design.plant, design.extended
     names = (*plant.names("x"), *extended.followed)
-    where = within(compress(extended.plant.x, curved(extended.plant)), units=True)
+    where = within(
+        compress(extended.plant.x, curved_states(extended.plant, noise=True)), units=True
+    )
     noise = within(extended.plant.w)
     bound = design.bound
     if isinstance(bound, EnergyBound):
@@ -184,9 +187,8 @@ def _on_rounding(design: GeneralDesign) -> str:
     rounding = design.rounding
     largest = max(float(part.max(initial=0.0)) for part in (rounding.q, rounding.c, rounding.p))
     plant, limits = design.extended.plant, Limits.of(design.extended.plant)
-    pairs = zip((*plant.x, *plant.u), np.vstack([limits.x, limits.u]).tolist(), strict=True)
-    listed = [f"{s.name} in [{a:g}, {b:g}]" for s, (a, b) in pairs if (a, b) != (s.lower, s.upper)]
-    where = f"estimates and inputs with {', '.join(listed)}: there " if listed else ""
+    listed = beyond((*plant.x, *plant.u), np.vstack([limits.x, limits.u]))
+    where = f"estimates and inputs with {listed}: there " if listed else ""
     return (
         f"{where}the rounding errors of one step stay below {largest:.1e} in every component, "
         "which is proved for IEEE doubles rounded to nearest"

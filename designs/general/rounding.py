@@ -11,9 +11,10 @@ import numpy as np
 
 from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.rounding import Bound, rounding_bound
 from obsynth.designs.general.record import GeneralDesign, Rounding
-from obsynth.designs.general.step import Limits, curved, stages
+from obsynth.designs.general.step import Limits, stages
 from obsynth.symbolic.arrays import FloatArray
 
 CELLS = 256
@@ -37,7 +38,8 @@ def _over(
 ) -> dict[str, Bound]:
     """Bound the rounding of a function over boxes, cut along the states that matter."""
     plant = design.extended.plant
-    cells = {"x": cut_box(boxes["x"], CELLS, np.flatnonzero(curved(plant)).tolist())}
+    bends = np.flatnonzero(curved_states(plant, noise=True)).tolist()
+    cells = {"x": cut_box(boxes["x"], CELLS, bends)}
     for name in function.name_in():
         if name != "x":
             box = boxes[name].reshape(-1, 2)

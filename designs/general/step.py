@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive.rigour import add_up
 from obsynth.designs.core.boxes import Ends, column
 from obsynth.designs.core.core import Core, Known, Parts, Seen
+from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.running import (
@@ -26,26 +27,7 @@ from obsynth.designs.general.lmis import rounding_in
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.system import error_system, magnitude
 from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import BoolArray, FloatArray
-
-
-def curved(plant: Plant) -> BoolArray:
-    """Return on which states of an extended plant some slope depends, (N,)."""
-    sx = plant.sx()
-    both = ca.vertcat(sx.x, sx.w)
-    slopes = ca.jacobian(ca.vertcat(sx.rhs, sx.y), both)
-    found = ca.which_depends(ca.vec(ca.densify(slopes)), sx.x, 1, False)
-    return np.array(found, dtype=bool).reshape(-1)
-
-
-def held(plant: Plant) -> BoolArray:
-    """Return which inputs enter in no constant way, so that they have to keep to their range."""
-    sx = plant.sx()
-    slopes = ca.jacobian(ca.vertcat(sx.rhs, sx.y), sx.u)
-    everything = ca.vertcat(sx.x, sx.u, sx.w)
-    return np.array(
-        [bool(ca.depends_on(ca.SX(slopes[:, k]), everything)) for k in range(sx.u.numel())]
-    )
+from obsynth.symbolic.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +45,7 @@ class Limits:
     def of(cls, plant: Plant) -> "Limits":
         """Read the limits of an extended plant."""
         x, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xu")
-        return cls(wider(x), np.where(held(plant)[:, None], u, wider(u)))
+        return cls(wider(x), np.where(covered_inputs(plant)[:, None], u, wider(u)))
 
 
 def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:
@@ -77,7 +59,7 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
     sizes = {"x": N, "u": len(plant.u), "y": m, "nu": m}
     x, u, y, nu = (ca.SX.sym(name, size) for name, size in sizes.items())
     empty = ca.DM(0, 1)
-    box = np.where(curved(plant)[:, None], plant.box("x"), [-np.inf, np.inf])
+    box = np.where(curved_states(plant, noise=True)[:, None], plant.box("x"), [-np.inf, np.inf])
     inner = clip(x, box)
     middle = design.middle
     outside = x - inner
@@ -238,7 +220,7 @@ def build_core(design: GeneralDesign) -> Core:
     limits = Limits.of(plant)
     bounds = running(design)
     names, followed = design.plant.names("f"), design.extended.followed
-    own = curved(plant)[:n]
+    own = curved_states(plant, noise=True)[:n]
     domain = np.where(own[:, None], design.plant.box("x"), [-np.inf, np.inf])
     outputs = plant.function()
     empty = ca.DM(0, 1)

@@ -170,9 +170,7 @@ def _unknowns(stated: Stated, gain: FloatArray | None) -> tuple[Affine, Affine]:
     return P, P @ (stated.E - Z @ stated.Y)
 
 
-def recovered(
-    stated: Stated, solution: Solution, gamma: float, level: float, gain: FloatArray | None
-) -> Found:
+def recovered(stated: Stated, solution: Solution, gamma: float, gain: FloatArray | None) -> Found:
     """Return a solution in the units of the plant."""
     x, y = stated.units.x, stated.units.y
     N, n_w, n_q = stated.loop.sizes
@@ -187,14 +185,8 @@ def recovered(
     noise = np.maximum(noise, 0.0)
     noise = noise * min(1.0, gamma * BELOW_ONE / max(float(noise.sum()), 1e-300))
     tau = np.diag(solution["tau"]) if n_q else np.zeros(0)
-    return Found(
-        Z,
-        0.5 * (P + P.T),
-        gamma,
-        noise,
-        np.maximum(tau, 0.0) / stated.q**2,
-        level,
-    )
+    tau = np.maximum(tau, 0.0) / stated.q**2
+    return Found(Z, 0.5 * (P + P.T), gamma, noise, tau, 0.0)
 
 
 def solve_ellipsoid(
@@ -213,7 +205,7 @@ def solve_ellipsoid(
             where, solution = _near_units(
                 design, stated[-1], lambda s: ellipsoid_problem(s, gamma, weights, gain)
             )
-            found = recovered(where, solution, gamma, 0.0, gain)
+            found = recovered(where, solution, gamma, gain)
             size = weights @ np.sqrt(np.diag(np.linalg.inv(found.P)))
         except (InfeasibleDesign, SolverTrouble, np.linalg.LinAlgError) as refusal:
             refusals.append(refusal)
@@ -363,10 +355,10 @@ def solve_energy(
         except (InfeasibleDesign, SolverTrouble) as refusal:
             last = refusal
             continue
-        found = recovered(where, solution, 0.0, 0.0, gain)
+        found = recovered(where, solution, 0.0, gain)
         unit = float((weights * where.units.x).max())
         level = unit * np.sqrt(max(solution.number("mu2"), LEAST_LEVEL))
-        return Found(found.Z, found.P * unit**2, 0.0, found.noise, found.tau * unit**2, level)
+        return replace(found, P=found.P * unit**2, tau=found.tau * unit**2, level=level)
     text = "no energy gain was found"
     details = [] if last is None else [str(last).splitlines()[0]]
     if isinstance(last, InfeasibleDesign) and not measured.bounded:

@@ -11,11 +11,12 @@ import obsynth as ob
 from methods import motor, observer_of
 from obsynth.derive.forms.extended import extend
 from obsynth.derive.structure.following import follow, hidden_somewhere
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.general.claims import claims
 from obsynth.designs.general.method import GeneralUIO, bound_peak
 from obsynth.designs.general.model import read
 from obsynth.designs.general.rounding import needed, settle
-from obsynth.designs.general.step import curved, stages, steady
+from obsynth.designs.general.step import stages, steady
 from obsynth.symbolic.errors import ObsynthError
 
 
@@ -40,7 +41,7 @@ def design():
 def test_the_stages_are_the_equations_inside_and_affine_outside(design):
     """Mutants: rows or outputs without their continuation; v0 at zero."""
     first, second, third = stages(design)
-    assert curved(design.extended.plant).tolist() == [True, True, False]
+    assert curved_states(design.extended.plant, noise=True).tolist() == [True, True, False]
     middle, N = design.middle, design.size
     C0, A0 = middle[N:, :N], middle[:N, :N]
     w1 = 0.05
