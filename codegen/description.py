@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import STEP_INPUTS, Machine
+from obsynth.designs.core.files import stored_text
 from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic import Plant
@@ -98,6 +99,11 @@ class Description:
     scheduling: their places among all scheduling signals of the plant
     start (n_memory,): the initialised memory that ``NAME_init_default`` sets
     model_hash: SHA-256 of the plant's stored form
+    design: the stored design, as `Observer.save` writes it
+    detector: options of a fault detector; empty for an observer
+    design_hash: SHA-256 of the record of the design, with those options
+    claims: names of what is proved: loading a design proves less than designing it
+    certificate_hash: SHA-256 of its claims, without margins, whose last digits are the machine's
     """
 
     name: str
@@ -112,6 +118,11 @@ class Description:
     scheduling: tuple[int, ...]
     start: FloatArray
     model_hash: str
+    design: str
+    detector: Mapping[str, Any]
+    design_hash: str
+    certificate_hash: str
+    claims: tuple[str, ...]
 
     @property
     def further(self) -> list[tuple[str, int]]:
@@ -168,6 +179,7 @@ def describe(
     scheduling = _scheduling(observer.step, model)
     _check_step(observer.step, model, n_memory, len(scheduling))
     start = _start(observer, memory, n_memory)
+    inner, options = _taken_apart(observer)
     _check_not_initialised(observer)
     return Description(
         name=chosen,
@@ -182,7 +194,22 @@ def describe(
         scheduling=scheduling,
         start=start,
         model_hash=_hash(model.to_dict()),
+        design=stored_text(inner),
+        detector=options,
+        design_hash=_hash({"record": inner.record, "detector": options}),
+        certificate_hash=_hash(
+            {"claims": [[c.name, c.statement, c.holds] for c in inner.certificate]}
+        ),
+        claims=tuple(claim.name for claim in inner.certificate),
     )
+
+
+def _taken_apart(observer: Observer | FaultDetector) -> tuple[Observer, dict[str, Any]]:
+    """Return the observer that is stored, and what a detector adds to it."""
+    if not isinstance(observer, FaultDetector):
+        return observer, {}
+    names = ("persistence", "also_skip", "window")
+    return observer.observer, {name: getattr(observer, name) for name in names}
 
 
 def _fields(layout: Mapping[str, slice]) -> tuple[Field, ...]:

@@ -7,18 +7,17 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-import casadi as ca
-
-from obsynth.codegen.build import Build, Comparison, build_and_compare, find_compiler
+from obsynth.codegen.build import FLAGS, Build, Comparison, build_and_compare, find_compiler
 from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
 from obsynth.codegen.kernel import Kernel
-from obsynth.codegen.render import generator_name, render
+from obsynth.codegen.render import render
 from obsynth.codegen.tape import write_tape
 from obsynth.codegen.vectors import Vectors, make_vectors
 from obsynth.designs.core.observer import Observer
@@ -34,6 +33,7 @@ BACKENDS = ("casadi", "tape")
 KIND = "obsynth C project"
 
 _FORMAT = 1
+_TOOLS = ("obsynth", "casadi", "numpy", "sympy", "jinja2")
 _BUILT = "build"
 
 
@@ -248,8 +248,11 @@ def _manifest(
         "kind": KIND,
         "format": _FORMAT,
         "name": description.name,
-        "versions": {"obsynth": generator_name().split()[-1], "casadi": ca.CasadiMeta.version()},
+        "versions": {name: version(name) for name in _TOOLS},
+        "flags": list(FLAGS),
         "model": {"name": observer.model.name, "sha256": description.model_hash},
+        "design": {"sha256": description.design_hash, "detector": dict(description.detector)},
+        "certificate": {"sha256": description.certificate_hash, "claims": list(description.claims)},
         "method": observer.method,
         "precision": PRECISIONS[0],
         "backend": kernel.backend,

@@ -105,6 +105,7 @@ def render(
         for path, template in templates.items()
     }
     files["tests/vectors.txt"] = vectors.text
+    files["design.json"] = description.design
     return files
 
 
@@ -125,7 +126,11 @@ def _values(
         "casadi": ca.CasadiMeta.version(),
         "method": observer.method,
         "plant": observer.model.name,
-        "model_hash": description.model_hash,
+        "hashes": {
+            "model": description.model_hash,
+            "design": description.design_hash,
+            "certificate": description.certificate_hash,
+        },
         "sample_time": description.sample_time,
         "fault_delay": observer.fault_delay,
         "n": sizes,

@@ -28,10 +28,13 @@ def save(observer: Observer, path: str | os.PathLike[str]) -> None:
     FileNotFoundError
         If the folder does not exist.
     """
-    target = Path(path)
+    write_whole(Path(path), stored_text(observer))
+
+
+def stored_text(observer: Observer) -> str:
+    """Return what the file of an observer holds."""
     claims = [claim.to_record() for claim in observer.certificate]
-    text = json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
-    write_whole(target, text)
+    return json.dumps({**observer.record, CLAIMS: claims}, indent=1, allow_nan=False) + "\n"
 
 
 def write_whole(target: Path, text: str) -> None:

@@ -115,6 +115,8 @@ class Toy:
     model: ToyPlant = field(default_factory=ToyPlant)
     method: str = "toy_observer"
     fault_delay: int = 0
+    record: Any = field(default_factory=lambda: {"design": 1})
+    certificate: tuple[Any, ...] = ()
     memory_layout: dict[str, slice] = field(
         default_factory=lambda: {
             "y_last": slice(0, 1),

@@ -14,6 +14,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from methods import observer_of
+from obsynth import FaultDetector, load
 from obsynth.codegen import (
     BuildError,
     CodegenError,
@@ -22,6 +24,8 @@ from obsynth.codegen import (
     find_compiler,
     generate_c,
 )
+from obsynth.codegen.description import describe
+from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.observer import STATUS
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -73,6 +77,7 @@ def test_the_folder_holds_the_listed_files_and_nothing_else(toy: Any, tmp_path: 
         "CMakeLists.txt",
         "Makefile",
         "README.md",
+        "design.json",
         "examples/main.c",
         "include/tank.h",
         "manifest.json",
@@ -88,6 +93,45 @@ def test_the_folder_holds_the_listed_files_and_nothing_else(toy: Any, tmp_path: 
     assert manifest["guarantee"]["claims"] == ["each state lies\nbetween its bounds"]
     assert manifest["sizes"] == {"memory": 6, "u": 1, "y": 2, "x": 2, "f": 1}
     assert [p for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_two_designs_never_share_a_hash(toy: Any, tmp_path: Path) -> None:
+    """Of one plant too, nor do two certificates. Mutant: either hash taken of the plant."""
+
+    def hashes(name: str) -> list[str]:
+        project = generate_c(toy, tmp_path / name, vectors=100)
+        manifest = json.loads((project.folder / "manifest.json").read_text())
+        header = (project.folder / "include/two_tanks.h").read_text()
+        found = re.findall(r"_(MODEL|DESIGN|CERTIFICATE)_HASH \\\n +\"(\w{64})\"", header)
+        assert found == [
+            (kind.upper(), manifest[kind]["sha256"]) for kind in ("model", "design", "certificate")
+        ]
+        return [value for _, value in found]
+
+    model, design, certificate = hashes("one")
+    toy.record["design"] = 1.0000000000000002
+    assert hashes("two") == [model, changed := hashes("two again")[1], certificate]
+    assert changed != design
+    toy.certificate = (Claim("lmi", "an inequality", True, 0.1, "a proof"),)
+    assert hashes("three")[:2] == [model, changed]
+    assert hashes("four")[2] != certificate
+
+
+def test_the_design_in_the_folder_is_the_one_that_was_shipped(tmp_path: Path) -> None:
+    """Loaded, it gives the hash of the header again; a detector is another design.
+
+    What loading proves is not all that designing proves, so the certificate is another one.
+    """
+    observer = observer_of("interval_observer")
+    description = describe(observer)
+    (tmp_path / "design.json").write_text(description.design)
+    again = describe(load(tmp_path / "design.json"))
+    assert again.design_hash == description.design_hash
+    assert again.certificate_hash == describe(load(tmp_path / "design.json")).certificate_hash
+    assert again.certificate_hash != description.certificate_hash
+    found = {describe(FaultDetector(observer, count)).design_hash for count in (1, 2)}
+    assert len({*found, description.design_hash}) == 3
+    assert describe(FaultDetector(observer)).design == description.design
 
 
 def test_the_header_speaks_the_users_names(toy: Any, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -71,6 +71,8 @@ class Scheduled:
     model: Plant
     method: str = "toy_observer"
     fault_delay: int = 0
+    record: Any = field(default_factory=lambda: {"design": 1})
+    certificate: tuple[Any, ...] = ()
 
     @property
     def memory_layout(self) -> dict[str, slice]:
