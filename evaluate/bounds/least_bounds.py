@@ -1,5 +1,6 @@
 """The smallest disturbance bounds that explain a measured record, attained and certified."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -73,10 +74,9 @@ class LeastBounds:
     @cached_property
     def refuted(self) -> bool:
         """Whether the declared bounds of the disturbances are too small for certain."""
-        declared = dict(zip(self.problem.groups, self._declared.tolist(), strict=True))
-        if self.lower == np.inf or not np.isfinite([*declared.values()]).all():
+        if self.lower == np.inf or not np.isfinite([*self._declared.values()]).all():
             return self.lower == np.inf
-        return self.refutes(**declared)
+        return self.refutes(**self._declared)
 
     @property
     def trajectory(self) -> dict[str, FloatArray]:
@@ -99,13 +99,9 @@ class LeastBounds:
         if not np.isfinite(self.least.trajectory.bounds).all():
             raise BoundsError(f"{problem.plant.name}: no bounds were found that are attained.")
         size = problem.sizes(self.safety * self.least.trajectory.bounds)
-        ranges = {
-            name: (middle - half, middle + half)
-            for name, middle, half, group in zip(
-                problem.plant.names("w"), problem.middle, size, problem.group, strict=True
-            )
-            if group < len(problem.groups)
-        }
+        ends = np.column_stack([problem.middle - size, problem.middle + size]).tolist()
+        ours = np.flatnonzero(problem.group < len(problem.groups)).tolist()
+        ranges = {problem.plant.names("w")[j]: (ends[j][0], ends[j][1]) for j in ours}
         held = {name: (value, value) for name, value in self.params.items()}
         return problem.plant.with_ranges({**ranges, **held})
 
@@ -175,13 +171,11 @@ class LeastBounds:
         given = np.array([*(self.bounds | bounds).values()])
         if len(given) > len(self.bounds) or not (np.isfinite(given) & (given >= 0.0)).all():
             raise BoundsError(
-                "refutes() takes a bound that is finite and not negative for each of the groups "
+                "refutes() takes finite bounds, not negative, of the groups "
                 f"{', '.join(self.bounds)}, not {bounds}.",
-                groups=self.problem.groups,
             )
-        one, top = np.ones(1), 1.0 + BESIDE
-        problem = self.problem.scaled(scale * given)
-        _, _, found = below(problem, one, np.array([top]), top, CONTRACTIONS)
+        problem, top = self.problem.scaled(scale * given), 1.0 + BESIDE
+        found = below(problem, np.ones(1), np.array([top]), top, CONTRACTIONS)[2]
         return found is None or found.certified > 1.0
 
     def attribute(self, without: Sequence[str] = (), safety: float | None = None) -> Attribution:
@@ -200,43 +194,34 @@ class LeastBounds:
 
     def validate(self, windows: int = 18) -> Validation:
         """Say what the bounds are worth for records to come: see `Validation`."""
-        return validate(self._held(), self.least.trajectory.bounds, windows)
+        fitted = self.problem.still & (np.ptp(self.problem.box, axis=1) > 0.0)
+        free = len(self.bounds) + int(fitted.sum())
+        return validate(self._held(), self.least.trajectory.bounds, windows, free)
 
     def _held(self) -> Problem:
         """Return the problem with the parameters at their values."""
         return replace(self.problem, still=np.zeros_like(self.problem.still)).fixed(**self.params)
 
     @property
-    def _declared(self) -> FloatArray:
+    def _declared(self) -> dict[str, float]:
         """Declared bounds of the groups, of their largest members."""
-        box = self.problem.plant.box("w").reshape(-1, 2)
-        radius = 0.5 * (box[:, 1] - box[:, 0])
-        groups = range(len(self.problem.groups))
-        return np.array([radius[self.problem.group == g].max(initial=0.0) for g in groups])
+        radius = 0.5 * np.ptp(self.problem.plant.box("w").reshape(-1, 2), axis=1)
+        members = {name: self.problem.group == g for g, name in enumerate(self.problem.groups)}
+        return {name: float(radius[own].max(initial=0.0)) for name, own in members.items()}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what is found as numbers and names for JSON; null is infinite."""
-        sides = {"upper": self.upper, "lower": self.lower}
-        return {
-            "plant": self.problem.plant.name,
-            "record": self.record.source,
-            "instants": len(self.record),
-            "bounds": _finite(self.bounds),
-            "declared": _finite(dict(zip(self.problem.groups, self._declared, strict=True))),
-            "weights": self.weights,
-            **_finite(sides),
-            "params": self.params,
-            "refuted": self.refuted,
-        }
+        """Return what is found as names and numbers for JSON; null is infinite."""
+        told: dict[str, Any] = {"plant": self.problem.plant.name, "record": self.record.source}
+        told |= {"instants": len(self.record), "declared": self._declared}
+        for name in ("bounds", "weights", "upper", "lower", "params", "refuted"):
+            told[name] = getattr(self, name)
+        return dict(json.loads(json.dumps(told), parse_constant=lambda name: None))
 
     def table(self) -> Table:
         """Bounds by group beside the declared ones, both sides of their weighted sum."""
-        declared = self._declared.tolist()
         rows: list[list[Any]] = [
-            [name, value, float(weight), was]
-            for (name, value), weight, was in zip(
-                self.bounds.items(), self.least.weights, declared, strict=True
-            )
+            [name, value, self.weights[name], self._declared[name]]
+            for name, value in self.bounds.items()
         ]
         rows += [
             ["sum, attained", self.upper, None, None],
@@ -323,9 +308,8 @@ def least_bounds(
     problem = pose(plant, record, free, groups)
     if not problem.groups:
         raise BoundsError(
-            f"{plant.name} has no disturbance whose bound is open: declare one, of the outputs at "
-            "least, plant.disturbances(name, bound=).",
-            symbol=None,
+            f"{plant.name} has no disturbance whose bound is open: declare one, "
+            "plant.disturbances(name, bound=)."
         )
     factors = _by_group(problem, "weights", weights, 1.0)
     smallest = _by_group(problem, "least_of", least_of, 0.0)
@@ -336,10 +320,6 @@ def least_bounds(
     problem = replace(problem, smallest=smallest)
     found = least(problem, factors, progress=progress)
     return LeastBounds(problem, record, float(safety), found)
-
-
-def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: float(v) if np.isfinite(v) else None for name, v in values.items()}
 
 
 def _by_group(

@@ -154,7 +154,8 @@ class Linear:
         cost[-1] = 1.0
         multipliers = relaxed.minimise(cost, certify=False).multipliers
         relaxed.upper[-1] = 1.0  # a point of ours would be there, with nothing
-        return relaxed.certify(cost, multipliers) > 0.0
+        crossed = bool((self.lower > self.upper).any())
+        return crossed or relaxed.certify(cost, multipliers) > 0.0
 
     def certify(self, cost: FloatArray, multipliers: FloatArray) -> float:
         """Return what multipliers prove, rounded down from exact rationals."""

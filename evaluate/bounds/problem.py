@@ -103,12 +103,9 @@ class Problem:
     def fixed(self, **values: float) -> "Problem":
         """Return the problem with variables of v at values."""
         box = self.box.copy()
-        if unknown := set(values) - set(self.names):
-            raise BoundsError(
-                f"{min(unknown)!r} is none of {', '.join(self.names)} of {self.plant.name}.",
-                symbol=min(unknown),
-            )
         for name, value in values.items():
+            if name not in self.names:
+                raise BoundsError(f"{name!r} is none of {', '.join(self.names)}.", symbol=name)
             box[self.names.index(name)] = value
         return replace(self, box=box)
 

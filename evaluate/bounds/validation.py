@@ -27,7 +27,7 @@ class Validation:
     certified : array (n,)
         No window needs less.
     free : int
-        Number of bounds that were fitted.
+        Number of bounds and parameters that were fitted.
     """
 
     factors: FloatArray
@@ -43,7 +43,7 @@ class Validation:
     def violation(self) -> float:
         """Share of windows to come that may violate the bounds, with 95 per cent confidence.
 
-        The root in eps of ``sum_{i < d} C(n, i) eps^i (1 - eps)^(n - i) = .05`` for d bounds
+        The root in eps of ``sum_{i < d} C(n, i) eps^i (1 - eps)^(n - i) = .05`` for d numbers
         (Campi, Garatti 2008), for exchangeable windows.
         """
         n, d = len(self.factors), min(self.free, len(self.factors))
@@ -78,7 +78,7 @@ class Validation:
         )
 
 
-def validate(problem: Problem, bounds: FloatArray, windows: int) -> Validation:
+def validate(problem: Problem, bounds: FloatArray, windows: int, free: int) -> Validation:
     """Return the factors of bounds that equal windows of the record need."""
     if not 2 <= windows <= len(problem):
         raise BoundsError(f"{windows} windows: give 2 to {len(problem)}.", windows=windows)
@@ -88,4 +88,4 @@ def validate(problem: Problem, bounds: FloatArray, windows: int) -> Validation:
         least(scaled.window(a, b), np.ones(1), contractions=0) for a, b in pairwise(edges.tolist())
     ]
     factors = np.array([one.upper for one in found])
-    return Validation(factors, np.array([one.lower for one in found]), len(bounds))
+    return Validation(factors, np.array([one.lower for one in found]), free)

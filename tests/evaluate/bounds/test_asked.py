@@ -12,7 +12,7 @@ import obsynth as ob
 from obsynth.evaluate.bounds import certified
 from obsynth.evaluate.bounds.attribution import attribute
 from obsynth.evaluate.bounds.boxes import enclose
-from obsynth.evaluate.bounds.linear import Linear
+from obsynth.evaluate.bounds.linear import Linear, assemble
 from obsynth.evaluate.bounds.problem import pose
 from obsynth.evaluate.bounds.trajectory import measured
 
@@ -40,7 +40,8 @@ def test_nothing_is_said_of_what_follows_the_record():
     plant, record = asked([0.5, 0.9], [[0.4], [0.9]])
     problem = pose(plant, record, [])
     assert enclose(problem, np.array([0.1])).empty is None
-    assert ob.least_bounds(plant, record, []).upper < 1e-6
+    fit = ob.least_bounds(plant, record, [])
+    assert fit.upper < 1e-6 and not fit.refutes(outputs=0.1)
 
 
 def test_sums_of_readings():
@@ -89,6 +90,11 @@ def test_sizes_hold_the_ranges():
         for m, size, a, b in zip(problem.middle, sizes, low, high, strict=True):
             assert Fraction(m) - Fraction(size) <= Fraction(a)
             assert Fraction(b) <= Fraction(m) + Fraction(size)
+        bounds, own = rng.uniform(0, 1, 3), rng.uniform(0, 1)
+        shape = (even := pose(*asked([0.5, 0.5], bounds=bounds))).shape
+        for share, size, bound in zip(shape, even.sizes(np.array([own])), bounds, strict=True):
+            assert Fraction(share) * Fraction(bounds.max()) >= Fraction(bound)
+            assert Fraction(size) >= Fraction(share) * Fraction(own)
 
 
 def test_what_a_step_leaves_out_is_no_bound_to_find():
@@ -123,6 +129,14 @@ def test_what_no_bounds_explain():
     assert abs(fit.upper - 0.25) < 1e-7 and abs(fit.lower - 0.25) < 1e-7
 
 
+def test_what_is_empty_below_what_is_attained(monkeypatch):
+    """It proves what was looked up to, not that no bounds do."""
+    plant, record = asked([0, 1, 0, 1])
+    monkeypatch.setattr(certified, "ROOM", -1e-3)
+    found = certified.least(pose(plant, record, []), np.ones(1))
+    assert found.solution is None and found.lower <= found.upper < 0.251
+
+
 def test_one_disturbance_alone():
     plant, record = asked([0, 1, 0, 1], bounds=(0.1,))
     found = ob.least_bounds(plant, record, []).attribute()
@@ -146,6 +160,8 @@ def test_emptiness_is_proved():
         assert found.certified == np.inf
     assert not program([1, -1], [1.0, -1.0]).empty()
     assert program([3.0], [7.0], equal=True).empty()
+    assert replace(program([1], [1.0]), lower=np.array([3.0])).minimise(np.ones(1)).value == np.inf
+    assert replace(program([1], [9.0]), lower=np.array([3.0])).empty()
     assert not program([3.0], [1.0], equal=True).empty()
 
 
@@ -200,6 +216,7 @@ def test_what_stands_still_is_one_number():
     fit = ob.least_bounds(plant, record)
     assert abs(fit.upper - 0.5) < 1e-7 and 0.5 - 1e-7 < fit.lower <= fit.upper
     assert abs(fit.params["p"] - 1.0) < 1e-6
+    assert fit.validate(3).free == 2  # the parameter was fitted as well
     boxes = enclose(fit.problem, np.array([0.75]))
     assert np.allclose(boxes.ends[:, 2], [0.75, 1.25])
 
@@ -209,6 +226,11 @@ def test_faults_move_by_their_rates():
     plant, record = asked([0, 0.1, 0.1], rate=0.05)
     assert ob.least_bounds(plant, record).lower > 0.005
     assert ob.least_bounds(*asked([0, 0.1, 0.1])).upper < 1e-6
+    fit = ob.least_bounds(*asked([0, 0.1, 0.15], rate=0.05))
+    assert fit.upper < 1e-6 and not fit.refutes(outputs=1e-5)
+    loose, top = pose(plant, record), np.array([0.05])
+    linear = assemble(loose, enclose(loose, top), top)
+    assert abs(linear.minimise(linear.cost(np.ones(1))).certified - 0.05 / 8) < 1e-9
     exact = pose(*asked([0, 0.1, np.nan], rate=0.05))
     boxes = enclose(exact, np.array([1e-6]))
     assert np.allclose(boxes.ends[:2, 1], [[0.1, 0.1], [0.05, 0.1]], atol=1e-5)

@@ -23,7 +23,7 @@ def asked(truth):
     """The problem and the bounds of its groups that are declared, which the truth keeps."""
     problem = pose(truth.plant, truth.record, truth.free)
     declared = LeastBounds(problem, truth.record, 1.2, None)._declared
-    return problem, declared
+    return problem, np.array([*declared.values()])
 
 
 def lost(problem, bounds, path):
