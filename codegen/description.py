@@ -31,15 +31,20 @@ _KEYWORD_TEXT = """
 """
 
 # A project called "math" would put its own math.h before the compiler's; one called "test"
-# would clash with the targets that CMake and make define themselves.
+# would clash with the targets that CMake, CTest and make define themselves, one called "m" would
+# be linked in place of the mathematics library.
 _HEADER_TEXT = """
     assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg
     stdbool stddef stdint stdio stdlib string tgmath time wchar wctype
 """
-_TARGET_TEXT = "all build clean example help install package test uninstall"
+_TARGET_TEXT = """
+    all all_build build clean continuous depend edit_cache example experimental help install
+    install_local install_strip list_install_components nightly nightlymemorycheck none package
+    package_source rebuild_cache run_tests test uninstall zero_check c dl gcc m pthread rt util
+"""
 
 _KEYWORDS = frozenset(_KEYWORD_TEXT.split())
-_TAKEN = frozenset((_HEADER_TEXT + _TARGET_TEXT).split())
+_TAKEN = frozenset(f"{_HEADER_TEXT} {_TARGET_TEXT}".split())
 
 _ASCII = str.maketrans(
     {
@@ -408,7 +413,7 @@ def project_name(name: str | None, plant: str) -> str:
         )
     if chosen.lower() in _TAKEN:
         raise CodegenError(
-            f"name={chosen!r} would hide a header or a target of the build; {advice},"
+            f"name={chosen!r} would hide a header, a library or a target of the build; {advice},"
             f" for example name={chosen + '_observer'!r}",
             symbol=chosen,
         )

@@ -96,7 +96,11 @@ def render(
         f"src/{name}_kernel.h": "kernel.h.j2",
         f"tests/test_{name}.c": "runner.c.j2",
         "examples/main.c": "example.c.j2",
+        f"src/{name}.h": "forward.h.j2",
         "CMakeLists.txt": "CMakeLists.txt.j2",
+        "library.json": "library.json.j2",
+        "library.properties": "library.properties.j2",
+        "zephyr/module.yml": "module.yml.j2",
         "Makefile": "Makefile.j2",
         "README.md": "README.md.j2",
     }

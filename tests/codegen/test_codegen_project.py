@@ -80,12 +80,17 @@ def test_the_folder_holds_the_listed_files_and_nothing_else(toy: Any, tmp_path: 
         "design.json",
         "examples/main.c",
         "include/tank.h",
+        "library.json",
+        "library.properties",
         "manifest.json",
         "src/tank.c",
+        "src/tank.h",
         "src/tank_kernel.h",
         "tests/test_tank.c",
         "tests/vectors.txt",
+        "zephyr/module.yml",
     }
+    assert json.loads((project.folder / "library.json").read_text())["name"] == "tank"
     manifest = json.loads((project.folder / "manifest.json").read_text())
     for name, digest in manifest["files"].items():
         assert hashlib.sha256((project.folder / name).read_bytes()).hexdigest() == digest
@@ -95,8 +100,11 @@ def test_the_folder_holds_the_listed_files_and_nothing_else(toy: Any, tmp_path: 
     assert [p for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
-def test_two_designs_never_share_a_hash(toy: Any, tmp_path: Path) -> None:
+def test_two_designs_never_share_a_hash(
+    toy: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of one plant too, nor do two certificates. Mutant: either hash taken of the plant."""
+    monkeypatch.setattr("obsynth.codegen.project.find_compiler", lambda: None)
 
     def hashes(name: str) -> list[str]:
         project = generate_c(toy, tmp_path / name, vectors=100)
@@ -282,6 +290,65 @@ def test_cmake_builds_and_tests(toy: Any, tmp_path: Path) -> None:
     assert "100% tests passed" in run("ctest", "--test-dir", "build", cwd=folder)
 
 
+USE = """cmake_minimum_required(VERSION 3.15)
+project(use C)
+enable_testing()
+if(INSTALLED)
+  find_package(two_tanks REQUIRED PATHS ${INSTALLED})
+else()
+  add_subdirectory(${FOLDER} tanks)
+  if(TARGET test_two_tanks OR TARGET example_two_tanks)
+    message(FATAL_ERROR "tests of a subproject")
+  endif()
+endif()
+add_executable(use use.c)
+target_link_libraries(use two_tanks::two_tanks)
+"""
+
+
+@pytest.mark.long
+@needs_compiler
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+def test_cmake_serves_other_projects(toy: Any, tmp_path: Path) -> None:
+    """As a subdirectory, without its tests, installed, and as a module of Zephyr (its functions
+    told here). Mutant: tests built in subprojects; no header installed."""
+    folder = generate_c(toy, tmp_path / "p", vectors=100).folder
+    place = tmp_path / "use"
+    place.mkdir()
+    (place / "CMakeLists.txt").write_text(USE)
+    (place / "use.c").write_text(
+        '#include "two_tanks.h"\nint main(void) { two_tanks_state_t s; two_tanks_init(&s);'
+        " return 0; }\n"
+    )
+    run("cmake", "-S", ".", "-B", "sub", f"-DFOLDER={folder}", cwd=place)
+    run("cmake", "--build", "sub", cwd=place)
+    run("cmake", "-S", str(folder), "-B", "lib", "-DBUILD_TESTING=OFF", cwd=tmp_path)
+    run("cmake", "--build", "lib", cwd=tmp_path)
+    run("cmake", "--install", "lib", "--prefix", "root", cwd=tmp_path)
+    run("cmake", "-S", ".", "-B", "inst", f"-DINSTALLED={tmp_path / 'root'}", cwd=place)
+    run("cmake", "--build", "inst", cwd=place)
+    (place / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.15)\nproject(use C)\n"
+        "function(zephyr_library)\nendfunction()\n"
+        "function(zephyr_library_sources file)\nmessage(STATUS told:${file})\nendfunction()\n"
+        "function(zephyr_include_directories)\nendfunction()\n"
+        f"add_subdirectory({folder} tanks)\n"
+    )
+    assert "told:src/two_tanks.c" in run("cmake", "-S", ".", "-B", "zephyr", cwd=place)
+
+
+@pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="no compiler for ARM")
+def test_an_arm_compiler_takes_every_file(
+    toy: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mutant: PRIx64, which newlib does not define."""
+    monkeypatch.setattr("obsynth.codegen.project.find_compiler", lambda: None)
+    folder = generate_c(toy, tmp_path / "p", vectors=100).folder
+    for file in ("src/two_tanks.c", "tests/test_two_tanks.c", "examples/main.c"):
+        flags = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-Iinclude", "-c", "-o", "x.o")
+        run("arm-none-eabi-gcc", "-mcpu=cortex-m4", *flags, file, cwd=folder)
+
+
 def test_without_a_compiler_the_result_says_so(
     toy: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -325,6 +392,8 @@ def test_fast_math_is_refused_by_the_sources(
         ({"seed": -1}, "seed"),
         ({"memory": np.zeros(5)}, r"\(6,\)"),
         ({"name": "stdio"}, "stdio_observer"),
+        ({"name": "m"}, "hide a header, a library or a target"),
+        ({"name": "Nightly"}, "hide a header, a library or a target"),
     ],
 )
 def test_options_that_cannot_be_met_are_refused(
