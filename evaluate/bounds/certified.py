@@ -58,29 +58,19 @@ def least(
     contractions: int = CONTRACTIONS,
     progress: Callable[[str, float], None] | None = None,
 ) -> Least:
-    """Look for the least ``weights'bounds``; bounds with weight zero up to the largest.
-
-    No window of a record needs more than all of it: long ones are certified by windows.
-    """
-    say = progress or (lambda stage, share: None)
-    say("looking for a trajectory", 0.0)
+    """Look for the least ``weights'bounds``; bounds with weight zero up to the largest."""
+    if progress is not None:
+        progress("looking for a trajectory", 0.0)
     found = explain(problem, weights, largest, start)
     upper = _cost(weights, found)
     cost = upper * (1.0 + ROOM)
     with np.errstate(divide="ignore", invalid="ignore"):
         top = np.where(weights > 0.0, cost / weights, np.inf)
     top = np.minimum(top, np.inf if largest is None else largest * (1.0 + ROOM))
-    best = Least(problem, weights, found, 0.0, None, None)
-    for begin in range(0, len(problem), LONGEST):
-        say("certifying", 0.2 + 0.8 * begin / len(problem))
-        window = replace(problem, box=best.problem.box).window(begin, begin + LONGEST)
-        after, linear, solution = below(window, weights, top, cost, contractions)
-        box = replace(problem, box=after.box)
-        lower = min(np.inf if solution is None else solution.certified, upper)
-        if lower > best.lower or begin == 0:
-            best = Least(box, weights, found, max(lower, 0.0), linear, solution, begin)
-        best = replace(best, problem=box)
-    return best
+    side = below(problem, weights, top, cost, contractions, progress)
+    problem, lower, linear, solution, begin = side
+    lower = max(min(lower, upper), 0.0)
+    return Least(problem, weights, found, lower, linear, solution, begin)
 
 
 def _cost(weights: FloatArray, found: Trajectory) -> float:
@@ -89,9 +79,33 @@ def _cost(weights: FloatArray, found: Trajectory) -> float:
 
 
 def below(
+    problem: Problem,
+    weights: FloatArray,
+    top: FloatArray,
+    cost: float,
+    contractions: int = CONTRACTIONS,
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[Problem, float, Linear | None, Solution | None, int]:
+    """Return the certified side among bounds up to the largest and costs up to one.
+
+    No window of a record needs more than all of it: long ones are certified by windows.
+    """
+    best: tuple[float, Linear | None, Solution | None, int] = -np.inf, None, None, 0
+    for begin in range(0, len(problem), LONGEST):
+        if progress is not None:
+            progress("certifying", 0.2 + 0.8 * begin / len(problem))
+        window = problem.window(begin, begin + LONGEST)
+        after, linear, solution = _window(window, weights, top, cost, contractions)
+        problem = replace(problem, box=after.box)
+        lower = np.inf if solution is None else solution.certified
+        if lower > best[0]:
+            best = lower, linear, solution, begin
+    return problem, *best
+
+
+def _window(
     problem: Problem, weights: FloatArray, top: FloatArray, cost: float, contractions: int
 ) -> tuple[Problem, Linear | None, Solution | None]:
-    """Return the certified side among bounds up to the largest and costs up to one."""
     for _ in range(contractions if problem.still.any() else 0):
         after = narrowed(problem, top, weights, cost)
         if after is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.evaluate.bounds.attribution import Attribution, attribute
-from obsynth.evaluate.bounds.certified import CONTRACTIONS, Least, below, least
+from obsynth.evaluate.bounds.certified import Least, below, least
 from obsynth.evaluate.bounds.problem import Groups, Problem, pose
 from obsynth.evaluate.bounds.validation import Validation, validate
 from obsynth.evaluate.errors import BoundsError
@@ -175,8 +175,7 @@ class LeastBounds:
                 f"{', '.join(self.bounds)}, not {bounds}.",
             )
         problem, top = self.problem.scaled(scale * given), 1.0 + BESIDE
-        found = below(problem, np.ones(1), np.array([top]), top, CONTRACTIONS)[2]
-        return found is None or found.certified > 1.0
+        return below(problem, np.ones(1), np.array([top]), top)[1] > 1.0
 
     def attribute(self, without: Sequence[str] = (), safety: float | None = None) -> Attribution:
         """Say where a contradiction lies: see `Attribution`.

@@ -247,6 +247,8 @@ def test_windows_of_long_records(monkeypatch):
     assert [round(share, 2) for _, share in said] == [0.0, 0.2, 0.43, 0.66, 0.89]
     support = ob.LeastBounds(problem, record, 1.2, found).support
     assert {row[0] for row in support.rows} == {2.0, 3.0}
+    fit = ob.LeastBounds(problem, record, 1.2, found)
+    assert fit.refutes(outputs=0.24) and not fit.refutes(outputs=0.26)
     narrow = replace(problem, first=np.array([[0.5, 0.5]]))
     assert narrow.window(2, 4).first is None
     assert enclose(narrow, np.ones(1)).ends[0, 0].tolist() == [0.5, 0.5]

@@ -92,7 +92,7 @@ def hold(name, seed, steps=24):
 
 @pytest.mark.parametrize("name", [name for name in PLANTS if name != "battery"])
 def test_truths(name):
-    hold(name, 0, 12)
+    hold(name, 0, 8)
 
 
 @pytest.mark.long
