@@ -33,9 +33,8 @@ class LinearPart:
 def rounded(exact: sp.Matrix) -> LinearPart:
     """Round a matrix of exact numbers to doubles, with bounds of the errors."""
     value, error = np.zeros(exact.shape), np.zeros(exact.shape)
-    for i in range(exact.rows):
-        for j in range(exact.cols):
-            value[i, j], error[i, j] = round_number(exact[i, j])
+    for place in np.ndindex(*exact.shape):
+        value[place], error[place] = round_number(exact[place])
     return LinearPart(sp.ImmutableMatrix(exact), value, error)
 
 

@@ -172,12 +172,11 @@ def majorant(
     exact = exact_jacobian(split)
     n = exact.rows
     rounding, kept = np.zeros((n, n)), {}
-    for i in range(n):
-        for j in range(n):
-            if is_rounding(exact[i, j], split.A[i, j]):
-                rounding[i, j] = abs(float(exact[i, j])) * UP
-            elif exact[i, j] != 0:
-                kept[(i, j)] = exact[i, j]
+    for place, coefficient in np.ndenumerate(split.A):
+        if is_rounding(exact[place], coefficient):
+            rounding[place] = abs(float(exact[place])) * UP
+        elif exact[place] != 0:
+            kept[place] = exact[place]
     entries = matrix_entries(kept, model)
     ranges = entries.ranges(min(rtol, 1e-6), effort, "dg/dx")
     sizes = np.zeros((n, n))

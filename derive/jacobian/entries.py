@@ -54,27 +54,26 @@ def jacobian_entries(split_or_model: Split | Plant, wrt: str) -> MatrixEntries:
     quiet = {s.symbol: 0 for k in ("d", "f", "w") for s in getattr(model, k)}
     values, shifts, shift_symbols = [], [], []
     expressions: dict[Entry, sp.Expr] = {}
-    for i in range(jacobian.shape[0]):
-        for j in range(jacobian.shape[1]):
-            present = jacobian.sparsity().has_nz(i, j)
-            offset = 0.0 if linear is None else float(linear[i, j])
-            if not present and offset == 0.0:
-                continue
-            value = jacobian[i, j] if present else ca.SX(0)
-            exact = _exact_entry(rows[i], wrt_symbols[j], f"J{i + 1}_{j + 1}", model)
-            if offset != 0.0:
-                symbol = ca.SX.sym(f"a{i + 1}{j + 1}")
-                shifts.append((offset, offset))
-                shift_symbols.append(symbol)
-                value, exact = value - symbol, exact - rational(offset)
-            if part is not None:
-                exact = exact.subs(quiet)
-            if size(exact) < _LONG:
-                exact = sp.expand(exact)
-            if exact == 0:
-                continue
-            values.append(value)
-            expressions[(i, j)] = exact
+    for i, j in np.ndindex(jacobian.shape):
+        present = jacobian.sparsity().has_nz(i, j)
+        offset = 0.0 if linear is None else float(linear[i, j])
+        if not present and offset == 0.0:
+            continue
+        value = jacobian[i, j] if present else ca.SX(0)
+        exact = _exact_entry(rows[i], wrt_symbols[j], f"J{i + 1}_{j + 1}", model)
+        if offset != 0.0:
+            symbol = ca.SX.sym(f"a{i + 1}{j + 1}")
+            shifts.append((offset, offset))
+            shift_symbols.append(symbol)
+            value, exact = value - symbol, exact - rational(offset)
+        if part is not None:
+            exact = exact.subs(quiet)
+        if size(exact) < _LONG:
+            exact = sp.expand(exact)
+        if exact == 0:
+            continue
+        values.append(value)
+        expressions[(i, j)] = exact
     column = ca.vertcat(*values) if values else ca.SX(0, 1)
     inner = [] if quotients is None else [q.argument for q in quotients.members]
     needed = {str(s) for s in ca.symvar(ca.vertcat(column, *inner))}

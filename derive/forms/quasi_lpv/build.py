@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.zero_test import FormProof
@@ -115,12 +116,7 @@ def quasi_lpv(
     proxy = assemble(model, layout, point, terms, chosen)
     matrix = sp.ImmutableMatrix(proxy.xreplace({k.signal.symbol: k.meaning for k in lifts}))
     proof = prove_form(model, matrix, point, rows)
-    places = {
-        (i, j): proxy[i, j]
-        for i in range(proxy.rows)
-        for j in range(proxy.cols)
-        if proxy[i, j] != 0
-    }
+    places = {place: proxy[place] for place in np.ndindex(*proxy.shape) if proxy[place] != 0}
     back = deviations(model, point)
     names = row_names(model)
     left = tuple((names[t.row], t.expression.xreplace(back), t.reason) for t in terms if t.reason)

@@ -171,13 +171,10 @@ class IntervalForm:
     def __str__(self) -> str:
         what = ", ".join(map(str, self.arguments))
         lines = [f"elementwise bounds of A as functions of {what}" if what else "bounds of A"]
-        n, k = self.A_min.shape
-        for i in range(n):
-            for j in range(k):
-                low, high = self.A_min[i, j], self.A_max[i, j]
-                if high > low:
-                    kind = self.how["A"][i, j]
-                    lines.append(f"  a{i + 1}{j + 1} in [{low:.8g}, {high:.8g}]  {kind}")
+        for (i, j), kind in np.ndenumerate(self.how["A"]):
+            low, high = self.A_min[i, j], self.A_max[i, j]
+            if high > low:
+                lines.append(f"  a{i + 1}{j + 1} in [{low:.8g}, {high:.8g}]  {kind}")
         return "\n".join(lines)
 
     def _repr_latex_(self) -> str:
@@ -195,7 +192,7 @@ def make_interval_form(
         return _constant_form(blocks, model, way)
     lower, upper, how = {}, {}, {}
     for name, block in blocks.items():
-        places = {(i, j): block[i, j] for i in range(block.rows) for j in range(block.cols)}
+        places = {place: block[place] for place in np.ndindex(*block.shape)}
         found = bound_elements(places, model, known, [lift.signal for lift in way.lifts])
         lower[name] = sp.ImmutableMatrix(*block.shape, list(found.lower.values()))
         upper[name] = sp.ImmutableMatrix(*block.shape, list(found.upper.values()))
@@ -210,12 +207,11 @@ def _constant_form(blocks: dict[str, sp.Matrix], model: Plant, way: Ranging) -> 
     for name, block in blocks.items():
         low, high = np.zeros(block.shape), np.zeros(block.shape)
         varying = {}
-        for i in range(block.rows):
-            for j in range(block.cols):
-                if block[i, j].free_symbols:
-                    varying[(i, j)] = block[i, j]
-                else:
-                    low[i, j], high[i, j] = enclose_number(block[i, j])
+        for place in np.ndindex(*block.shape):
+            if block[place].free_symbols:
+                varying[place] = block[place]
+            else:
+                low[place], high[place] = enclose_number(block[place])
         entries = matrix_entries(varying, model, [lift.signal for lift in way.lifts])
         if entries.places:
             found = entries.ranges(way.rtol, way.effort, name)
