@@ -6,6 +6,7 @@ import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import (
+    LIBRARY,
     OPERATIONS,
     RESULTS,
     STEP_INPUTS,
@@ -17,12 +18,6 @@ from obsynth.codegen.kernel import (
 
 # CasADi wraps these to serve C89 as well; the wrapped C99 function is what its VM calls.
 _WRAPPED = frozenset({"expm1", "fabs", "fmax", "fmin", "hypot", "log1p"})
-
-_C99_TEXT = """
-    acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh erf exp floor fmod log pow
-    remainder sin sinh sqrt tan tanh
-"""
-_C99 = _WRAPPED | frozenset(_C99_TEXT.split())
 
 _FUNCTION = re.compile(
     r"^static int casadi_f0\([^)]*\) \{\n(?P<body>.*?)^\}\n", re.MULTILINE | re.DOTALL
@@ -117,7 +112,7 @@ def _check_words(body: str, prefix: str, helpers: list[str]) -> tuple[str, ...]:
     known |= {f"{prefix}_{helper}" for helper in helpers}
     library = set()
     for word in set(_WORD.findall(body)):
-        if word in _C99:
+        if word in LIBRARY:
             library.add(word)
         elif word == "erfinv":
             raise CodegenError(

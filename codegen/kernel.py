@@ -19,6 +19,13 @@ STEP_INPUTS = ("memory", "u", "y", "theta")
 RESULTS = ("next", *STEP_OUTPUTS[1:], *FURTHER_OUTPUTS[-1])
 """Results of a step, in their order; the last ones of detectors only."""
 
+_C99_TEXT = """
+    acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh erf exp expm1 fabs floor fmax fmin
+    fmod hypot log log1p pow remainder sin sinh sqrt tan tanh
+"""
+LIBRARY = frozenset(_C99_TEXT.split())
+"""What C99 has of CasADi's functions, under the same names."""
+
 _EXACT = frozenset({"ceil", "copysign", "fabs", "floor", "fmax", "fmin", "fmod", "remainder"}) | {
     "sqrt"
 }

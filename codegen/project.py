@@ -170,7 +170,10 @@ def generate_c(
     if start < 0:
         raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
     description = describe(observer, name, memory)
-    kernel = _kernel(description, backend)
+    if backend == "tape":
+        kernel = write_tape(observer.step, description.name, description.place)
+    else:
+        kernel = generate_kernel(observer.step, description.name)
     recorded = make_vectors(description, count, start)
     files = render(description, kernel, recorded, start_given=memory is not None)
     files[MANIFEST] = _manifest(description, kernel, recorded, start, files)
@@ -192,13 +195,6 @@ def generate_c(
         build=build,
         comparison=comparison,
     )
-
-
-def _kernel(description: Description, backend: str) -> Kernel:
-    step, name = description.observer.step, description.name
-    if backend == "tape":
-        return write_tape(step, name, description.place)
-    return generate_kernel(step, name)
 
 
 def _compared(

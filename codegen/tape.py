@@ -21,6 +21,7 @@ import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import (
+    LIBRARY,
     OPERATIONS,
     RESULTS,
     STEP_INPUTS,
@@ -36,11 +37,7 @@ _TRUTH = {*_COMPARED, "and", "or", "not"}
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", **_COMPARED, "and": "&&", "or": "||"}
 # operands are written more than once
 _TWICE = {"fmax", "fmin", "sq", "twice", "sign"}
-_CALLED = {name: name for name in ("fabs", "pow", "sqrt", "exp", "log", "sin", "cos", "tan")}
-_CALLED |= {name: name for name in ("asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh")}
-_CALLED |= {name: name for name in ("acosh", "atanh", "atan2", "floor", "ceil", "fmod", "erf")}
-_CALLED |= {name: name for name in ("log1p", "expm1", "hypot", "copysign", "remainder")}
-_CALLED["constpow"] = "pow"
+_CALLED = {name: name for name in LIBRARY - _TWICE} | {"constpow": "pow"}
 # -0 in, -0 out, and nothing else depends on the sign of a zero
 _ODD = {"neg", "twice", "sqrt", "sign", "floor", "ceil", "fmax", "fmin", "if_else_zero", "mul"}
 _BLIND = {*_TRUTH, "fabs", "sq"}
@@ -104,8 +101,10 @@ class _Reader:
     def _operation(self, name: str, args: tuple[_Value, ...]) -> _Value:
         if name == "add":
             for one, other in (args, args[::-1]):
-                if one.name == other.name == "if_else_zero" and _opposite(one, other):
-                    return self._value("choose", (one.args[0], one.args[1], other.args[1]))
+                if one.name == other.name == "if_else_zero":
+                    (test, then), (against, otherwise) = one.args, other.args
+                    if against.name == "not" and against.args[0] is test:
+                        return self._value("choose", (test, then, otherwise))
         if name == "mul":
             for factor, truth in (args, args[::-1]):
                 if truth.truth and factor.name == "const" and 0 < factor.number < float("inf"):
@@ -144,10 +143,6 @@ class _Reader:
                     argument.uses += 1
                     argument.signed |= sign
         return [value for value in self.values.values() if value.uses]
-
-
-def _opposite(one: _Value, other: _Value) -> bool:
-    return other.args[0].name == "not" and other.args[0].args[0] is one.args[0]
 
 
 def _may_be(value: _Value) -> tuple[bool, bool]:
