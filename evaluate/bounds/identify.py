@@ -174,9 +174,10 @@ def _sizes(problem: Problem) -> FloatArray:
 def _intervals(problem: Problem) -> Problem:
     """Return the problem with what the declared bounds leave of the parameters."""
     size = _sizes(problem)
-    bounds = [size[problem.group == g].max(initial=0.0) for g in range(len(problem.groups))]
+    groups = range(len(problem.groups))
+    bounds = np.nextafter([size[problem.group == g].max(initial=0.0) for g in groups], np.inf)
     for _ in range(MOST_CUTS):
-        after = narrowed(problem, np.array(bounds))
+        after = narrowed(problem, bounds)
         if after is None:
             raise BoundsError(
                 "the record contradicts the declared ranges and bounds for certain: "
