@@ -216,6 +216,20 @@ class LeastBounds:
             told[name] = getattr(self, name)
         return dict(json.loads(json.dumps(told), parse_constant=lambda name: None))
 
+    @property
+    def pressed(self) -> dict[str, int]:
+        """Numbers of instants at which a signal of the trajectory is at an end of its range.
+
+        Where there are any, the range may be what asks for large bounds, not the noise.
+        """
+        box, v = self.problem.box, self.least.trajectory.v
+        near = 1e-6 * np.ptp(box, axis=1)
+        at = (v <= box[:, 0] + near) | (v >= box[:, 1] - near)
+        at[:, self.problem.places["w"]] = False
+        at[:, ~(near > 0.0)] = False
+        count = at[np.isfinite(v).all(axis=1)].sum(axis=0)
+        return {n: k for n, k in zip(self.problem.names, count.tolist(), strict=True) if k}
+
     def table(self) -> Table:
         """Bounds by group beside the declared ones, both sides of their weighted sum."""
         rows: list[list[Any]] = [
@@ -232,6 +246,9 @@ class LeastBounds:
             verdict = f"No trajectory was found that meets the equations (best: to {gap:.2g})."
             if self.lower == np.inf:
                 verdict = "No bounds explain it: ranges or equations without disturbance refute it."
+        if self.pressed:
+            told = ", ".join(f"{name} at {count} instants" for name, count in self.pressed.items())
+            verdict += f" At an end of its range: {told}; a wider one may ask for smaller bounds."
         return Table(
             f"Least bounds of {self.problem.plant.name}",
             ["group", "bound", "weight", "declared"],

@@ -252,3 +252,13 @@ def test_windows_of_long_records(monkeypatch):
     narrow = replace(problem, first=np.array([[0.5, 0.5]]))
     assert narrow.window(2, 4).first is None
     assert enclose(narrow, np.ones(1)).ends[0, 0].tolist() == [0.5, 0.5]
+
+
+def test_a_range_that_is_too_narrow_is_told() -> None:
+    """Readings beyond the range of a level: not the noise is large, the range is small."""
+    record = ob.records.three_tank_leak()[:30]
+    plant = ob.plants.leaking_tanks()
+    assert not ob.least_bounds(plant, record).pressed
+    fit = ob.least_bounds(plant.with_ranges({"h2": (0.0, 0.3)}), record)
+    assert set(fit.pressed) == {"h2"}
+    assert f"h2 at {fit.pressed['h2']} instants" in repr(fit) and fit.refuted
