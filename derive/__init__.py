@@ -29,12 +29,9 @@ from obsynth.derive.jacobian.bounds import jacobian_bounds as jacobian_bounds
 from obsynth.derive.jacobian.family import AffineDependence as AffineDependence
 from obsynth.derive.jacobian.family import AffineFamily as AffineFamily
 from obsynth.derive.mismatch import mismatch as mismatch
-from obsynth.derive.polytopes.fewer import principal_family as principal_family
 from obsynth.derive.polytopes.polytope import Polytope as Polytope
 from obsynth.derive.polytopes.polytope import polytope_from_halfspaces as polytope_from_halfspaces
 from obsynth.derive.polytopes.polytope import polytope_from_vertices as polytope_from_vertices
-from obsynth.derive.polytopes.support import JacobianPolytope as JacobianPolytope
-from obsynth.derive.polytopes.support import jacobian_polytope as jacobian_polytope
 from obsynth.derive.remainder.certify import discretisation_remainder as discretisation_remainder
 from obsynth.derive.remainder.enclosure import enclose_remainder as enclose_remainder
 from obsynth.derive.remainder.flow import FlowError as FlowError

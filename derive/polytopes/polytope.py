@@ -10,7 +10,6 @@ that the list is complete needs no further proof. Everything is computed in rati
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,13 +105,6 @@ def _independent(matrix: FloatArray, order: NDArray[np.intp]) -> tuple[int, ...]
 # Faces are moved outwards by so much of the size, each by a different multiple, until no more than
 # n of them meet in a vertex.
 _NUDGES = (2.0**-44, 2.0**-40, 2.0**-34)
-
-
-class Label(StrEnum):
-    """What a polytope says about the set it stands for; the value is a sentence for the reader."""
-
-    EXACT = "exact: the hull of the set, up to the tolerance of its ranges"
-    OUTER = "outer: holds the set, with proof, and may be larger"
 
 
 @dataclass(frozen=True, eq=False)
