@@ -137,6 +137,7 @@ def test_no_matrix_within_the_bounds_majorises_a_row():
     assert violation(np.array([1.0, 1.0]), corners[1]) == 4.0
 
 
+@pytest.mark.long
 def test_the_paper_s_own_printed_example_is_such_a_row():
     """With the bounds of dg1/dx1 and dg1/dx2, no M of (11) holds for the Jacobians that occur."""
     parts = hinf_split("as_printed")

@@ -82,6 +82,7 @@ def test_pole_on_an_interior_diagonal():
     assert "df/dx[1,1]" in str(told.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effort", ["fast", "normal"])
 def test_an_infinite_end_is_refused_with_entry_and_box(effort):
     """Near v = 0 the slopes have no bound, whether or not the budget reaches a tiny box there."""

@@ -194,6 +194,7 @@ def test_faults_that_multiply_states_are_refused_by_name(name):
     assert (told.value.symbol, told.value.row) == (symbol, row)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n in LIGHT if n not in REFUSED])
 def test_bounds_of_the_remainder_are_those_of_the_plant_moved(name):
     parts, whole = split_of(name, "jacobian"), bounds_of(name, "states", "normal")

@@ -88,6 +88,7 @@ def test_admissible_runs_with_gaps_are_inside(carried, kind):
     assert any(status & 32 for _, status in told) and any(status & 2 for _, status in told)
 
 
+@pytest.mark.long
 def test_bounds_that_are_too_small_are_noticed(carried):
     """Mutant: the step of a design with a tenth of the proved bounds; only strips beside it."""
     design, contract = carried.certificate.design, carried.certificate.contract

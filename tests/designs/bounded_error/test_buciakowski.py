@@ -119,6 +119,7 @@ def test_printed_form_is_refused_on_the_derived_bounds(tank_split, tank_bounds):
     assert "s = M e" in str(refusal.value)
 
 
+@pytest.mark.long
 def test_gamma_of_the_paper_is_refused_with_the_largest_feasible(tank_split, tank_bounds):
     with pytest.raises(ob.InfeasibleDesign, match="largest feasible gamma") as refusal:
         ob.BoundedErrorUIO(gamma=0.01).design(tank_split, tank_bounds)
@@ -138,6 +139,7 @@ def test_peak_bounds_of_a_gain_of_our_own(peak):
     assert peak.performance["sum_half_widths"] / 24.32 <= 0.1347
 
 
+@pytest.mark.long
 def test_repaired_form(tank_split, tank_bounds):
     method = ob.BoundedErrorUIO(form="repaired", gamma=0.005, objective="trace")
     observer = method.design(tank_split, tank_bounds)
@@ -175,6 +177,7 @@ def test_largest_gamma_with_the_printed_bounds(base):
     assert largest_gamma(plain_error(data)) == pytest.approx(0.00917, rel=0.005)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "ratio"),
     [
@@ -207,6 +210,7 @@ def test_gamma_search_beats_the_fixed_gamma(tank_split, tank_bounds):
     assert 0.0058 < observer.performance["gamma"] < 0.007
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("objective", "key", "sign"),
     [("log_det", "log_det_P", 1), ("lambda_min", "lambda_min_P", 1), ("trace", "trace_P", 1)],

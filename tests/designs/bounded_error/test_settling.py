@@ -32,6 +32,7 @@ def steady_run(observer, steps):
     return np.array(widths), np.array(ages)
 
 
+@pytest.mark.long
 def test_half_widths_hold_when_a_copy_has_taken_over(observer):
     """Mutants: the estimate taken to lie inside of its box; begun two calls early."""
     contract, design = observer.certificate.contract, observer.certificate.design

@@ -115,6 +115,7 @@ def test_the_programmes_give_the_published_hull(hulls):
     assert hulls[-1] == pytest.approx(LAST, abs=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["default", "vertex", "sylvester", "paper", "single"])
 def test_every_feasible_set_is_contained(name, observers, hulls):
     found = sets(observers[name], MEASUREMENTS)

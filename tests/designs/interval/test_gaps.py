@@ -94,6 +94,7 @@ def wrong(observer, seeds=8, gaps=True, narrow=0.0, steps=90):
     return sum(run(plant, step, memory, seed, steps, gaps) for seed in range(seeds))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("contraction", [True, False])
 @pytest.mark.parametrize("cuts", [None, (), ("strips",)])
 @pytest.mark.parametrize("name", ["tight", "two faults", "product"])

@@ -153,6 +153,7 @@ def test_options_that_do_not_fit_the_plant(options, words, example):
         ob.IntervalObserver(**options).design(example)
 
 
+@pytest.mark.long
 def test_given_transformations(example, designs):
     """For n - q >= 2 a rotation of the free coordinates is another observer, as good a proof."""
     c, s = np.cos(0.3), np.sin(0.3)
@@ -442,6 +443,7 @@ def test_a_record_that_cannot_be_read(change, designs, tmp_path):
         ob.load(path)
 
 
+@pytest.mark.long
 def test_analyse_proves_what_given_gains_guarantee(example, designs):
     method = ob.IntervalObserver(cuts=(), horizon=10**9)
     observer = method.analyse(example, {"L": [[0.4], [-1.0]]})

@@ -84,6 +84,7 @@ def variants(example):
 BOX = np.tile([0.5, 1.5], (3, 1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize(
     ("noise", "schedule"),
@@ -263,6 +264,7 @@ NOISE_MUTANTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_mutants_leave_the_truth_outside(mutant, mixed, run_many):
     observer = mixed[False]

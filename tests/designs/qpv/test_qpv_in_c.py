@@ -19,6 +19,7 @@ def project(designed, tmp_path_factory):
     return ob.generate_c(observer, folder, memory=memory)
 
 
+@pytest.mark.long
 def test_ten_thousand_steps_are_equal_to_the_last_bit(project):
     # estimates and level once, twice what the guard has of faults, its marks
     memory = 7 + 2 * (6 + 1) + 3

@@ -1,6 +1,7 @@
 """The step at run time: its differential equation, status bits, time index."""
 
 import numpy as np
+import pytest
 
 import obsynth as ob
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
@@ -86,6 +87,7 @@ def test_the_start_is_certified_or_not(designed):
     assert np.isfinite(found["fhat"]).all()
 
 
+@pytest.mark.long
 def test_the_paper_starts_outside_its_own_polytope(designed):
     """xhat(0) = (11, 10.5, 12, 0, 0, 0) is not in c + P_e; with sets apart it is certified."""
     guess, truth = [11.0, 10.5, 12.0], np.stack([CENTRE, CENTRE], axis=1)

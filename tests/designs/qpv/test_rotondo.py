@@ -145,6 +145,7 @@ def test_eta_is_searched_together_with_the_gain_cap(method, designed, plant, mon
     assert max(sizes) <= 200.0 * (1 + 1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "mu"), [("box_insc", 2.40004), ("cross1", 0.507478)])
 def test_the_printed_conditions_have_another_optimum_and_prove_nothing(name, mu, method, plant):
     with pytest.raises(ob.CertificateError, match="as printed") as refusal:

@@ -32,6 +32,7 @@ def lag():
     return of("lag")[0]
 
 
+@pytest.mark.long
 def test_what_own_coordinates_cannot_is_designed_and_contained(case):
     """Ends of disturbances, inputs and faults held, jumping or anything: nothing outside."""
     name, observer, plant, steps, box = case

@@ -63,6 +63,7 @@ def noisy(tanks, paper_gain, schedule):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("Gamma", [0.003, 0.01, 0.03])
 def test_false_alarms_of_the_printed_indicators(noisy, numbers, Gamma):
     observer, z, indicators, _ = noisy[Gamma]

@@ -239,6 +239,7 @@ def test_inclusion_in_a_thousand_hard_runs(bank, loop):
     assert [violations(bank, hard_run(loop, seed)) for seed in range(1000)] == [(0, 0)] * 1000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "mutant", ["no noise", "sign of the fault", "swapped ends", "late by one", "no envelope"]
 )

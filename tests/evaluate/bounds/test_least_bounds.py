@@ -63,6 +63,7 @@ def test_free_parameters(record: ob.Record) -> None:
     assert not fit.refutes(1.01)
 
 
+@pytest.mark.long
 def test_first_contradiction(fixed: ob.LeastBounds) -> None:
     """Without the leak, from 36 on: up to 61 .852 of the bounds do, up to 62 they do not."""
     problem = fixed.problem.window(0, 30).fixed(leak=0.0)
