@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from obsynth.evaluate.bounds.certified import STALLED, narrowed
+from obsynth.evaluate.bounds.certified import narrowed
 from obsynth.evaluate.bounds.problem import Problem, default_groups, pose
 from obsynth.evaluate.bounds.trajectory import Search, Trajectory, guess, measured
 from obsynth.evaluate.errors import BoundsError
@@ -20,6 +20,8 @@ from obsynth.symbolic.arrays import FloatArray
 
 MOST_CUTS = 12
 """Times that the intervals are cut at most."""
+STALLED = 0.001
+"""Share of an interval below which another cut is not worth its programs."""
 UNKNOWN = 1e-8
 """Information of a direction, relative to the largest, below which the record has none of it."""
 
