@@ -106,6 +106,7 @@ _UNARY = st.sampled_from([sp.sin, sp.cos, sp.atan, sp.tanh, sp.exp, lambda e: sp
 _BINARY = st.sampled_from([lambda a, b: a + b, lambda a, b: a * b, lambda a, b: a / (40 + b)])
 
 
+@pytest.mark.long
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(
     st.recursive(

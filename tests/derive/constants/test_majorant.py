@@ -70,6 +70,7 @@ def test_attained_value_of_the_consistent_variant():
     assert a**2 <= found.diagonal[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("d2", [10.0, 1.0, 0.1])
 def test_printed_variant_is_a_family(d2):
     """sup a^2 / d1 + b^2 / d2 <= 1; the note's .51841 is .5184 rounded up."""

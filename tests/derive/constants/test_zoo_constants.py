@@ -97,6 +97,7 @@ def test_slopes_of_every_plant_stay_within_its_constants(name):
         assert value.attained <= value.upper
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_one_euler_step_of_every_plant_stays_within_its_remainder(name):
     plant = build(name)

@@ -76,6 +76,7 @@ def test_interval_detector_in_c(interval, tmp_path):
     assert "- **Means.**" in (project.folder / "README.md").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("engine", "filters", "first"),
     [

@@ -148,6 +148,7 @@ def worst(Z, middle, reach, apart, w=0.1):
     return most
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("Z", [0.2, 0.45, 0.8])
 @pytest.mark.parametrize(("sign", "touched"), [(1, 0), (-1, 0), (1, 2), (-1, 2)])
 def test_widths_of_one_state_are_above_the_worst_and_near_it(Z, sign, touched):
