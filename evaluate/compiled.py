@@ -38,8 +38,8 @@ def compiled(function: ca.Function, calls: int) -> ca.Function:
     if command is None or not _plain(plain):
         return function
     text = f"{ca.CasadiMeta.version()} {command} {FLAGS} {plain.serialize()}"
-    library = _folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.so"
     try:
+        library = _folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.so"
         if not library.is_file():
             if calls < PAYS:
                 return function

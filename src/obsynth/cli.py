@@ -28,6 +28,16 @@ app = typer.Typer(
     help="From a plant's equations to a proven fault-estimating observer in C.",
 )
 
+RecordFile = Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")]
+MapOption = Annotated[
+    list[str] | None,
+    typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
+]
+TimeOption = Annotated[str | None, typer.Option("--time", help="Column of the time.")]
+FromOption = Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)]
+ToOption = Annotated[int | None, typer.Option("--to", help="Instant before which to end.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")]
+
 
 def main() -> None:
     """Run the command line; refusals are sentences on stderr and exit code 1."""
@@ -138,21 +148,18 @@ def choose(
 @app.command()
 def estimate(
     design: Annotated[Path, typer.Argument(help="A design saved by obsynth, a JSON file.")],
-    record: Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")],
-    mapping: Annotated[
-        list[str] | None,
-        typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
-    ] = None,
-    time_column: Annotated[str | None, typer.Option("--time", help="Column of the time.")] = None,
-    first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
-    until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
+    record: RecordFile,
+    mapping: MapOption = None,
+    time_column: TimeOption = None,
+    first: FromOption = 0,
+    until: ToOption = None,
     guess: Annotated[str | None, typer.Option(help="First state, numbers with commas.")] = None,
     window: Annotated[
         list[int] | None, typer.Option(help="Instants for means of the faults.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="File to write, .csv or .parquet.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run a saved observer over a record; exit 3 if the record refutes its assumptions."""
     with _refusals():
@@ -181,21 +188,18 @@ def estimate(
 @app.command()
 def bounds(
     plant: Annotated[str, typer.Argument(help="A name in obsynth.plants, or a JSON file.")],
-    record: Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")],
-    mapping: Annotated[
-        list[str] | None,
-        typer.Option("--map", help="SIGNAL=COLUMN[,SCALE[,OFFSET]], for each that needs it."),
-    ] = None,
-    time_column: Annotated[str | None, typer.Option("--time", help="Column of the time.")] = None,
-    first: Annotated[int, typer.Option("--from", help="First instant, from 0.", min=0)] = 0,
-    until: Annotated[int | None, typer.Option("--to", help="Instant before which to end.")] = None,
+    record: RecordFile,
+    mapping: MapOption = None,
+    time_column: TimeOption = None,
+    first: FromOption = 0,
+    until: ToOption = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
             help="SIGNAL or PARAMETER=LOWER:UPPER; the others are held. Default: signals."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the least bounds that explain a record; exit 3 if it refutes the declared ones."""
     with _refusals():
