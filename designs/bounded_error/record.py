@@ -12,7 +12,7 @@ from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData, kept_coordinates
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -50,7 +50,7 @@ class EllipsoidBound(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class UioDesign(Record):
+class UioDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
     plant: the discrete plant

@@ -35,6 +35,7 @@ from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
 from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.record import Precision, precision_of
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.core.sweeps import Sweeps
 from obsynth.symbolic import Plant
@@ -57,11 +58,13 @@ class Watch:
         as many as the core's bounds take to settle
     recovery: N_rec, calls for which the status says that the sets are recovering
     cuts: parts of the contractor that are used
+    precision: of the step
     """
 
     horizon: int | None
     recovery: int
     cuts: tuple[Cut, ...]
+    precision: Precision = "double"
 
     @property
     def calls(self) -> int:
@@ -82,7 +85,8 @@ class Watch:
                 f"cuts {cuts!r} are no options of the guard"
             )
         found = None if horizon is None else counts[0]
-        return cls(found, counts[1], tuple(c for c in EVERY_CUT if c in named))
+        used = tuple(c for c in EVERY_CUT if c in named)
+        return cls(found, counts[1], used, precision_of(options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +106,13 @@ class Guard:
     watch: Watch
     delay: int
     Ts: float
-    precision: str = "double"
     shared: tuple[str, ...] = ()
     settle: Callable[[FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
+
+    @property
+    def precision(self) -> Precision:
+        """In which the step runs."""
+        return self.watch.precision
 
     @property
     def discrete(self) -> bool:

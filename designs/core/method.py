@@ -20,10 +20,11 @@ from obsynth.derive import JacobianBounds, split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT
 from obsynth.designs.core.core import Core
+from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
-from obsynth.designs.core.record import plain
+from obsynth.designs.core.record import Precision, plain
 from obsynth.designs.core.remainder import of_continuous, prove_remainder
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import extended, fill
@@ -36,6 +37,8 @@ D = TypeVar("D")
 CALLS = Number(
     at_least=1, at_most=MOST_CALLS, because="it has to be a number of calls, at least one"
 )
+WATCHED = ("horizon", "recovery", "cuts", "precision")
+"""Options that every method has."""
 FORMAT = "obsynth design"
 VERSION = 2
 
@@ -74,6 +77,7 @@ class Contract(Generic[D]):
     settle: of a design, half widths of the sets that its core begins from, and a number of calls
         or None: how many calls its bounds take to settle, or that number, and its half widths from
         then on, all infinite where they cannot begin from such sets; None without any bounds
+    single: whether the step can run in single precision
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """
@@ -94,6 +98,15 @@ class Contract(Generic[D]):
     step_covered: bool = False
     settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
     quiet: bool = False
+    single: bool = False
+
+    @property
+    def refusal(self) -> str:
+        """Why a step in single precision is refused."""
+        return (
+            f"precision='single': rounding of the step of {self.name} is not proved in single "
+            "precision; take precision='double'"
+        )
 
     def to_record(self, design: Any) -> dict[str, Any]:
         """Return a design as JSON-able data with the header that `load` reads."""
@@ -102,6 +115,8 @@ class Contract(Generic[D]):
 
     def certify(self, design: Any, level: Level = "full", model: Any = None) -> Certificate:
         """Prove a design; `model`, what was read of the plant, spares deriving it again."""
+        if design.precision == "single" and not self.single:
+            raise CertificateError(f"the stored design cannot be read: {self.refusal}")
         claims = [*self.claims(design)]
         if level == "full" or model is not None:
             try:
@@ -154,7 +169,6 @@ class Contract(Generic[D]):
             Watch.of(design.options),
             self.fault_delay(design) if callable(self.fault_delay) else self.fault_delay,
             plant.Ts if plant.Ts is not None else design.Ts,
-            getattr(design, "precision", "double"),
             self.shared(design) if callable(self.shared) else self.shared,
             None if self.settle is None else partial(self.settle, design),
         )
@@ -200,6 +214,8 @@ class Method:
         ``"strips"``, ``"image"``, ``"inversion"``, ``"rates"`` and ``"sweeps"``: by default all but
         the last, which takes the most operations; ``()`` for the method's own sets, as its paper
         has them
+    precision: in which the step runs, ``"double"`` or ``"single"``: sets hold the truth with every
+        number and operation of the step rounded to it, readings too
     """
 
     CLASS: ClassVar[PlantClass]
@@ -209,6 +225,7 @@ class Method:
     horizon: Annotated[int | None, CALLS] = field(default=None, kw_only=True)
     recovery: Annotated[int, CALLS] = field(default=10, kw_only=True)
     cuts: tuple[str, ...] | None = field(default=None, kw_only=True)
+    precision: Precision = field(default="double", kw_only=True)
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -221,6 +238,8 @@ class Method:
             raise ObsynthError(
                 f"cuts is {self.cuts!r}; it takes a tuple of {', '.join(EVERY_CUT)}", option="cuts"
             )
+        if self.precision == "single" and not self.CONTRACT.single:
+            raise ObsynthError(self.CONTRACT.refusal, option="precision")
         object.__setattr__(self, "cuts", None if self.cuts is None else named)
         self.check()
 
@@ -314,7 +333,7 @@ class Method:
     @property
     def watched(self) -> dict[str, Any]:
         """The options that every method has, by name."""
-        return {"horizon": self.horizon, "recovery": self.recovery, "cuts": self.cuts}
+        return {name: getattr(self, name) for name in WATCHED}
 
     def settling(self, seconds: float, Ts: float) -> Mapping[str, Any]:
         """Return the options with a default horizon of so many seconds."""

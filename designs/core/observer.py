@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.certificate import Certificate, Guarantee
+from obsynth.designs.core.record import Precision, precision_of
 from obsynth.symbolic.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -100,6 +101,11 @@ class Observer:
     ode: ca.Function | None = None
     step_covered: bool = False
     searched: tuple[str, ...] = ()
+
+    @property
+    def precision(self) -> Precision:
+        """In which the step keeps its guarantee: ``"double"`` or ``"single"``."""
+        return precision_of(self.certificate.design.options)
 
     @property
     def figures(self) -> Mapping[str, float]:

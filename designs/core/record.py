@@ -31,6 +31,8 @@ from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 from obsynth.symbolic.errors import ObsynthError
 
+Precision = Literal["double", "single"]
+"""IEEE format in which a step runs."""
 ARRAYS = {FloatArray: float, IntArray: np.int64}
 MOST_SHOWN = 400
 """Characters of a file that a refusal repeats."""
@@ -94,6 +96,25 @@ class Record:
 
     def check(self) -> None:
         """Refuse what annotations cannot say, with a CertificateError."""
+
+
+class Design(Record):
+    """What is stored of an observer; its options say in which precision its step runs."""
+
+    options: Mapping[str, Any]
+
+    @property
+    def precision(self) -> Precision:
+        """In which precision the step runs."""
+        return precision_of(self.options)
+
+
+def precision_of(options: Mapping[str, Any]) -> Precision:
+    """Return the precision that the options of a design name; without one it is double."""
+    given: Precision = _read_literal(
+        get_args(Precision), options.get("precision", "double"), "precision"
+    )
+    return given
 
 
 @contextmanager

@@ -42,8 +42,7 @@ class Window:
 
     def __init__(self, observer: Any, m: int) -> None:
         self.m, self.plant, self.delay = m, observer.model, observer.fault_delay
-        design = getattr(getattr(observer, "certificate", None), "design", None)
-        self.precision: str = getattr(design, "precision", "double")
+        self.precision = observer.precision
         self.relations: tuple[list[int], Equations | None] = [], None
         if observer.ode is None:
             self.relations = relations(self.plant, observer.half_widths, m)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -41,8 +41,6 @@ class FilterBank(Method):
         ranges by default.
     Ts : float, optional
         Sample time of `Observer.step`, .01 s by default.
-    precision : {"double", "single"}
-        In which the step runs: what its rounding may do is added to the bounds.
 
     Raises
     ------
@@ -94,6 +92,7 @@ class FilterBank(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
+        single=True,
         ode=build_ode,
         step_covered=True,
     )
@@ -101,7 +100,6 @@ class FilterBank(Method):
     filters: Annotated[tuple[float, ...], POSITIVE] = (0.1, 0.2, 0.3, 0.5)
     region: tuple[tuple[float, float], ...] | None = None
     Ts: Annotated[float | None, POSITIVE] = None
-    precision: Literal["double", "single"] = "double"
 
     def read(self, given: Plant | Split) -> BankModel:
         """Prove over the region that the equations are monotone, and find where faults enter."""
@@ -114,7 +112,6 @@ class FilterBank(Method):
             **vars(model),
             Ts=Ts,
             filters=np.array(self.filters),
-            precision=self.precision,
             options=self.settling(_SETTLED / min(self.filters), Ts),
         )
 

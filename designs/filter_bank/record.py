@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 
 from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import allowance
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
@@ -70,18 +70,16 @@ class BankModel(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class BankDesign(BankModel):
+class BankDesign(BankModel, Design):
     """Everything that is deployed and proved of the bank.
 
     Ts: sample time of the step
     filters: rates, the one of the returned intervals first
-    precision: in which the step runs
     options: the options of the method, as given
     """
 
     Ts: float
     filters: Annotated[FloatArray, "n_l"]
-    precision: Literal["double", "single"]
     options: Mapping[str, Any]
 
     @cached_property

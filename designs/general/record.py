@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.derive.forms.extended import Extended, extend
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
@@ -120,7 +120,7 @@ class Rounding(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class GeneralDesign(Record):
+class GeneralDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
     plant: the discrete plant

@@ -12,7 +12,7 @@ from obsynth.derive import AffineFamily
 from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.designs.hinf.sector import Sector, SectorForm
 from obsynth.designs.hinf.system import Filter, FilterData
 from obsynth.symbolic import Plant
@@ -57,7 +57,7 @@ class Bound(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class HinfDesign(Record):
+class HinfDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
     plant: the discrete plant

@@ -23,7 +23,6 @@ from obsynth.designs.interval.decoupling import check_detectable, find_transform
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
-from obsynth.designs.interval.rows import Precision
 from obsynth.designs.interval.step import (
     build_core,
     first_memory,
@@ -76,9 +75,6 @@ class IntervalObserver(Method):
         fails: the widths, or else (32).
     nominal : array_like of shape (n, n), optional
         The nominal A of ``centred=False``.
-    precision : {"double", "single"}
-        In which the step may be evaluated with its bounds still enclosing; in single precision
-        the method's own sets are returned, with no `cuts`.
     R, Q : array_like, optional
         Of the Sylvester equation; R nonnegative, shapes (n - q, n - q) and (n - q, m - q).
     H, R0, K0, N, R1, K1 : array_like, optional
@@ -116,6 +112,7 @@ class IntervalObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
+        single=True,
         fault_delay=1,
         settle=half_widths_after,
     )
@@ -126,7 +123,6 @@ class IntervalObserver(Method):
     contraction: bool = True
     form: Literal["general", "corrected", "printed"] | None = None
     nominal: Matrix = None
-    precision: Precision = "double"
     R: Matrix = None
     Q: Matrix = None
     H: Matrix = None
@@ -280,7 +276,6 @@ class IntervalObserver(Method):
             np.zeros((n2, m2)),
             self.bound,
             self.contraction,
-            self.precision,
             np.zeros(0),
             np.zeros(0),
             self.options(),

@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.derive.rigour import UNIT, Exact, above, exact, inverse, magnitude, nearest
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design
 from obsynth.designs.interval.decoupling import (
     Decoupled,
     Reduced,
@@ -19,7 +19,6 @@ from obsynth.designs.interval.decoupling import (
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.designs.interval.rows import (
     Part,
-    Precision,
     Rows,
     estimate_rows,
     first_rows,
@@ -46,11 +45,10 @@ NEGATIVE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class IntervalDesign(Record):
+class IntervalDesign(Design):
     """Everything that is deployed and proved.
 
     nominal: the A around which the paper's bound is taken
-    precision: in which the step may be evaluated
     error, width: e* and w*: steady bounds of the errors and widths of r; empty before they are
         known
     options: the options of the method, as given
@@ -63,7 +61,6 @@ class IntervalDesign(Record):
     L: Annotated[FloatArray, "n-n_f-q m-n_f-q"]
     bound: Bound
     contraction: bool
-    precision: Precision
     error: Annotated[FloatArray, "n-n_f-q"]
     width: Annotated[FloatArray, "n-n_f-q"]
     options: Mapping[str, Any]

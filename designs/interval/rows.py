@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from obsynth.derive.rigour import UNIT, Exact, above, exact, image, magnitude, negative, positive
+from obsynth.designs.core.record import Precision
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.interval.decoupling import Decoupled
 from obsynth.designs.interval.model import IntervalModel
 from obsynth.symbolic.arrays import FloatArray
 
-Precision = Literal["double", "single"]
 SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120}
 """Above what many underflows of a sum can cost."""
 

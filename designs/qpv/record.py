@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.derive.forms.qpv.form import QPVLayout, QPVVertices
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_kept
 from obsynth.designs.qpv.lmis import PolyaTerm, collapsed_terms, polya_terms
 from obsynth.designs.qpv.polytopes import Shape
@@ -125,7 +125,7 @@ class NoiseBound(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class QPVDesign(Record):
+class QPVDesign(Design):
     """Everything that is deployed and proved, in doubles; states of the form are states, faults.
 
     plant: the continuous plant

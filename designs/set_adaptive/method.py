@@ -76,12 +76,10 @@ class SetAdaptiveObserver(Method):
     window : float, optional
         Time constant in seconds of the monitors (13); all time by default.
     robust : bool
-        Design a `FilterBank` with the options ``filters``, ``region``, ``Ts`` and ``precision``
-        instead; it has none of the others.
+        Design a `FilterBank` with the options ``filters``, ``region`` and ``Ts`` instead; it has
+        none of the others.
     filters, region
         Of the `FilterBank`.
-    precision : {"double", "single"}
-        In which the step runs: what its rounding may do is added to the bounds.
     form : {"corrected", "printed"}
         ``"printed"``: the printed gain condition, law and bounds.
     coordinates : None, "auto" or array_like of shape (n, n)
@@ -128,6 +126,7 @@ class SetAdaptiveObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
+        single=True,
         shared=MONITORS,
         ode=build_ode,
         step_covered=True,
@@ -142,7 +141,6 @@ class SetAdaptiveObserver(Method):
     robust: bool = False
     filters: Annotated[tuple[float, ...], POSITIVE] = FilterBank.filters
     region: tuple[tuple[float, float], ...] | None = None
-    precision: Literal["double", "single"] = "double"
     form: Literal["corrected", "printed"] = "corrected"
     coordinates: Literal["auto"] | tuple[tuple[float, ...], ...] | None = None
 
@@ -172,7 +170,7 @@ class SetAdaptiveObserver(Method):
     def _design(self, model: Plant | Split, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer, or that of the bank."""
         if self.robust:
-            own = (self.filters, self.region, self.Ts, self.precision)
+            own = (self.filters, self.region, self.Ts)
             return FilterBank(*own, **self.watched).design(model)
         return super()._design(model, bounds)
 
@@ -303,7 +301,6 @@ class SetAdaptiveObserver(Method):
             law=self.law,
             fault_outputs=np.array(outputs),
             window=self.window,
-            precision=self.precision,
             coordinates=coordinates,
             options=self.settling(_SETTLED / min(alpha_step, float(adaptation.min())), Ts),
         )

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import allowance
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.designs.set_adaptive.bounds import EndBounds
 from obsynth.designs.set_adaptive.coordinates import Coordinates, Frame, build_frame
 from obsynth.symbolic import Plant
@@ -55,7 +55,7 @@ class System(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class SetDesign(System):
+class SetDesign(System, Design):
     """Everything that is deployed and proved of the set adaptive observer.
 
     Ts: sample time of the step
@@ -66,7 +66,6 @@ class SetDesign(System):
     alpha, alpha_step: decay of the continuous form and of the step
     fault_outputs: the output that adapts each fault
     window: time constant of the monitors in seconds, None for all time
-    precision: in which the step runs
     coordinates: z = S x in which the bounds move, None for x itself; L is the gain in them
     options: the options of the method, as given
     """
@@ -85,7 +84,6 @@ class SetDesign(System):
     law: Literal["cooperative", "printed"]
     fault_outputs: Annotated[IntArray, "n_f"]
     window: float | None
-    precision: Literal["double", "single"]
     coordinates: Coordinates | None
     options: Mapping[str, Any]
 

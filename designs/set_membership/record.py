@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design
 from obsynth.designs.general.record import GeneralDesign, PeakBound
 from obsynth.designs.set_membership.zonotope import Frame
 from obsynth.symbolic import Plant
@@ -18,7 +18,7 @@ MOST_COLUMNS = 400
 
 
 @dataclass(frozen=True, eq=False)
-class SetMembershipDesign(Record):
+class SetMembershipDesign(Design):
     """Everything that is deployed and proved.
 
     plant: the discrete plant

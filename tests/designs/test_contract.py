@@ -17,7 +17,7 @@ import obsynth as ob
 from methods import METHODS, observer_of, run_of, simulated
 from obsynth.codegen import find_compiler
 from obsynth.designs.core.certificate import Certificate, Claim
-from obsynth.designs.core.errors import DetectorError
+from obsynth.designs.core.errors import CertificateError, DetectorError
 from obsynth.designs.core.files import CLAIMS
 from obsynth.designs.core.method import CONTRACTS, VERSION
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
@@ -93,6 +93,27 @@ def test_the_table_holds_every_method():
 
 
 # -- design and refusals -----------------------------------------------------------------------
+
+
+def test_the_precision_is_an_option_that_a_design_stores(entry, observer):
+    """Mutants: another word passes; a file may claim what its method does not prove."""
+    design = observer.certificate.design
+    assert observer.precision == design.precision == "double"
+    assert contract_of(observer).guard(design).precision == "double"
+    with pytest.raises(ob.ObsynthError, match=r"precision is 'half'"):
+        replace(entry.method, precision="half")
+    record = json.loads(json.dumps(observer.record))
+    record["options"]["precision"] = "half"
+    with pytest.raises(CertificateError, match="'double', 'single'"):
+        contract_of(observer).certify(read(observer, record), "lmi")
+    if contract_of(observer).single:
+        assert replace(entry.method, precision="single").precision == "single"
+        return
+    with pytest.raises(ob.ObsynthError, match=r"precision='single'.* take precision='double'"):
+        replace(entry.method, precision="single")
+    record["options"]["precision"] = "single"
+    with pytest.raises(CertificateError, match="take precision='double'"):
+        contract_of(observer).certify(read(observer, record), "lmi")
 
 
 def test_a_design_has_a_checked_certificate(entry, monkeypatch):

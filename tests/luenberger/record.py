@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from luenberger.model import LuenbergerModel
-from obsynth.designs.core.record import Record
+from obsynth.designs.core.record import Design, Record
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -21,7 +21,7 @@ class Comparison(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class LuenbergerDesign(Record):
+class LuenbergerDesign(Design):
     """Everything that is deployed and proved.
 
     closed, missing: with a measurement and without

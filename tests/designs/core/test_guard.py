@@ -1,5 +1,7 @@
 """The guard over a core without sets: what is void, forgotten, left out, and returned."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -325,7 +327,7 @@ def test_first_boxes_are_stored_outside_of_what_is_given(precision):
     """In numbers of the precision. Mutant: the box as it is, which single precision rounds."""
     kind = np.float32 if precision == "single" else np.float64
     watch = Watch.of({"horizon": 30, "recovery": 1, "cuts": None})
-    guard = Guard(drifting(), {}, watch, 0, 1.0, precision)
+    guard = Guard(drifting(), {}, replace(watch, precision=precision), 0, 1.0)
     box = np.array([[0.1, 0.3], [-0.7, -0.1]])
     parts = guard.first({}, box, np.zeros((0, 2)))
     for end in ("", YOUNG):

@@ -58,9 +58,10 @@ class Calls:
         self, core, plant=None, delay=0, cuts=None, horizon=HORIZON, shared=(), precision="double"
     ):
         self.plant = tank() if plant is None else plant
-        watch = Watch.of({"horizon": horizon, "recovery": 2, "cuts": cuts})
+        given = {"horizon": horizon, "recovery": 2, "cuts": cuts, "precision": precision}
+        watch = Watch.of(given)
         sizes = {"count": 1, **dict.fromkeys(shared, 1)}
-        self.guard = Guard(self.plant, sizes, watch, delay, 1.0, precision, shared)
+        self.guard = Guard(self.plant, sizes, watch, delay, 1.0, shared)
         self.step = Step(self.guard, core).build()
         self.layout = self.guard.layout()
         parts = self.guard.first({"count": [0.0]}, self.plant.box("x"), self.plant.box("f"))

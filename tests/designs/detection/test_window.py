@@ -27,7 +27,8 @@ def window_of(plant, m, delay, moving=True):
     """The window of an observer of which nothing is known but its plant."""
     inputs = 3 + any(s.measured for s in plant.rho)
     parts = {"fault_delay": delay, "ode": None if moving else "not discrete", "half_widths": None}
-    observer = SimpleNamespace(model=plant, step=SimpleNamespace(n_in=lambda: inputs), **parts)
+    step = SimpleNamespace(n_in=lambda: inputs)
+    observer = SimpleNamespace(model=plant, step=step, precision="double", **parts)
     return Window(observer, m)
 
 

@@ -109,7 +109,7 @@ def test_steady_widths_do_not_depend_on_the_sign_of_a_coupling():
 
 def test_what_rounding_may_do_counts_with_the_largest_states(stored):
     """In single precision it is seen. Mutants: the smallest ones, the rounding left out."""
-    single = replace(stored, precision="single")
+    single = replace(stored, options={**stored.options, "precision": "single"})
     widths = 2.0 * steady_half_widths(single)[0]
     for k, i in enumerate(stored.outputs.tolist()):
         noise = np.diff(stored.noise[k])[0] / stored.scale[k]
