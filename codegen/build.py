@@ -55,7 +55,7 @@ class Comparison:
     vectors : int
         Number of steps.
     values : int
-        Number of doubles and statuses, each equal to the last bit.
+        Number of numbers and statuses, each equal to the last bit.
     """
 
     vectors: int
@@ -205,7 +205,7 @@ def _read(output: str, name: str) -> Comparison:
     if found is None:
         raise BuildError(f"the test of {name} does not say what differs:\n{output}", output=output)
     raise ComparisonError(
-        f"{name}: the compiled step differs from CasADi's virtual machine in {differing} of"
+        f"{name}: the compiled step differs from its vectors in {differing} of"
         f" {vectors} steps. First difference: vector {found['vector']} (line {found['line']} of"
         f" tests/vectors.txt), output {found['output']}: expected {found['expected']}"
         f" {found['expected_value']}, computed {found['computed']} {found['computed_value']}."

@@ -6,12 +6,12 @@ import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import (
+    DOUBLE,
     LIBRARY,
     OPERATIONS,
     RESULTS,
     STEP_INPUTS,
     Kernel,
-    c_number,
     counted,
     scalar_function,
 )
@@ -44,7 +44,7 @@ def _surprise(what: str) -> CodegenError:
 
 
 def _shortest(literal: re.Match[str]) -> str:
-    return c_number(float(literal[0]))
+    return DOUBLE.number(float(literal[0]))
 
 
 def generate_kernel(step: ca.Function, prefix: str) -> Kernel:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.kernel import STEP_INPUTS, Machine
+from obsynth.codegen.kernel import DOUBLE, REALS, STEP_INPUTS, Machine, Real
 from obsynth.designs.core.files import stored_text
 from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -109,6 +109,7 @@ class Description:
     design_hash: SHA-256 of the record of the design, with those options
     claims: names of what is proved: loading a design proves less than designing it
     certificate_hash: SHA-256 of its claims, without margins, whose last digits are the machine's
+    real: the type that the step computes in
     """
 
     name: str
@@ -128,6 +129,7 @@ class Description:
     design_hash: str
     certificate_hash: str
     claims: tuple[str, ...]
+    real: Real
 
     @property
     def further(self) -> list[tuple[str, int]]:
@@ -158,7 +160,10 @@ class Description:
 
 
 def describe(
-    observer: Observer | FaultDetector, name: str | None = None, memory: FloatArray | None = None
+    observer: Observer | FaultDetector,
+    name: str | None = None,
+    memory: FloatArray | None = None,
+    precision: str | None = None,
 ) -> Description:
     """Check that an observer can ship and collect what its C project says of it.
 
@@ -183,8 +188,9 @@ def describe(
     n_memory = fields[-1].start + fields[-1].size
     scheduling = _scheduling(observer.step, model)
     _check_step(observer.step, model, n_memory, len(scheduling))
-    start = _start(observer, memory, n_memory)
     inner, options = _taken_apart(observer)
+    real = _real(inner, precision)
+    start = np.array([real.rounded(v) for v in _start(observer, memory, n_memory).tolist()])
     _check_not_initialised(observer)
     return Description(
         name=chosen,
@@ -206,7 +212,22 @@ def describe(
             {"claims": [[c.name, c.statement, c.holds] for c in inner.certificate]}
         ),
         claims=tuple(claim.name for claim in inner.certificate),
+        real=real,
     )
+
+
+def _real(observer: Observer, precision: str | None) -> Real:
+    """Return the type of a step: the design's, or double, which never rounds more."""
+    designed = observer.precision
+    real = REALS[designed if precision is None else precision]
+    if real is not DOUBLE and real.precision != designed:
+        raise CodegenError(
+            f"precision={precision!r}, but {observer.method} was designed for {designed} precision,"
+            f" and its bounds do not count what rounding adds in {precision}: design it with"
+            f" precision={precision!r}",
+            precision=precision,
+        )
+    return real
 
 
 def _taken_apart(observer: Observer | FaultDetector) -> tuple[Observer, dict[str, Any]]:

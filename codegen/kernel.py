@@ -1,9 +1,9 @@
-"""The arithmetic of one step: what both writers share, and CasADi's virtual machine."""
+"""The arithmetic of one step: its type, what both writers share, and CasADi's virtual machine."""
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -26,9 +26,10 @@ _C99_TEXT = """
 LIBRARY = frozenset(_C99_TEXT.split())
 """What C99 has of CasADi's functions, under the same names."""
 
-_EXACT = frozenset({"ceil", "copysign", "fabs", "floor", "fmax", "fmin", "fmod", "remainder"}) | {
+EXACT = frozenset({"ceil", "copysign", "fabs", "floor", "fmax", "fmin", "fmod", "remainder"}) | {
     "sqrt"
 }
+"""What of it IEEE 754 defines to the last bit."""
 
 OPERATIONS = {
     getattr(ca, name): name.removeprefix("OP_").lower()
@@ -49,6 +50,7 @@ class Kernel:
     arguments: what it reads and writes: some of ``memory, u, y, theta, next, xhat, ...``, or of
         ``state, in, out``
     library: what it calls from ``math.h``, sorted
+    own: functions beyond those of IEEE 754 that are written out, with their units in the last place
     operations: instructions of the CasADi function, a measure of its length
     counts: how often it does what, by CasADi's names of operations
     """
@@ -59,11 +61,13 @@ class Kernel:
     library: tuple[str, ...]
     operations: int
     counts: Mapping[str, int]
+    own: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def inexact(self) -> tuple[str, ...]:
         """What of the library IEEE 754 does not define to the last bit: libraries differ there."""
-        return tuple(name for name in self.library if name not in _EXACT)
+        exact = EXACT | {f"{name}f" for name in EXACT}
+        return tuple(name for name in self.library if name not in exact)
 
 
 def counted(operations: Iterable[str]) -> dict[str, int]:
@@ -100,21 +104,48 @@ def scalar_function(step: ca.Function) -> ca.Function:
     return ca.Function(step.name(), inputs, outputs)
 
 
-def c_number(value: float) -> str:
-    """Return the shortest C literal of type double that is read back as the same number."""
-    if math.isnan(value):
-        return "NAN"
-    if math.isinf(value):
-        return "INFINITY" if value > 0 else "-INFINITY"
-    return repr(float(value))
+@dataclass(frozen=True)
+class Real:
+    """The type that a step computes in: its name in C, its length, what its literals end with."""
+
+    precision: str
+    c: str
+    bits: int
+    suffix: str
+    type: type[np.floating[Any]]
+
+    def rounded(self, value: float) -> float:
+        """Return the number of the type that is next to a constant, or refuse the constant."""
+        with np.errstate(over="ignore"):
+            near = float(self.type(value))
+        if math.isinf(near) > math.isinf(value) or (near == 0.0) > (value == 0.0):
+            raise CodegenError(
+                f"the step holds the number {value!r}, which {self.precision} precision takes for"
+                f" {near!r}: design and generate the observer with precision='double'",
+                number=value,
+            )
+        return near
+
+    def number(self, value: float) -> str:
+        """Return the shortest literal of the type that is read back as the same number."""
+        if math.isnan(value):
+            return "NAN"
+        if math.isinf(value):
+            return "INFINITY" if value > 0 else "-INFINITY"
+        return f"{self.type(value)!s}{self.suffix}"
+
+    def literal(self, value: float, name: str) -> str:
+        """Return a constant as an operand of a C type; infinity and NaN of C are float."""
+        text = self.number(value)
+        if math.isfinite(value):
+            return text
+        return f"-({name}){text[1:]}" if text[0] == "-" else f"({name}){text}"
 
 
-def c_literal(value: float, real: str) -> str:
-    """Return a constant as an operand of a C type; infinity and NaN of C are float."""
-    text = c_number(value)
-    if math.isfinite(value):
-        return text
-    return f"-({real}){text[1:]}" if text[0] == "-" else f"({real}){text}"
+DOUBLE = Real("double", "double", 64, "", np.float64)
+SINGLE = Real("single", "float", 32, "f", np.float32)
+REALS: Mapping[str, Real] = {real.precision: real for real in (DOUBLE, SINGLE)}
+"""Types that a step can compute in, by precision."""
 
 
 class Machine:

@@ -16,7 +16,7 @@ from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
-from obsynth.codegen.kernel import Kernel
+from obsynth.codegen.kernel import DOUBLE, REALS, Kernel
 from obsynth.codegen.render import render
 from obsynth.codegen.tape import write_tape
 from obsynth.codegen.vectors import Vectors, make_vectors
@@ -24,7 +24,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
 
-PRECISIONS = ("double",)
+PRECISIONS = tuple(REALS)
 """Precisions that a project can be generated for."""
 
 BACKENDS = ("casadi", "tape")
@@ -107,8 +107,8 @@ def generate_c(
     observer: Observer | FaultDetector,
     folder: str | os.PathLike[str],
     name: str | None = None,
-    precision: Literal["double"] = "double",
-    backend: Literal["casadi", "tape"] = "casadi",
+    precision: Literal["double", "single"] | None = None,
+    backend: Literal["casadi", "tape"] | None = None,
     vectors: int = 10_000,
     seed: int = 0,
     overwrite: bool = False,
@@ -129,10 +129,13 @@ def generate_c(
         Where the project shall be. It appears there only when it is complete and compared.
     name : str, optional
         Prefix of every C name; made from the plant's name by default.
-    precision : {"double"}
-    backend : {"casadi", "tape"}
-        Who writes the kernel: CasADi's code generation, or our own from the instructions of the
-        same function, shorter and quicker. Interface and results are the same to the last bit.
+    precision : {"double", "single"}, optional
+        Type of all numbers, ``double`` or ``float``; that of the design by default. An observer
+        has to be designed for single precision, whose rounding its bounds then count.
+    backend : {"casadi", "tape"}, optional
+        Who writes the kernel: CasADi's code generation (default in double precision), or our own
+        from the instructions of the same function, shorter and quicker (the only one in single
+        precision). Interface and results are the same to the last bit.
     vectors : int
         Number of recorded steps, at least 100.
     seed : int
@@ -155,23 +158,32 @@ def generate_c(
     BuildError
         If the compiler rejects the code.
     ComparisonError
-        If the compiled step differs from CasADi's virtual machine in any bit.
+        If the compiled step differs in any bit from CasADi's virtual machine, or, in single
+        precision, from its instructions in NumPy's float32.
 
     Examples
     --------
-    >>> generate_c(None, folder="tank", precision="single")
+    >>> generate_c(None, folder="tank", precision="float")
     Traceback (most recent call last):
     ...
-    obsynth.codegen.errors.CodegenError: precision='single' is not available; available: 'double'
+    obsynth.codegen.errors.CodegenError: precision='float' is not available; available: 'double', \
+'single'
     """
-    _available("precision", precision, PRECISIONS)
-    _available("backend", backend, BACKENDS)
+    _available("precision", precision, (*PRECISIONS, None))
+    _available("backend", backend, (*BACKENDS, None))
     count, start = _whole("vectors", vectors), _whole("seed", seed)
     if start < 0:
         raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
-    description = describe(observer, name, memory)
-    if backend == "tape":
-        kernel = write_tape(observer.step, description.name, description.place)
+    description = describe(observer, name, memory, precision)
+    real = description.real
+    if backend == "casadi" and real is not DOUBLE:
+        raise CodegenError(
+            f"backend='casadi' computes with constants of double, not in {real.precision} precision"
+            " (which the design has): say backend='tape', or precision='double'",
+            backend=backend,
+        )
+    if backend == "tape" or real is not DOUBLE:
+        kernel = write_tape(observer.step, description.name, description.place, real)
     else:
         kernel = generate_kernel(observer.step, description.name)
     recorded = make_vectors(description, count, start)
@@ -215,12 +227,13 @@ def _compared(
     return build, comparison
 
 
-def _available(option: str, value: str, values: tuple[str, ...]) -> None:
+def _available(option: str, value: str | None, values: tuple[str | None, ...]) -> None:
     if value not in values:
+        known = tuple(name for name in values if name is not None)
         raise CodegenError(
-            f"{option}={value!r} is not available; available: {', '.join(map(repr, values))}",
+            f"{option}={value!r} is not available; available: {', '.join(map(repr, known))}",
             option=option,
-            available=values,
+            available=known,
         )
 
 
@@ -250,7 +263,7 @@ def _manifest(
         "design": {"sha256": description.design_hash, "detector": dict(description.detector)},
         "certificate": {"sha256": description.certificate_hash, "claims": list(description.claims)},
         "method": observer.method,
-        "precision": PRECISIONS[0],
+        "precision": description.real.precision,
         "backend": kernel.backend,
         "sample_time": description.sample_time,
         "fault_delay": observer.fault_delay,
@@ -267,6 +280,7 @@ def _manifest(
         "operation_counts": dict(kernel.counts),
         "library_functions": list(kernel.library),
         "not_defined_to_the_last_bit": list(kernel.inexact),
+        "own_functions_within_ulps": dict(kernel.own),
         "vectors": {
             "count": vectors.count,
             "seed": seed,

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
-from obsynth.codegen.kernel import Kernel, Machine, c_literal, c_number
+from obsynth.codegen.kernel import Kernel, Machine, Real
 from obsynth.codegen.vectors import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
@@ -44,7 +44,7 @@ def generator_name() -> str:
     return f"obsynth {version('obsynth')}"
 
 
-def _example(description: Description) -> list[tuple[str, str, str]]:
+def _example(description: Description) -> list[tuple[str, ...]]:
     """Return u, y and theta of a plant that starts in its nominal state."""
     model = description.observer.model
     plant = Machine(model.function())
@@ -56,14 +56,15 @@ def _example(description: Description) -> list[tuple[str, str, str]]:
     rows = []
     for _ in range(_EXAMPLE_STEPS):
         following, y = plant(x, u, d, np.zeros(len(model.f)), w, p, rho)
-        rows.append((_row(u), _row(y), _row(theta)))
+        rows.append(tuple(_row(values, description.real) for values in (u, y, theta)))
         x = following
     return rows
 
 
-def _row(values: FloatArray) -> str:
+def _row(values: FloatArray, real: Real) -> str:
     # Six digits serve an example; a plant that diverges must not break its C.
-    return ", ".join(c_number(float(f"{v:.6g}") if math.isfinite(v) else 0.0) for v in values)
+    known = np.abs(values) <= np.finfo(real.type).max
+    return ", ".join(real.number(float(f"{v:.6g}")) for v in np.where(known, values, 0.0))
 
 
 def _listed(ports: tuple[Port, ...]) -> str:
@@ -84,12 +85,12 @@ def render(
         keep_trailing_newline=True,
         autoescape=False,
     )
-    environment.filters["number"] = c_number
-    environment.filters["constant"] = lambda value: c_literal(value, f"{description.name}_real_t")
+    real, name = description.real, description.name
+    environment.filters["number"] = real.number
+    environment.filters["constant"] = lambda value: real.literal(value, f"{name}_real_t")
     environment.filters["comment"] = c_comment
     environment.filters["cell"] = lambda text: " ".join(text.replace("|", "\\|").split())
     values = _values(description, kernel, vectors, start_given)
-    name = description.name
     templates = {
         f"include/{name}.h": "header.h.j2",
         f"src/{name}.c": "source.c.j2",
@@ -150,6 +151,10 @@ def _values(
         "start_given": start_given,
         "start_guess": [] if start_given else list(zip(description.x, start, strict=True)),
         "kernel": kernel,
+        "real": description.real,
+        "machine": f"instructions in NumPy's float{description.real.bits}"
+        if description.real.bits == 32
+        else "CasADi's virtual machine",
         "call": ",\n        ".join(
             _ARGUMENTS.get(name, f"result.{name}") for name in kernel.arguments
         ),

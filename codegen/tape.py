@@ -10,6 +10,8 @@ What runs is what CasADi's virtual machine runs, to the last bit but for which N
 - Comparisons are int; as factors of positive constants they choose the constant or zero.
 - All inputs are read before a result is written, so that states and structs may overlap.
 - Beyond some thousand statements there are several functions, see `parts`.
+- In single precision constants are rounded to the nearest, literals and functions are those of
+  float, and functions that IEEE 754 does not define are our own, see `functions`.
 - A product is never written into the expression of a sum: what a compiler may fuse by C's rules
   is not there.
 """
@@ -20,13 +22,16 @@ from dataclasses import dataclass
 import casadi as ca
 
 from obsynth.codegen.errors import CodegenError
+from obsynth.codegen.functions import ULPS, own_function
 from obsynth.codegen.kernel import (
+    DOUBLE,
+    EXACT,
     LIBRARY,
     OPERATIONS,
     RESULTS,
     STEP_INPUTS,
     Kernel,
-    c_literal,
+    Real,
     counted,
     scalar_function,
 )
@@ -75,7 +80,8 @@ class _Value:
 class _Reader:
     """The values of a function, equal ones once."""
 
-    def __init__(self, function: ca.Function) -> None:
+    def __init__(self, function: ca.Function, real: Real) -> None:
+        self.real = real
         self.values: dict[tuple[object, ...], _Value] = {}
         self.results: list[tuple[int, int, _Value]] = []
         work: dict[int, _Value] = {}
@@ -96,7 +102,7 @@ class _Reader:
 
     def constant(self, number: float) -> _Value:
         """Return a constant."""
-        return self._value("const", (), number=number)
+        return self._value("const", (), number=self.real.rounded(number))
 
     def _operation(self, name: str, args: tuple[_Value, ...]) -> _Value:
         if name == "add":
@@ -114,6 +120,12 @@ class _Reader:
                 f"the step uses the operation {name!r} of CasADi, which C99 does not have: write"
                 " the equations without it",
                 symbol=name,
+            )
+        if self.real is not DOUBLE and _CALLED.get(name, "sqrt") not in {*EXACT, *ULPS}:
+            raise CodegenError(
+                f"the step uses {_CALLED[name]!r}, which has no form in {self.real.precision}"
+                " precision: write the equations without it, or design with precision='double'",
+                symbol=_CALLED[name],
             )
         return self._value(name, args)
 
@@ -188,10 +200,11 @@ def _seen(value: _Value) -> list[bool]:
 class _Writer:
     """C text of values."""
 
-    def __init__(self, real: str) -> None:
-        self.real = real
+    def __init__(self, prefix: str, real: Real) -> None:
+        self.prefix, self.type, self.real = prefix, real, f"{prefix}_real_t"
         self.lines: list[str] = []
         self.library: set[str] = set()
+        self.own: set[str] = set()
         self.count = 0
 
     def write(self, values: Sequence[_Value], places: Mapping[tuple[int, int], str]) -> None:
@@ -216,7 +229,7 @@ class _Writer:
 
     def literal(self, number: float) -> str:
         """Return a constant of the type."""
-        return c_literal(number, self.real)
+        return self.type.literal(number, self.real)
 
     def result(self, value: _Value) -> str:
         """Return a value as a number that is assigned."""
@@ -254,8 +267,7 @@ class _Writer:
             text = f"{self._condition(args[0])} ? {then} : {other}"
             return f"({text}) + {self.literal(0.0)}" if value.signed and value.minus else text
         if name in _CALLED:
-            self.library.add(_CALLED[name])
-            return f"{_CALLED[name]}({', '.join(map(self.result, args))})"
+            return f"{self._called(_CALLED[name])}({', '.join(map(self.result, args))})"
         numbers = [self._number(argument) for argument in args]
         if name in {"fmax", "fmin"}:
             return self._extreme(value, *numbers)
@@ -267,6 +279,13 @@ class _Writer:
             "sign": lambda: self._sign(numbers[0]),
         }
         return written[name]() if name in written else f" {_INFIX[name]} ".join(numbers)
+
+    def _called(self, name: str) -> str:
+        if self.type is DOUBLE or name in EXACT:
+            self.library.add(name + self.type.suffix)
+            return name + self.type.suffix
+        self.own.add(name)
+        return f"{self.prefix}_{name}"
 
     def _extreme(self, value: _Value, x: str, y: str) -> str:
         """Return the larger or smaller of two: the first where they are equal, no NaN if one is."""
@@ -293,17 +312,17 @@ def write_tape(
     step: ca.Function,
     prefix: str,
     places: Callable[[str, int], str] = lambda port, i: f"{port}[{i}]",
+    real: Real = DOUBLE,
 ) -> Kernel:
     """Write the arithmetic of a step as one static C function of its structs.
 
     places: how entry i of ``memory, u, y, theta, next, xhat, ...`` is called in C
     """
     function = scalar_function(step)
-    reader = _Reader(function)
+    reader = _Reader(function, real)
     values = reader.used()
-    real = f"{prefix}_real_t"
     inputs = [value.place for value in values if value.name == "input"]
-    writer = _Writer(real)
+    writer = _Writer(prefix, real)
     writer.write(values, {(k, i): places(STEP_INPUTS[k], i) for k, i in inputs})
     status = RESULTS.index("status")
     told = [(k, i, value) for k, i, value in reader.results if k != status]
@@ -315,15 +334,32 @@ def write_tape(
     )
     if not any(STEP_INPUTS[k] != "memory" for k, _ in inputs):
         lines = [*lines[:-1], "(void)in;", lines[-1]]
-    body = "\n".join(f"    {line}".rstrip() for line in lines)
     head = f"{prefix}_state_t *state, const {prefix}_in_t *in, {prefix}_out_t *out"
+    kernel = _function(f"{writer.real} {prefix}_kernel(\n    {head})", lines)
+    called = [_written(name, writer) for name in sorted(writer.own)]
     return Kernel(
         backend="tape",
-        functions="\n\n".join(
-            [*functions, f"static {real} {prefix}_kernel(\n    {head})\n{{\n{body}\n}}"]
-        ),
+        functions="\n\n".join([*called, *functions, kernel]),
         arguments=("state", "in", "out"),
         library=tuple(sorted(writer.library)),
         operations=int(function.n_instructions()),
         counts=counted(value.name for value in values),
+        own={name: ULPS[name] for name in sorted(writer.own)},
     )
+
+
+def _function(head: str, lines: Sequence[str]) -> str:
+    body = "\n".join(f"    {line}".rstrip() for line in lines)
+    return f"static {head}\n{{\n{body}\n}}"
+
+
+def _written(name: str, caller: _Writer) -> str:
+    """Write a function of our own; what it calls of the library is added to the caller's."""
+    reader = _Reader(own_function(name), caller.type)
+    values, writer = reader.used(), _Writer(caller.prefix, caller.type)
+    writer.write(values, {(k, 0): "xy"[k] for k in range(2)})
+    caller.library |= writer.library
+    arguments = ", ".join(f"{writer.real} {'xy'[k]}" for k in range(own_function(name).n_in()))
+    result = writer.result(reader.results[0][-1])
+    head = f"{writer.real} {caller.prefix}_{name}({arguments})"
+    return _function(head, [*writer.lines, f"return {result};"])

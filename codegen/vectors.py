@@ -1,8 +1,7 @@
-"""Test vectors: what CasADi's virtual machine returns for the step, bit by bit."""
+"""Test vectors: what CasADi's virtual machine, or one in single precision, returns, bit by bit."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,7 +11,8 @@ import numpy as np
 
 from obsynth.codegen.description import Description, midpoints, nominal_values
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.kernel import Machine
+from obsynth.codegen.kernel import DOUBLE, SINGLE, Machine
+from obsynth.codegen.single import machine_of
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
@@ -34,23 +34,19 @@ _SMALL = 0.01
 _SEQUENCE = 250
 _ALL_BITS = sum(STATUS.values())
 _STATUS = STEP_OUTPUTS.index("status")
-_EXTREMES = np.array(
-    [
-        0.0,
-        -0.0,
-        5e-324,
-        -2.2250738585072014e-308,
-        1e-160,
-        1e160,
-        -1e300,
-        1.0000000000000002e300,
-        sys.float_info.max,
-        -sys.float_info.max,
-        np.inf,
-        -np.inf,
-        np.nan,
-    ]
-)
+_EXTREMES: Mapping[str, FloatArray] = {
+    real.precision: np.array(
+        [
+            *(0.0, -0.0, float(info.smallest_subnormal), -float(info.tiny), *small, *large),
+            *(float(info.max), -float(info.max), np.inf, -np.inf, np.nan),
+        ]
+    )
+    for real, small, large in (
+        (DOUBLE, (1e-160, 1e160), (-1e300, 1.0000000000000002e300)),
+        (SINGLE, (1e-20, 1e20), (-1e35, 1e35)),
+    )
+    for info in [np.finfo(real.type)]
+}
 
 
 @dataclass(frozen=True)
@@ -72,24 +68,25 @@ class Vectors:
 
 
 def bits(values: FloatArray) -> str:
-    """Return doubles as IEEE 754 bit patterns in hexadecimal, without trailing zeros.
+    """Return numbers of a type as bit patterns in hexadecimal, without trailing zeros.
 
     Every NaN is written as the same one: which of the NaNs an operation returns is not
     defined, neither by IEEE 754 nor by C.
     """
-    flat = np.array(values, dtype=float).ravel()
+    flat = np.array(values).ravel()
     flat[np.isnan(flat)] = np.nan
-    text = flat.astype(">f8").tobytes().hex()
-    return " ".join(text[i : i + 16].rstrip("0") or "0" for i in range(0, len(text), 16))
+    text, digits = flat.astype(flat.dtype.newbyteorder(">")).tobytes().hex(), 2 * flat.itemsize
+    return " ".join(text[i : i + digits].rstrip("0") or "0" for i in range(0, len(text), digits))
 
 
 class _Recorder:
     """The state of a C program that runs through the vectors, kept by the virtual machine."""
 
     def __init__(self, description: Description) -> None:
-        self._step = Machine(description.observer.step)
-        self._start = description.start
-        self._zeros = np.zeros_like(description.start)
+        self._type = description.real.type
+        self._step = machine_of(description.observer.step, description.real)
+        self._start = description.start.astype(self._type)
+        self._zeros = np.zeros_like(self._start)
         self.memory = self._zeros
         self.lines: list[str] = []
         self.statuses: Counter[int] = Counter()
@@ -108,12 +105,15 @@ class _Recorder:
         self._set("M", memory)
 
     def _set(self, letter: str, memory: FloatArray) -> None:
-        self.memory = memory.copy()
-        self.lines.append(f"{letter} {bits(memory)}")
+        with np.errstate(over="ignore"):
+            self.memory = memory.astype(self._type)
+        self.lines.append(f"{letter} {bits(self.memory)}")
         self.values += memory.size
 
     def step(self, inputs: list[FloatArray]) -> None:
         """Record one step with u, y and theta where there is one; carry the memory along."""
+        with np.errstate(over="ignore"):
+            inputs = [values.astype(self._type) for values in inputs]
         arrays = self._step(self.memory, *inputs)
         status = float(arrays.pop(_STATUS)[0])
         if not (status.is_integer() and 0 <= status <= _ALL_BITS):
@@ -153,7 +153,7 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
     for kind, failing in (("closed loop", False), ("closed loop with failing signals", True)):
         for length in _lengths(kinds[kind]):
             _follow(recorder, drive, length, failing)
-            visited.append(recorder.memory)
+            visited.append(recorder.memory.astype(float))
     scale = _scale(visited)
     for i in range(kinds["random"]):
         recorder.load(random_memory(rng, visited[i % len(visited)], scale))
@@ -164,7 +164,7 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
         if i % 2:
             memory = random_memory(rng, memory, scale)
         # Extremes in the memory would hide those in the inputs: a step must cope with either.
-        _spoil(rng, [memory] if i % 3 == 0 else inputs)
+        _spoil(drive, [memory] if i % 3 == 0 else inputs)
         recorder.load(memory)
         recorder.step(inputs)
     for length in _lengths(kinds["not initialised"], 4):
@@ -203,16 +203,17 @@ def _follow(recorder: _Recorder, drive: Drive, length: int, failing: bool) -> No
         inputs = drive.sample(k)
         # Whole stretches fail, so that what follows a failure is tested too.
         if failing and k % 25 in (7, 8, 9, 20):
-            _spoil(drive.rng, inputs)
+            _spoil(drive, inputs)
         recorder.step(inputs)
 
 
-def _spoil(rng: np.random.Generator, arrays: list[FloatArray]) -> None:
+def _spoil(drive: Drive, arrays: list[FloatArray]) -> None:
     """Replace one to three entries by extreme or non-finite numbers, in place."""
     places = [(array, i) for array in arrays for i in range(array.size)]
+    rng = drive.rng
     for _ in range(rng.integers(1, 4)):
         array, i = places[rng.integers(len(places))]
-        array[i] = rng.choice(_EXTREMES)
+        array[i] = rng.choice(_EXTREMES[drive.precision])
 
 
 def _scale(visited: list[FloatArray]) -> FloatArray:
@@ -242,7 +243,7 @@ class Drive:
 
     def __init__(self, description: Description, rng: np.random.Generator) -> None:
         model = description.observer.model
-        self.rng = rng
+        self.rng, self.precision = rng, description.real.precision
         self._observer = description.observer
         self._plant = Machine(model.function())
         self._slope = Machine(_input_slope(model.function()))

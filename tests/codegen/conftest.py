@@ -66,14 +66,14 @@ class ToyPlant:
         return {"name": self.name, "Ts": self.Ts, "boxes": {"x": [[1.0, 50.0], [1.0, 40.0]]}}
 
 
-def toy_step(n_u: int = 1, n_f: int = 1, **changes: Any) -> ca.Function:
+def toy_step(n_u: int = 1, n_f: int = 1, limit: float = FINITE, **changes: Any) -> ca.Function:
     """Return a step with roots, branches to infinity, a shifted measurement, a flag."""
     memory = ca.SX.sym("memory", 6)
     u, y = ca.SX.sym("u", n_u), ca.SX.sym("y", 2)
     y_last, flag, width, fault, z = memory[0], memory[1], memory[2], memory[3], memory[4:6]
-    finite = ca.if_else(ca.fabs(ca.sum1(u)) <= FINITE, 1, 0)
+    finite = ca.if_else(ca.fabs(ca.sum1(u)) <= limit, 1, 0)
     for i in range(2):
-        finite = ca.logic_and(finite, ca.fabs(y[i]) <= FINITE)
+        finite = ca.logic_and(finite, ca.fabs(y[i]) <= limit)
     innovation = ca.if_else(finite, y - z, 0)
     xhat = z + ca.vertcat(0.6, 0.4) * innovation
     # The last measurement is read after its place in the memory is written: aliasing shows.
@@ -114,6 +114,7 @@ class Toy:
     step: ca.Function = field(default_factory=toy_step)
     model: ToyPlant = field(default_factory=ToyPlant)
     method: str = "toy_observer"
+    precision: str = "double"
     fault_delay: int = 0
     record: Any = field(default_factory=lambda: {"design": 1})
     certificate: tuple[Any, ...] = ()
@@ -145,6 +146,12 @@ def toy() -> Toy:
 @pytest.fixture(scope="session")
 def make_toy() -> Callable[[], Toy]:
     return Toy
+
+
+@pytest.fixture(scope="session")
+def make_single() -> Callable[[], Toy]:
+    """As designed for single precision: limits that are numbers of it."""
+    return lambda: Toy(step=toy_step(limit=1e30), precision="single")
 
 
 @pytest.fixture

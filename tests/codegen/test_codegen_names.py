@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from obsynth.codegen import CodegenError
 from obsynth.codegen.description import c_comment, identifier, project_name, unique
-from obsynth.codegen.kernel import c_number
+from obsynth.codegen.kernel import DOUBLE
 from obsynth.codegen.vectors import bits
 
 C_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*_?")
@@ -79,7 +79,7 @@ def test_a_project_name_that_would_break_the_build_is_refused(name: str, word: s
 def test_bits_and_literals_are_read_back_exactly(value: float) -> None:
     text = bits(np.array([value]))
     (back,) = struct.unpack(">d", bytes.fromhex(text.ljust(16, "0")))
-    literal = c_number(value)
+    literal = DOUBLE.number(value)
     if math.isnan(value):
         assert math.isnan(back)
         assert literal == "NAN"

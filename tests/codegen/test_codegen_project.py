@@ -385,7 +385,8 @@ def test_fast_math_is_refused_by_the_sources(
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        ({"precision": "single"}, "available: 'double'"),
+        ({"precision": "float"}, "available: 'double', 'single'"),
+        ({"precision": "single"}, "design it with precision='single'"),
         ({"backend": "hand"}, "available: 'casadi', 'tape'"),
         ({"vectors": 99}, "at least 100"),
         ({"vectors": 1e3}, "whole number"),

@@ -1,4 +1,4 @@
-"""The tape's C against CasADi's virtual machine, where NaN, infinities and zeros decide."""
+"""The tape's C against its machines, where NaN, infinities and zeros decide; both precisions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ import methods
 from obsynth.codegen import CodegenError, build_and_compare, find_compiler, generate_c
 from obsynth.codegen import parts as parts_module
 from obsynth.codegen.casadi_text import generate_kernel
-from obsynth.codegen.kernel import Machine
+from obsynth.codegen.kernel import DOUBLE, REALS, SINGLE, Real
+from obsynth.codegen.single import machine_of
 from obsynth.codegen.tape import write_tape
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -27,6 +28,7 @@ pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 WARNINGS = ("-Wconversion", "-Wdouble-promotion", "-Wfloat-conversion", "-Wshadow")
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", *WARNINGS)
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 2.5, -0.3, 5e-324, 1e300, np.inf, -np.inf, np.nan]
+BOTH = pytest.mark.parametrize("real", REALS.values(), ids=REALS)
 
 
 def step_of(outputs: ca.SX, x: ca.SX) -> ca.Function:
@@ -42,24 +44,32 @@ def place(port: str, i: int) -> str:
     return f"{struct}->{port.replace('next', 'memory')}[{i}]"
 
 
-def run(step: ca.Function, text: str, rows: np.ndarray, where: Path, *flags: str) -> np.ndarray:
+def run(
+    step: ca.Function,
+    text: str,
+    rows: np.ndarray,
+    where: Path,
+    *flags: str,
+    real: Real = DOUBLE,
+    compiler: str | None = None,
+) -> np.ndarray:
     """Compile a kernel and evaluate it on rows of inputs."""
     n, m = step.numel_in(2), step.numel_out(1)
     where.mkdir(exist_ok=True)
     source, library = where / "k.c", where / "k.so"
     source.write_text(
         f"""#include <math.h>
-typedef double p_real_t;
-typedef struct {{ double memory[1]; }} p_state_t;
-typedef struct {{ double y[{n}]; }} p_in_t;
-typedef struct {{ double xhat[{m}]; }} p_out_t;
+typedef {real.c} p_real_t;
+typedef struct {{ p_real_t memory[1]; }} p_state_t;
+typedef struct {{ p_real_t y[{n}]; }} p_in_t;
+typedef struct {{ p_real_t xhat[{m}]; }} p_out_t;
 int rows(const p_in_t *in, p_out_t *out, int count);
 {text}
 int rows(const p_in_t *in, p_out_t *out, int count)
 {{
-    p_state_t state = {{{{0.0}}}};
+    p_state_t state = {{{{0}}}};
     int k;
-    double status = 0.0;
+    p_real_t status = 0;
     for (k = 0; k < count; ++k) {{
         status += p_kernel(&state, &in[k], &out[k]);
     }}
@@ -67,34 +77,41 @@ int rows(const p_in_t *in, p_out_t *out, int count)
 }}
 """
     )
-    compiler = find_compiler()
-    assert compiler is not None
-    command = [*compiler, *STRICT, *flags, "-shared", "-fPIC", str(source), "-o", str(library)]
+    found = find_compiler() if compiler is None else (compiler,)
+    assert found is not None
+    command = [*found, *STRICT, *flags, "-shared", "-fPIC", str(source), "-o", str(library)]
     done = subprocess.run([*command, "-lm"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    out = np.zeros((len(rows), m))
-    rows = np.ascontiguousarray(rows)
+    out = np.zeros((len(rows), m), real.type)
+    rows = narrowed(rows, real)
     called = ctypes.CDLL(str(library)).rows
     called(ctypes.c_void_p(rows.ctypes.data), ctypes.c_void_p(out.ctypes.data), len(rows))
     return out
 
 
-def virtual(step: ca.Function, rows: np.ndarray) -> np.ndarray:
-    machine = Machine(step)
-    return np.array([machine(np.zeros(1), np.zeros(0), row)[1] for row in rows])
+def narrowed(rows: np.ndarray, real: Real) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(rows, real.type)
+
+
+def virtual(step: ca.Function, rows: np.ndarray, real: Real = DOUBLE) -> np.ndarray:
+    machine = machine_of(step, real)
+    return np.array([machine(np.zeros(1), np.zeros(0), r)[1] for r in narrowed(rows, real)])
 
 
 def differing(one: np.ndarray, other: np.ndarray) -> int:
     """How many numbers differ in a bit; a NaN is a NaN."""
-    same = (one.view(np.uint64) == other.view(np.uint64)) | (np.isnan(one) & np.isnan(other))
+    assert one.dtype == other.dtype
+    places = f"u{one.itemsize}"
+    same = (one.view(places) == other.view(places)) | (np.isnan(one) & np.isnan(other))
     return int((~same).sum())
 
 
-def choices() -> ca.Function:
+def choices(limit: float = 1e90) -> ca.Function:
     """Extremes with a NaN in either operand, both or none, choices of zeros, truth as numbers."""
     y = ca.SX.sym("y", 3)
     a, b, c = y[0], y[1], y[2]
-    some, truth = ca.fabs(a) <= 1e90, a <= b
+    some, truth = ca.fabs(a) <= limit, a <= b
     known = ca.if_else(some, a, 0.1)
     chosen = ca.if_else(truth, a, b)
     outputs = [f(*pair) for f in (ca.fmax, ca.fmin) for pair in ((a, b), (a, 0.0), (-0.0, b))]
@@ -111,13 +128,15 @@ def choices() -> ca.Function:
 ROWS = np.array(list(itertools.product(SPECIAL, repeat=3)))
 
 
-def test_choices_and_extremes_are_those_of_the_machine(tmp_path: Path) -> None:
+@BOTH
+def test_choices_and_extremes_are_those_of_the_machine(real: Real, tmp_path: Path) -> None:
     """Every triple of special numbers. Mutants: all of `MUTANTS`, planted below."""
-    step = choices()
-    expected = virtual(step, ROWS)
-    text = write_tape(step, "p", place).functions
+    step = choices(1e30)
+    expected = virtual(step, ROWS, real)
+    text = write_tape(step, "p", place, real).functions
     for level in ("-O0", "-O3"):
-        assert differing(run(step, text, ROWS, tmp_path / level, level), expected) == 0
+        found = run(step, text, ROWS, tmp_path / level, level, real=real)
+        assert differing(found, expected) == 0
     assert "fmax" not in text
     assert "fmin" not in text
 
@@ -131,15 +150,19 @@ MUTANTS = {
     "the sign of a zero": (r"\) \+ 0\.0;", ");"),
     "the other of two equal ones": (r"\((\S+) < (t\d+)\) \?", r"(\1 <= \2) ?"),
 }
+OF_SINGLE = {
+    "fmaxf": (r"\(\((t\d+) < (t\d+)\) \|\| \(\1 != \1\)\) \? \2 : \1", r"fmaxf(\1, \2)"),
+}
 
 
-@pytest.mark.parametrize("mutant", MUTANTS)
+@pytest.mark.parametrize("mutant", [*MUTANTS, *OF_SINGLE])
 def test_mistakes_of_the_writer_are_seen(mutant: str, tmp_path: Path) -> None:
-    step = choices()
-    pattern, wrong = MUTANTS[mutant]
-    text, count = re.subn(pattern, wrong, write_tape(step, "p", place).functions)
+    step, real = choices(1e30), SINGLE if mutant in OF_SINGLE else DOUBLE
+    pattern, wrong = (MUTANTS | OF_SINGLE)[mutant]
+    text, count = re.subn(pattern, wrong, write_tape(step, "p", place, real).functions)
     assert count
-    assert differing(run(step, text, ROWS, tmp_path / "m"), virtual(step, ROWS)) > 0
+    found = run(step, text, ROWS, tmp_path / "m", "-w", real=real)
+    assert differing(found, virtual(step, ROWS, real)) > 0
 
 
 def grown(seed: int, size: int = 150) -> ca.Function:
