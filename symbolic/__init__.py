@@ -12,6 +12,7 @@ from obsynth.symbolic.errors import RecordError as RecordError
 from obsynth.symbolic.functions import phi1 as phi1
 from obsynth.symbolic.functions import tanhc as tanhc
 from obsynth.symbolic.plant import Plant as Plant
+from obsynth.symbolic.plant_file import read_plant as read_plant
 from obsynth.symbolic.reading import read_record as read_record
 from obsynth.symbolic.record import Record as Record
 from obsynth.symbolic.scenario import Scenario as Scenario

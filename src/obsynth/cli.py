@@ -28,6 +28,9 @@ app = typer.Typer(
     help="From a plant's equations to a proven fault-estimating observer in C.",
 )
 
+PlantGiven = Annotated[
+    str, typer.Argument(help="A name in obsynth.plants, a text file (TOML) or a JSON file.")
+]
 RecordFile = Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")]
 MapOption = Annotated[
     list[str] | None,
@@ -122,8 +125,35 @@ def check(
 
 
 @app.command()
+def new(
+    file: Annotated[Path, typer.Argument(help="Text file to write, a TOML file.")],
+    like: Annotated[
+        str | None, typer.Option(help="Plant of obsynth.plants to begin from; else a small tank.")
+    ] = None,
+) -> None:
+    """Write the text of a plant, with comments, to be edited into one's own."""
+    if file.exists():
+        _refuse(f"{str(file)!r} is there already.")
+    with _refusals():
+        from importlib.resources import files
+
+        from obsynth.symbolic import plants
+
+        name = "a new plant" if like is None else like
+        folder = files("obsynth.symbolic")
+        text = folder / ("new_plant.toml" if like is None else f"plants/{like}.toml")
+        if not text.is_file():
+            written = [
+                name for name in plants.__all__ if (folder / f"plants/{name}.toml").is_file()
+            ]
+            _refuse(f"{name} is no plant with a text; there are {', '.join(written)}.")
+        file.write_text(text.read_text(encoding="utf-8"), encoding="utf-8")
+    print(f"{file} holds a plant; edit it, then: obsynth choose {file}")
+
+
+@app.command()
 def choose(
-    plant: Annotated[str, typer.Argument(help="A name in obsynth.plants, or a JSON file.")],
+    plant: PlantGiven,
     ts: Annotated[
         float | None, typer.Option(help="Sample time in s, for continuous plants.", min=0)
     ] = None,
@@ -187,7 +217,7 @@ def estimate(
 
 @app.command()
 def bounds(
-    plant: Annotated[str, typer.Argument(help="A name in obsynth.plants, or a JSON file.")],
+    plant: PlantGiven,
     record: RecordFile,
     mapping: MapOption = None,
     time_column: TimeOption = None,
@@ -252,7 +282,7 @@ def _plant(given: str) -> Plant:
     """Return a plant by its name, or from the file of a plant or of a design."""
     import json
 
-    from obsynth.symbolic import Plant, plants
+    from obsynth import Plant, plants, read_plant
 
     if given in plants.__all__:
         try:
@@ -262,6 +292,8 @@ def _plant(given: str) -> Plant:
             _refuse(f"{given} is made in Python ({error}); give a file of what to_dict returns.")
     if not Path(given).is_file():
         _refuse(f"there is no plant and no file {given!r}; plants are {', '.join(plants.__all__)}.")
+    if given.endswith(".toml"):
+        return read_plant(given)
     try:
         data = json.loads(Path(given).read_text())
     except ValueError as error:

@@ -1,26 +1,17 @@
-"""Plants ready to use, in files by what they are."""
+"""Plants ready to use: a text file each, and functions for those that take parameters."""
 
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+
+from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.plant_file import PlantText
 from obsynth.symbolic.plants.bicycle import bicycle
-from obsynth.symbolic.plants.driving import cruise_control, kinematic_bicycle, pvtol
-from obsynth.symbolic.plants.electric import battery, dc_motor, surface_pmsm
-from obsynth.symbolic.plants.exothermic_cstr import exothermic_cstr
-from obsynth.symbolic.plants.haldane_bioreactor import haldane_bioreactor
 from obsynth.symbolic.plants.hinf_example import hinf_example
-from obsynth.symbolic.plants.induction_motor import induction_motor
-from obsynth.symbolic.plants.interval_example import interval_example
 from obsynth.symbolic.plants.leaking_tanks import leaking_tanks
-from obsynth.symbolic.plants.lorenz import lorenz
 from obsynth.symbolic.plants.planar_arm import planar_arm, planar_arm_bias, planar_arm_terms
-from obsynth.symbolic.plants.pmsm_dq import pmsm_dq
-from obsynth.symbolic.plants.process import heat_exchanger, klatt_engell_reactor, tanks_in_a_row
-from obsynth.symbolic.plants.qpv_example import qpv_example
-from obsynth.symbolic.plants.quadrotor import quadrotor
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
-from obsynth.symbolic.plants.swinging import cart_pole, flexible_joint, forced_oscillator
-from obsynth.symbolic.plants.three_tanks import three_tanks
-from obsynth.symbolic.plants.three_tanks_fdt import three_tanks_fdt
+from obsynth.symbolic.plants.tanks_in_a_row import tanks_in_a_row
 from obsynth.symbolic.plants.van_der_pol import van_der_pol
-from obsynth.symbolic.plants.water_tanks import water_tanks
 
 __all__ = [
     "battery",
@@ -55,3 +46,31 @@ __all__ = [
     "van_der_pol",
     "water_tanks",
 ]
+
+
+def text(name: str) -> str:
+    """Return the text of a plant that is one, to begin one's own from."""
+    return (files(__name__) / f"{name}.toml").read_text(encoding="utf-8")
+
+
+@cache
+def _written(name: str) -> Callable[[], Plant]:
+    """Return the function that reads a plant's text, what the text says about it as docstring."""
+    told = PlantText(text(name), f"{name}.toml")
+
+    def make() -> Plant:
+        return told.plant()
+
+    make.__name__ = make.__qualname__ = name
+    make.__doc__ = str(told.data["about"]).strip() + "\n\nReturns\n-------\nPlant"
+    return make
+
+
+def __getattr__(name: str) -> Callable[[], Plant]:
+    if name not in __all__:
+        raise AttributeError(f"there is no plant {name!r}; plants are {', '.join(__all__)}")
+    return _written(name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "text"]

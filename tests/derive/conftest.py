@@ -13,7 +13,7 @@ import sympy as sp
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 REFERENCE = Path(__file__).parent.parent / "reference" / "bounded_error_uio.json"
 

@@ -33,6 +33,26 @@ def test_help_names_the_commands():
     assert "check" in result.output
 
 
+def test_a_new_plant_is_written_once(tmp_path):
+    for k, like in enumerate(([], ["--like", "cart_pole"])):
+        file = tmp_path / f"{k}.toml"
+        assert runner.invoke(app, ["new", str(file), *like]).exit_code == 0
+        assert obsynth.read_plant(file).check()
+        again = runner.invoke(app, ["new", str(file)])
+        assert again.exit_code == 1 and "is there already" in said(again)
+    refused = runner.invoke(app, ["new", str(tmp_path / "x.toml"), "--like", "bicycle"])
+    assert refused.exit_code == 1 and "no plant with a text; there are battery" in said(refused)
+    assert not (tmp_path / "x.toml").exists()
+
+
+def test_a_mistake_in_a_file_is_pointed_at(tmp_path):
+    file = tmp_path / "plant.toml"
+    assert runner.invoke(app, ["new", str(file)]).exit_code == 0
+    file.write_text(file.read_text().replace("sqrt(h)", "sqrt(hh)"))
+    result = runner.invoke(app, ["choose", str(file)])
+    assert result.exit_code == 1 and "plant.toml, line 30, column 19: " in result.output
+
+
 def test_an_unknown_study_is_refused_with_the_known_ones():
     result = runner.invoke(app, ["run", "triple-tank"])
     assert result.exit_code == 1

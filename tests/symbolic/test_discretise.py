@@ -6,7 +6,7 @@ import sympy as sp
 
 from obsynth.symbolic import Plant, PlantError
 from obsynth.symbolic.discretise import runge_kutta, sampling_time
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 
 def plant_with_everything():

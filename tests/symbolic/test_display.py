@@ -6,7 +6,7 @@ import pytest
 import sympy as sp
 
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 
 def balanced(latex):

@@ -7,7 +7,7 @@ import sympy as sp
 
 from obsynth.symbolic import ParityError, Plant, PlantError
 from obsynth.symbolic import from_casadi as module
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 BOX = [(60, 280), (60, 280), (5, 100), (5, 100)]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 REFERENCE = json.loads(
     (Path(__file__).parents[1] / "reference" / "bounded_error_uio.json").read_text()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.symbolic import Plant, PlantError, Scenario
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 from obsynth.symbolic.scenarios.quadruple_tank import quadruple_tank as scenario
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sympy.parsing import sympy_parser
 
 from obsynth.symbolic import Plant, PlantError, Role, Signal, serialize
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 from obsynth.symbolic.serialize import signal_from_dict, signal_to_dict
 
 

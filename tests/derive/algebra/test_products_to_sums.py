@@ -12,8 +12,8 @@ from obsynth.derive.algebra import factorise
 from obsynth.derive.algebra.factorise import same_waves
 from obsynth.derive.jacobian import entries as jacobian_entries
 from obsynth.symbolic import Plant
+from obsynth.symbolic.plants import quadrotor
 from obsynth.symbolic.plants.planar_arm import planar_arm_bias
-from obsynth.symbolic.plants.quadrotor import quadrotor
 
 fu = import_module("sympy.simplify.fu")
 a, b, v, m = sp.symbols("a b v m", real=True)

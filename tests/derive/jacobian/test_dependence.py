@@ -16,7 +16,7 @@ from obsynth.derive.jacobian.family import (
     find_dependences,
 )
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants.lorenz import lorenz
+from obsynth.symbolic.plants import lorenz
 
 x, y = sp.symbols("x y", real=True)
 POINTS = np.random.default_rng(0).random((2, 60)) + 0.5

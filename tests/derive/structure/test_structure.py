@@ -12,7 +12,7 @@ from obsynth.derive.structure.conditions import (
 )
 from obsynth.derive.structure.zeros import invariant_zeros, separable_faults
 from obsynth.symbolic import Plant
-from obsynth.symbolic.plants.quadruple_tank import quadruple_tank
+from obsynth.symbolic.plants import quadruple_tank
 
 
 def linear_plant(A, D=None, F=None, C=None, Ts=1.0, sensor=()):
