@@ -137,12 +137,13 @@ def build_and_compare(
         command = [*compiler, *flags, f"-I{project / 'include'}"]
         built = [str(source), "-c", "-o", str(library)]
         _run([*command, *built], f"compiling {source.name}", out)
-        for program, main in (
-            (test, project / "tests" / f"test_{name}.c"),
-            (example, project / "examples" / "main.c"),
+        tests = project / "tests"
+        for program, sources in (
+            (test, [tests / f"test_{name}.c", tests / "vectors_small.c"]),
+            (example, [project / "examples" / "main.c"]),
         ):
-            files = [str(main), str(library), "-o", str(program), "-lm"]
-            _run([*command, *files], f"compiling {main.name}", out)
+            files = [*map(str, sources), str(library), "-o", str(program), "-lm"]
+            _run([*command, *files], f"compiling {sources[0].name}", out)
         compared = _run(
             [str(test), str(project / "tests" / "vectors.txt")], "the test", out, (0, 1)
         )

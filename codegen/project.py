@@ -17,9 +17,10 @@ from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
 from obsynth.codegen.kernel import DOUBLE, REALS, Kernel
+from obsynth.codegen.recording import Vectors
 from obsynth.codegen.render import render
 from obsynth.codegen.tape import write_tape
-from obsynth.codegen.vectors import Vectors, make_vectors
+from obsynth.codegen.vectors import make_vectors
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
 from obsynth.codegen.kernel import Kernel, Machine, Real
-from obsynth.codegen.vectors import Vectors
+from obsynth.codegen.recording import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
 
@@ -96,6 +96,7 @@ def render(
         f"src/{name}.c": "source.c.j2",
         f"src/{name}_kernel.h": "kernel.h.j2",
         f"tests/test_{name}.c": "runner.c.j2",
+        "tests/vectors_small.c": "small.c.j2",
         "examples/main.c": "example.c.j2",
         f"src/{name}.h": "forward.h.j2",
         "CMakeLists.txt": "CMakeLists.txt.j2",
@@ -167,6 +168,11 @@ def _values(
         "outputs": [(name, length) for name, length in outputs if length],
         "example": _example(description),
         "count": vectors.count,
+        "numbers": sum(sizes.get(kind, 0) for kind in ("u", "y", "theta"))
+        + sum(length for _, length in outputs),
+        "small": vectors.small,
+        "few": vectors.few,
+        "word": vectors.word,
         "kinds": vectors.kinds,
         "claims": [" ".join(text.split()) for text in observer.guarantee.claims],
         "assumptions": [" ".join(text.split()) for text in observer.guarantee.assumptions],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -12,8 +10,8 @@ import numpy as np
 from obsynth.codegen.description import Description, midpoints, nominal_values
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import DOUBLE, SINGLE, Machine
+from obsynth.codegen.recording import Recorder, Vectors
 from obsynth.codegen.single import machine_of
-from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
 MINIMUM = 100
@@ -32,8 +30,6 @@ _KINDS = ("u", "d", "f", "w", "p", "rho")
 _HOLD = 20
 _SMALL = 0.01
 _SEQUENCE = 250
-_ALL_BITS = sum(STATUS.values())
-_STATUS = STEP_OUTPUTS.index("status")
 _EXTREMES: Mapping[str, FloatArray] = {
     real.precision: np.array(
         [
@@ -47,89 +43,6 @@ _EXTREMES: Mapping[str, FloatArray] = {
     )
     for info in [np.finfo(real.type)]
 }
-
-
-@dataclass(frozen=True)
-class Vectors:
-    """Vectors as the text that the C runner reads.
-
-    text: one record a line, see the README of a generated project
-    count: number of steps
-    values: how many numbers the runner has to compare: results, statuses and memories
-    kinds: how many steps of which kind
-    statuses: how often the steps returned which status
-    """
-
-    text: str
-    count: int
-    values: int
-    kinds: Mapping[str, int]
-    statuses: Mapping[int, int]
-
-
-def bits(values: FloatArray) -> str:
-    """Return numbers of a type as bit patterns in hexadecimal, without trailing zeros.
-
-    Every NaN is written as the same one: which of the NaNs an operation returns is not
-    defined, neither by IEEE 754 nor by C.
-    """
-    flat = np.array(values).ravel()
-    flat[np.isnan(flat)] = np.nan
-    text, digits = flat.astype(flat.dtype.newbyteorder(">")).tobytes().hex(), 2 * flat.itemsize
-    return " ".join(text[i : i + digits].rstrip("0") or "0" for i in range(0, len(text), digits))
-
-
-class _Recorder:
-    """The state of a C program that runs through the vectors, kept by the virtual machine."""
-
-    def __init__(self, description: Description) -> None:
-        self._type = description.real.type
-        self._step = machine_of(description.observer.step, description.real)
-        self._start = description.start.astype(self._type)
-        self._zeros = np.zeros_like(self._start)
-        self.memory = self._zeros
-        self.lines: list[str] = []
-        self.statuses: Counter[int] = Counter()
-        self.values = 0
-
-    def forget(self) -> None:
-        """Record a call of NAME_init."""
-        self._set("N", self._zeros)
-
-    def default(self) -> None:
-        """Record a call of NAME_init_default."""
-        self._set("D", self._start)
-
-    def load(self, memory: FloatArray) -> None:
-        """Record a call of NAME_set_memory."""
-        self._set("M", memory)
-
-    def _set(self, letter: str, memory: FloatArray) -> None:
-        with np.errstate(over="ignore"):
-            self.memory = memory.astype(self._type)
-        self.lines.append(f"{letter} {bits(self.memory)}")
-        self.values += memory.size
-
-    def step(self, inputs: list[FloatArray]) -> None:
-        """Record one step with u, y and theta where there is one; carry the memory along."""
-        with np.errstate(over="ignore"):
-            inputs = [values.astype(self._type) for values in inputs]
-        arrays = self._step(self.memory, *inputs)
-        status = float(arrays.pop(_STATUS)[0])
-        if not (status.is_integer() and 0 <= status <= _ALL_BITS):
-            raise CodegenError(
-                f"the step returns status {status!r}, which is no mask of the bits"
-                f" {', '.join(map(str, STATUS.values()))}",
-                status=status,
-                memory=self.memory,
-                u=inputs[0],
-                y=inputs[1],
-            )
-        self.memory = arrays[STEP_OUTPUTS.index("memory")]
-        self.statuses[int(status)] += 1
-        self.values += 1 + sum(array.size for array in arrays)
-        numbers = np.concatenate([*inputs, *arrays])
-        self.lines.append(f"S {int(status)} {bits(numbers)}")
 
 
 def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -> Vectors:
@@ -146,7 +59,7 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
             vectors=count,
         )
     rng = np.random.default_rng(seed)
-    recorder = _Recorder(description)
+    recorder = Recorder(description, machine_of(description.observer.step, description.real))
     drive = Drive(description, rng)
     kinds = _quotas(count)
     visited = [description.start]
@@ -171,15 +84,7 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
         recorder.forget()
         for _ in range(length):
             recorder.step(drive.wide())
-    head = [description.name, *(str(size) for size in description.sizes.values())]
-    lines = [" ".join(("obsynth-vectors", "1", *head, str(count))), *recorder.lines]
-    return Vectors(
-        text="\n".join(lines) + "\n",
-        count=count,
-        values=recorder.values,
-        kinds=kinds,
-        statuses=dict(sorted(recorder.statuses.items())),
-    )
+    return recorder.vectors(kinds)
 
 
 def _quotas(count: int) -> dict[str, int]:
@@ -193,7 +98,7 @@ def _lengths(total: int, most: int = _SEQUENCE) -> Iterator[int]:
         yield min(most, total - start)
 
 
-def _follow(recorder: _Recorder, drive: Drive, length: int, failing: bool) -> None:
+def _follow(recorder: Recorder, drive: Drive, length: int, failing: bool) -> None:
     guess = drive.begin(length)
     if guess is None:
         recorder.default()

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from obsynth.codegen import CodegenError
 from obsynth.codegen.description import c_comment, identifier, project_name, unique
-from obsynth.codegen.kernel import DOUBLE
-from obsynth.codegen.vectors import bits
+from obsynth.codegen.kernel import DOUBLE, SINGLE
+from obsynth.codegen.recording import Word, tokens
 
 C_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*_?")
 
@@ -77,8 +77,14 @@ def test_a_project_name_that_would_break_the_build_is_refused(name: str, word: s
 @settings(derandomize=True, deadline=None, max_examples=300)
 @given(st.floats())
 def test_bits_and_literals_are_read_back_exactly(value: float) -> None:
-    text = bits(np.array([value]))
+    (pattern,) = Word(DOUBLE).patterns([value]).tolist()
+    assert tokens([pattern] * 3, [pattern, pattern, pattern ^ 1], Word(DOUBLE))[0] == ".2"
+    *_, text = tokens([pattern] * 3, [pattern, pattern, pattern ^ 1], Word(DOUBLE))
     (back,) = struct.unpack(">d", bytes.fromhex(text.ljust(16, "0")))
+    (half,) = Word(SINGLE).patterns([value]).tolist()
+    (single,) = struct.unpack(">f", half.to_bytes(4, "big"))
+    with np.errstate(over="ignore"):
+        assert struct.pack(">f", single) == struct.pack(">f", np.float32(value)) or value != value
     literal = DOUBLE.number(value)
     if math.isnan(value):
         assert math.isnan(back)

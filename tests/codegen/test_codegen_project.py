@@ -88,6 +88,7 @@ def test_the_folder_holds_the_listed_files_and_nothing_else(toy: Any, tmp_path: 
         "src/tank_kernel.h",
         "tests/test_tank.c",
         "tests/vectors.txt",
+        "tests/vectors_small.c",
         "zephyr/module.yml",
     }
     assert json.loads((project.folder / "library.json").read_text())["name"] == "tank"
@@ -344,7 +345,8 @@ def test_an_arm_compiler_takes_every_file(
     """Mutant: PRIx64, which newlib does not define."""
     monkeypatch.setattr("obsynth.codegen.project.find_compiler", lambda: None)
     folder = generate_c(toy, tmp_path / "p", vectors=100).folder
-    for file in ("src/two_tanks.c", "tests/test_two_tanks.c", "examples/main.c"):
+    tests = ("tests/test_two_tanks.c", "tests/vectors_small.c")
+    for file in ("src/two_tanks.c", *tests, "examples/main.c"):
         flags = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-Iinclude", "-c", "-o", "x.o")
         run("arm-none-eabi-gcc", "-mcpu=cortex-m4", *flags, file, cwd=folder)
 

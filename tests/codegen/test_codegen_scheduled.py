@@ -70,6 +70,7 @@ class Scheduled:
     step: ca.Function
     model: Plant
     method: str = "toy_observer"
+    precision: str = "double"
     fault_delay: int = 0
     record: Any = field(default_factory=lambda: {"design": 1})
     certificate: tuple[Any, ...] = ()
@@ -120,7 +121,7 @@ def test_the_project_speaks_of_the_measured_signals_only(
     assert "| `theta[1]` | `speed` | m/s | -1 to 4 |" in readme
     assert "fill in.u, in.y and in.theta with" in readme
     assert "- **Scheduling.**" in readme
-    assert "status, u, y, theta, memory afterwards" in readme
+    assert "status, u, y, theta, xhat, x_lower" in readme
     manifest = json.loads((project.folder / "manifest.json").read_text())
     assert [signal["name"] for signal in manifest["signals"]["theta"]] == ["mass", "speed"]
     main = (project.folder / "examples/main.c").read_text()
