@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-long mutants notebook lint format lock benchmarks clean
+.PHONY: help run test test-long mutants firmware notebook lint format lock benchmarks clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +31,10 @@ test-long: $(VENV)/.installed ## the long statistics only
 
 mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print those that no test sees
 	$(BIN)/python tools/mutants.py --workers $(WORKERS) --minutes 6
+
+firmware: $(VENV)/.installed ## the C of every method on emulated Cortex-M3, M4F and M7
+	sh tools/firmware/install.sh
+	$(BIN)/python tools/firmware --workers $(WORKERS)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
