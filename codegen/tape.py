@@ -336,12 +336,12 @@ def write_tape(
         lines = [*lines[:-1], "(void)in;", lines[-1]]
     head = f"{prefix}_state_t *state, const {prefix}_in_t *in, {prefix}_out_t *out"
     kernel = _function(f"{writer.real} {prefix}_kernel(\n    {head})", lines)
-    called = [_written(name, writer) for name in sorted(writer.own)]
+    called = [write_function(name, prefix, real) for name in sorted(writer.own)]
     return Kernel(
         backend="tape",
-        functions="\n\n".join([*called, *functions, kernel]),
+        functions="\n\n".join([*(text for text, _ in called), *functions, kernel]),
         arguments=("state", "in", "out"),
-        library=tuple(sorted(writer.library)),
+        library=tuple(sorted(writer.library.union(*(names for _, names in called)))),
         operations=int(function.n_instructions()),
         counts=counted(value.name for value in values),
         own={name: ULPS[name] for name in sorted(writer.own)},
@@ -353,13 +353,12 @@ def _function(head: str, lines: Sequence[str]) -> str:
     return f"static {head}\n{{\n{body}\n}}"
 
 
-def _written(name: str, caller: _Writer) -> str:
-    """Write a function of our own; what it calls of the library is added to the caller's."""
-    reader = _Reader(own_function(name), caller.type)
-    values, writer = reader.used(), _Writer(caller.prefix, caller.type)
+def write_function(name: str, prefix: str, real: Real) -> tuple[str, set[str]]:
+    """Write a function of our own; return it and what it calls of the library."""
+    function = own_function(name)
+    reader, writer = _Reader(function, real), _Writer(prefix, real)
+    values = reader.used()
     writer.write(values, {(k, 0): "xy"[k] for k in range(2)})
-    caller.library |= writer.library
-    arguments = ", ".join(f"{writer.real} {'xy'[k]}" for k in range(own_function(name).n_in()))
-    result = writer.result(reader.results[0][-1])
-    head = f"{writer.real} {caller.prefix}_{name}({arguments})"
-    return _function(head, [*writer.lines, f"return {result};"])
+    arguments = ", ".join(f"{writer.real} {'xy'[k]}" for k in range(function.n_in()))
+    lines = [*writer.lines, f"return {writer.result(reader.results[0][-1])};"]
+    return _function(f"{writer.real} {prefix}_{name}({arguments})", lines), writer.library

@@ -165,7 +165,7 @@ def test_mistakes_of_the_writer_are_seen(mutant: str, tmp_path: Path) -> None:
     assert differing(found, virtual(step, ROWS, real)) > 0
 
 
-def grown(seed: int, size: int = 150) -> ca.Function:
+def grown(seed: int, size: int = 150, more: tuple[Any, ...] = ()) -> ca.Function:
     """A function of random operations on random earlier values."""
     rng = np.random.default_rng(seed)
     y = ca.SX.sym("y", 4)
@@ -180,7 +180,7 @@ def grown(seed: int, size: int = 150) -> ca.Function:
         lambda a: a**2,
         lambda a: -a,
     ]
-    unary += [lambda a: 2 * a, lambda a: 1 / a, ca.sin, ca.exp, lambda a: a**3]
+    unary += [lambda a: 2 * a, lambda a: 1 / a, ca.sin, ca.exp, lambda a: a**3, *more]
     binary = [ca.fmax, ca.fmin, ca.plus, ca.minus, ca.times, ca.rdivide, ca.lt, ca.le, ca.eq, ca.ne]
     binary += [ca.logic_and, ca.logic_or, ca.fmax, ca.fmin, ca.atan2, ca.copysign]
     for _ in range(size):
@@ -193,6 +193,21 @@ def grown(seed: int, size: int = 150) -> ca.Function:
         else:
             values.append(ca.if_else(a, b, c))
     return step_of(ca.vertcat(*values[10:]), y)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_functions_of_single_precision(seed: int, tmp_path: Path) -> None:
+    """With functions of our own, under both compilers. Mutant: they are written in double."""
+    own = [ca.cos, ca.log, ca.tanh, ca.atan, ca.asin, lambda a: ca.fabs(a) ** 1.5, ca.expm1]
+    step = grown(seed, more=(*own, lambda a: ca.hypot(a, 2.5), ca.sqrt, ca.tan))
+    rows = np.random.default_rng(seed).choice([*SPECIAL, 0.7, 88.5, -104.0, 3.1], (300, 4))
+    expected = virtual(step, rows, SINGLE)
+    text = write_tape(step, "p", place, SINGLE).functions
+    for compiler, level in ((None, "-O1"), ("clang-14", "-O3")):
+        if compiler is None or shutil.which(compiler):
+            where = tmp_path / level
+            found = run(step, text, rows, where, level, real=SINGLE, compiler=compiler)
+            assert differing(found, expected) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))

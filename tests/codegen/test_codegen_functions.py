@@ -1,0 +1,103 @@
+"""Functions of our own in single precision: errors, limits, and the same bits in C."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+import pytest
+
+from obsynth.codegen import functions
+from obsynth.codegen.functions import FARTHEST, ULPS, own_function
+from obsynth.codegen.single import SingleMachine
+
+NAMES = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "pow": "power"}
+NAMES |= {"asinh": "arcsinh", "acosh": "arccosh", "atanh": "arctanh"}
+LARGEST = float(np.finfo(np.float32).max)
+
+
+def exact(name: str) -> Callable[..., Any]:
+    """NumPy in double precision, 10^8 times as fine."""
+    function: Callable[..., Any] = getattr(np, NAMES.get(name, name))
+    return lambda *x: function(*(np.float64(a) for a in x))
+
+
+def errors(found: Any, truth: Any) -> Any:
+    """In units in the last place of the truth; infinity is a unit above the largest float."""
+    most = LARGEST * (1 + 2.0**-24)
+    found, truth = (np.clip(a, -most, most) for a in (found, truth))
+    unit = np.ldexp(1.0, np.maximum(np.frexp(truth)[1], -125) - 24)
+    return np.where(np.isnan(truth) & np.isnan(found), 0.0, np.abs(found - truth) / unit)
+
+
+def spread(rng: np.random.Generator, count: int) -> Any:
+    """Floats of every size, and those next to multiples of a quarter turn."""
+    every = rng.integers(0, 2**32, count, dtype=np.uint32).view(np.float32)
+    turns = (np.arange(4096) * (np.pi / 2)).astype(np.float32)
+    near = [np.nextafter(turns, np.float32(side * 1e9)) for side in (-1, 1)]
+    usual = rng.uniform(-1, 1, count).astype(np.float32) * np.float32(rng.choice([1, 9, 90]))
+    return np.concatenate([every, turns, *near, usual])
+
+
+def worst(name: str, count: int = 20_000) -> float:
+    rng = np.random.default_rng(0)
+    x = [spread(rng, count)]
+    with np.errstate(all="ignore"):
+        if name == "pow":
+            share = rng.uniform(-1, 1, x[0].size)
+            x = [np.abs(x[0]), (88.0 * share / np.log(np.abs(x[0]))).astype(np.float32)]
+        elif own_function(name).n_in() == 2:
+            x.append((x[0] * rng.uniform(-9, 9, x[0].size)).astype(np.float32))
+        if name in {"sin", "cos", "tan"}:
+            x = [x[0][np.abs(x[0]) <= FARTHEST]]
+        (found,) = SingleMachine(own_function(name))(*(a[None] for a in x))
+        told = errors(found[0].astype(float), exact(name)(*x))
+    return float(told[np.isfinite(x[-1]) & np.isfinite(x[0])].max())
+
+
+@pytest.mark.parametrize("name", ULPS)
+def test_errors_stay_below_what_is_said(name: str) -> None:
+    """And not far below. Mutants: see below; ``tools/ulps.py`` tries every float."""
+    assert 0.5 < worst(name) <= ULPS[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "wrong"),
+    [
+        ("log1p", "_as_written", nullcontext),
+        ("sin", "_SINE", (-0.1666667, 0.0083333, -0.000198, 2.7e-06)),
+        ("exp", "_EXP", (0.5, 0.1666667, 0.041667, 0.00833, 0.00139, 0.0002)),
+        ("log", "_LOG", (0.66667, 0.4, 0.285, 0.233)),
+        ("cos", "_PI", functions._PI * (1 + functions.Fraction(1, 2**44))),
+    ],
+)
+def test_mistakes_are_seen(
+    name: str, number: str, wrong: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Simplified by CasADi, coefficients with digits less, a quarter turn of 44 bits."""
+    monkeypatch.setattr(functions, number, wrong)
+    own_function.cache_clear()
+    try:
+        assert worst(name) > ULPS[name]
+    finally:
+        own_function.cache_clear()
+
+
+SPECIAL = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 2.0, -2.0, 3.0, -3.0, 1e30, np.inf, -np.inf, np.nan])
+
+
+@pytest.mark.parametrize("name", ULPS)
+def test_limits_and_what_is_not_defined(name: str) -> None:
+    """NaN, infinity and zero where C99 has them, but for the sign of a zero and for far angles."""
+    two = own_function(name).n_in() == 2
+    x = np.meshgrid(SPECIAL, SPECIAL) if two else [SPECIAL]
+    flat = [a.ravel() for a in x]
+    (found,) = SingleMachine(own_function(name))(*(a[None] for a in flat))
+    with np.errstate(all="ignore"):
+        truth = exact(name)(*flat)
+    if name in {"sin", "cos", "tan"}:
+        truth = np.where(np.abs(flat[0]) <= FARTHEST, truth, np.nan)
+    told = errors(found[0].astype(float), truth)
+    assert (told <= ULPS[name]).all(), [a[~(told <= ULPS[name])] for a in flat]
