@@ -22,6 +22,8 @@ from obsynth.evaluate.plotting.plots import plot_signal as plot_signal
 from obsynth.evaluate.report import report as report
 from obsynth.evaluate.run import Run as Run
 from obsynth.evaluate.simulate import simulate as simulate
+from obsynth.evaluate.studies.study import Study as Study
+from obsynth.evaluate.studies.study import read_study as read_study
 from obsynth.evaluate.table import Table as Table
 from obsynth.evaluate.trace import Trace as Trace
 from obsynth.evaluate.trace import Violation as Violation

@@ -41,7 +41,7 @@ from typing import Any, NoReturn
 
 import sympy as sp
 
-from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.errors import ObsynthError, PlantError
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, expand_names, is_name
 from obsynth.symbolic.text import TextError, read_text
@@ -60,6 +60,8 @@ _ROLES: Mapping[str, tuple[Role, set[str]]] = {
 }
 _WORDS = {"name", "about", "Ts"}
 _TABLES = {*_ROLES, "definitions", "dynamics", "outputs", "discretise"}
+BESIDE = ("design", "scenario", "record")
+"""Tables that say what is done with the plant."""
 _OUTPUT = {"is", "unit", "range"}
 _STEP = {"method", "Ts", "order", "remainder"}
 _TEXTS = {"unit", "of", "method", "is"}
@@ -100,15 +102,18 @@ def read_plant(path: str | os.PathLike[str]) -> Plant:
     ...     read_plant(file).rhs
     Matrix([[-x/2]])
     """
-    file = Path(path)
-    data = file.read_bytes()
+    return PlantText(read_text_file(path), Path(path).name).plant()
+
+
+def read_text_file(path: str | os.PathLike[str]) -> str:
+    """Return the text of a small file, or refuse what is none."""
+    data, name = Path(path).read_bytes(), Path(path).name
     if len(data) > _MOST:
-        raise PlantError(f"{file.name} has {len(data)} bytes; a plant has at most {_MOST}")
+        raise PlantError(f"{name} has {len(data)} bytes; a plant has at most {_MOST}")
     try:
-        text = data.decode()
+        return data.decode()
     except UnicodeDecodeError as error:
-        raise PlantError(f"{file.name} is no text in UTF-8 ({error})") from error
-    return PlantText(text, file.name).plant()
+        raise PlantError(f"{name} is no text in UTF-8 ({error})") from error
 
 
 class PlantText:
@@ -133,15 +138,15 @@ class PlantText:
 
     def plant(self) -> Plant:
         """Return the plant that the text says."""
-        self._known((), self.data, _WORDS | _TABLES)
-        for word in _TABLES & set(self.data):
-            self._table((word,), self.data[word])
+        self.known((), self.data, {*_WORDS, *_TABLES, *BESIDE})
+        for word in {*_TABLES, *BESIDE} & set(self.data):
+            self.table((word,), self.data[word])
         for word in ("name", "about"):
             if not isinstance(self.data.get(word, "-"), str):
-                self._fail((word,), f"{word} is text, not {self.data[word]!r}")
+                self.fail((word,), f"{word} is text, not {self.data[word]!r}")
         if "name" not in self.data:
-            self._fail((), 'the plant has no name: write name = "..." in the first line')
-        plant: Plant = self._tried(("name",), Plant, self.data["name"])
+            self.fail((), 'the plant has no name: write name = "..." in the first line')
+        plant: Plant = self.tried(("name",), Plant, self.data["name"])
         for table in self.data:
             if table in _ROLES:
                 self._declare(plant, table)
@@ -149,8 +154,8 @@ class PlantText:
         for name, text in self.data.get("definitions", {}).items():
             path = ("definitions", name)
             if not is_name(name) or name in symbols:
-                self._fail(path, f"a definition has a name of its own, not {name!r}")
-            symbols[name] = self._expression(path, text, symbols)
+                self.fail(path, f"a definition has a name of its own, not {name!r}")
+            symbols[name] = self.expression(path, text, symbols)
         self._equations(plant, symbols)
         step = self.data.get("discretise")
         if step is None:
@@ -158,8 +163,8 @@ class PlantText:
         options = self._fields(("discretise",), step, _STEP)
         for word in ("method", "Ts"):
             if word not in options:
-                self._fail(("discretise",), f"[discretise] needs {word}")
-        sampled: Plant = self._tried(("discretise",), plant.discretise, **options)
+                self.fail(("discretise",), f"[discretise] needs {word}")
+        sampled: Plant = self.tried(("discretise",), plant.discretise, **options)
         return sampled
 
     def _declare(self, plant: Plant, table: str) -> None:
@@ -170,7 +175,7 @@ class PlantText:
             given = entry
             if role is Role.PARAM and not isinstance(entry, dict):
                 given = {"value": entry}
-            fields = self._fields(path, self._table(path, given), words)
+            fields = self._fields(path, self.table(path, given), words)
             if role is Role.SENSOR_FAULT and "unit" not in fields:
                 fields["unit"] = self._units(fields.get("of"))
             if role is Role.PARAM:
@@ -178,8 +183,8 @@ class PlantText:
             if "range" in fields:
                 fields["limits"] = fields.pop("range")
             if "of" in words and "of" not in fields:
-                self._fail(path, f"{role} {names} needs of = the name of what it adds to")
-            self._tried(path, plant.declare, role, names, **fields)
+                self.fail(path, f"{role} {names} needs of = the name of what it adds to")
+            self.tried(path, plant.declare, role, names, **fields)
 
     def _units(self, of: Any) -> Any:
         """Return the units of outputs that sensor faults add to."""
@@ -192,35 +197,35 @@ class PlantText:
         """State dynamics and outputs."""
         for table in ("dynamics", "outputs"):
             if not self.data.get(table):
-                self._fail((table,), f"the plant has no [{table}]")
+                self.fail((table,), f"the plant has no [{table}]")
         rows, states = self.data["dynamics"], plant.names("x")
         for name in rows:
             if name not in states:
-                self._fail(("dynamics", name), f"{name} is no state{_close(name, states)}")
+                self.fail(("dynamics", name), f"{name} is no state{_close(name, states)}")
         for name in states:
             if name not in rows:
-                self._fail(("dynamics",), f"the state {name} has no equation in [dynamics]")
-        found = [self._expression(("dynamics", name), rows[name], symbols) for name in states]
+                self.fail(("dynamics",), f"the state {name} has no equation in [dynamics]")
+        found = [self.expression(("dynamics", name), rows[name], symbols) for name in states]
         Ts = self.data.get("Ts")
         step = None if Ts is None else self._number(("Ts",), Ts)
-        self._tried(("Ts",) if Ts is not None else ("dynamics",), plant.dynamics, found, Ts=step)
+        self.tried(("Ts",) if Ts is not None else ("dynamics",), plant.dynamics, found, Ts=step)
         names, texts, units, ranges = [], [], [], []
         for name, entry in self.data["outputs"].items():
             path = ("outputs", name)
             given = entry if isinstance(entry, dict) else {"is": entry}
             fields = self._fields(path, given, _OUTPUT)
             if "is" not in fields:
-                self._fail(path, f'the output {name} needs is = "what it shows"')
+                self.fail(path, f'the output {name} needs is = "what it shows"')
             where = (*path, "is") if isinstance(entry, dict) else path
-            texts.append(self._expression(where, fields["is"], symbols))
+            texts.append(self.expression(where, fields["is"], symbols))
             names.append(name)
             units.append(fields.get("unit", ""))
             ranges.append(fields.get("range"))
-        self._tried(("outputs",), plant.outputs, texts, names=names, unit=units, range=ranges)
+        self.tried(("outputs",), plant.outputs, texts, names=names, unit=units, range=ranges)
 
     def _fields(self, path: Keys, entry: Mapping[str, Any], words: Collection[str]) -> Any:
         """Return the keywords of a declaration, their numbers read."""
-        self._known(path, entry, words)
+        self.known(path, entry, words)
         return {
             word: value if word in _TEXTS else self._number((*path, word), value)
             for word, value in entry.items()
@@ -230,39 +235,42 @@ class PlantText:
         """Return numbers as given; text as the exact number it says."""
         if isinstance(value, list):
             return [self._number(path, item) for item in value]
-        return self._expression(path, value, {}) if isinstance(value, str) else value
+        return self.expression(path, value, {}) if isinstance(value, str) else value
 
-    def _expression(self, path: Keys, text: Any, symbols: Mapping[str, Any]) -> sp.Expr:
+    def expression(self, path: Keys, text: Any, symbols: Mapping[str, Any]) -> sp.Expr:
+        """Read an equation, or a number."""
         if isinstance(text, int | float) and not isinstance(text, bool):
             text = repr(text)
         if not isinstance(text, str):
-            self._fail(path, f"an equation is text in quotes, not {text!r}")
+            self.fail(path, f"an equation is text in quotes, not {text!r}")
         try:
             return read_text(text, symbols)
         except TextError as error:
             start = self.text.find(text, self._place(path)) if text else -1
             message = str(error).rsplit(", at position", 1)[0]
             if start < 0:
-                self._fail(path, message)
+                self.fail(path, message)
             self._fail_at(start + error.position, message)
 
-    def _table(self, path: Keys, value: Any) -> Any:
+    def table(self, path: Keys, value: Any) -> Any:
+        """Return a table, or refuse what is none."""
         if not isinstance(value, dict):
-            self._fail(path, f"{path[-1]} is a table such as {{ unit = 'cm' }}, not {value!r}")
+            self.fail(path, f"{path[-1]} is a table such as {{ unit = 'cm' }}, not {value!r}")
         return value
 
-    def _known(self, path: Keys, given: Mapping[str, Any], words: Collection[str]) -> None:
+    def known(self, path: Keys, given: Mapping[str, Any], words: Collection[str]) -> None:
+        """Refuse keys that have no meaning."""
         for word in given:
             if word not in words:
                 place = f"in {path[-1]}" if path else "here"
-                self._fail((*path, word), f"{word} has no meaning {place}{_close(word, words)}")
+                self.fail((*path, word), f"{word} has no meaning {place}{_close(word, words)}")
 
-    def _tried(self, path: Keys, call: Any, *args: Any, **keywords: Any) -> Any:
-        """Call a plant's method; what it refuses gets its place in the text."""
+    def tried(self, path: Keys, call: Any, *args: Any, **keywords: Any) -> Any:
+        """Call something; what it refuses gets its place in the text."""
         try:
             return call(*args, **keywords)
-        except PlantError as error:
-            self._fail(path, str(error))
+        except ObsynthError as error:
+            self.fail(path, str(error))
 
     # -- places ----------------------------------------------------------------------
 
@@ -295,7 +303,8 @@ class PlantText:
                 return start
         return 0
 
-    def _fail(self, path: Keys, message: str) -> NoReturn:
+    def fail(self, path: Keys, message: str) -> NoReturn:
+        """Refuse what stands at a key."""
         self._fail_at(self._place(path), message)
 
     def _fail_at(self, place: int, message: str) -> NoReturn:

@@ -40,6 +40,7 @@ from .evaluate import Identified as Identified
 from .evaluate import LeastBounds as LeastBounds
 from .evaluate import Run as Run
 from .evaluate import SimulationError as SimulationError
+from .evaluate import Study as Study
 from .evaluate import Table as Table
 from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
@@ -51,6 +52,7 @@ from .evaluate import plot_errors as plot_errors
 from .evaluate import plot_run as plot_run
 from .evaluate import plot_signal as plot_signal
 from .evaluate import plot_widths as plot_widths
+from .evaluate import read_study as read_study
 from .evaluate import report as report
 from .evaluate import simulate as simulate
 from .symbolic import ObsynthError as ObsynthError

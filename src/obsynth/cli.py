@@ -31,6 +31,9 @@ app = typer.Typer(
 PlantGiven = Annotated[
     str, typer.Argument(help="A name in obsynth.plants, a text file (TOML) or a JSON file.")
 ]
+StudyFile = Annotated[
+    Path, typer.Argument(help="A plant as text with [design], [scenario], [record]: a TOML file.")
+]
 RecordFile = Annotated[Path, typer.Argument(help="What was measured: a CSV or Parquet file.")]
 MapOption = Annotated[
     list[str] | None,
@@ -149,6 +152,62 @@ def new(
             _refuse(f"{name} is no plant with a text; there are {', '.join(written)}.")
         file.write_text(text.read_text(encoding="utf-8"), encoding="utf-8")
     print(f"{file} holds a plant; edit it, then: obsynth choose {file}")
+
+
+@app.command()
+def analyse(plant: PlantGiven, as_json: JsonOption = False) -> None:
+    """Report what can be seen and told apart; exit 1 if a condition fails."""
+    with _refusals():
+        import json
+
+        import obsynth
+
+        found = obsynth.analyse(_plant(plant))
+    if as_json:
+        lines = [{"title": n.title, "holds": n.passed, "text": n.text} for n in found.checks]
+        print(json.dumps(lines, indent=1))
+    else:
+        print(found)
+    if not found.passed:
+        raise typer.Exit(code=1)
+
+
+@app.command()
+def design(
+    study: StudyFile,
+    out: Annotated[Path | None, typer.Option(help="File to write, JSON.")] = None,
+) -> None:
+    """Design and prove the observer of a study; print its certificate and guarantee."""
+    with _refusals():
+        import obsynth
+
+        observer = obsynth.read_study(study).observer
+        if out is not None:
+            observer.save(out)
+    print(observer, observer.guarantee, sep="\n")
+
+
+@app.command()
+def simulate(
+    study: StudyFile,
+    seeds: Annotated[int, typer.Option(help="Runs, with seeds from that of the file.", min=1)] = 1,
+    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+) -> None:
+    """Run the observer of a study through its scenario; exit 1 if a guaranteed interval fails."""
+    with _refusals():
+        import obsynth
+
+        told = obsynth.read_study(study)
+        observer, first = told.observer, told.seed
+        runs = [
+            obsynth.simulate(observer.model, observer, told.scenario, seed=seed)
+            for seed in range(first, first + seeds)
+        ]
+        if report is not None:
+            obsynth.report(report, observer, runs)
+    _console().print(_rich(obsynth.coverage_table({observer.method: runs})))
+    if any(run.coverage[name] < 1.0 for run in runs for name in run.bounded):
+        _refuse("a guaranteed interval was violated; see the table.")
 
 
 @app.command()
