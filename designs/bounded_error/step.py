@@ -228,7 +228,7 @@ def build_core(design: UioDesign) -> Core:
         z = Ends(middle - radius, middle + radius).nearest(kept["z"])
         if design.bound.error == "shifted":
             # a part of the box need not lie in the range of T, its middle and what was kept do
-            moved = ca.sum1(ca.fabs(z - kept["z"])) > 0.0
+            moved = ca.logic_not(ca.sum1(ca.fabs(z - kept["z"])) <= 0.0)
             z = select(moved, middle, kept["z"])
         return {
             "z": z,
@@ -236,4 +236,4 @@ def build_core(design: UioDesign) -> Core:
             "prediction": x.nearest(kept["prediction"]),
         }
 
-    return Core(run, begin, place)
+    return Core(run, begin, place, nonnegative=("bound",))

@@ -81,6 +81,8 @@ class Core:
         None for those on which a derivative depends
     bridges: whether a missing reading is the core's own business; without, it begins anew after one
     mean_fault: whether its fault interval holds a mean over time
+    nonnegative: parts of its memory that are never negative, and may be infinite; two parts called
+        ``..._lower`` and ``..._upper`` are ends in order, all others are finite
     """
 
     run: Callable[[Seen], Known]
@@ -90,3 +92,4 @@ class Core:
     bridges: bool = False
     mean_fault: bool = False
     advance: Callable[[Seen], Parts] | None = None
+    nonnegative: tuple[str, ...] = ()

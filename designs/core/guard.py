@@ -119,16 +119,21 @@ class Guard:
         """Whether sets are carried from call to call."""
         return self.plant.Ts is not None
 
+    @property
+    def boxes(self) -> dict[str, int]:
+        """Parts of the memory of each copy that are ends of its sets, and their sizes."""
+        sizes = {"x": len(self.plant.x)} if self.discrete else {}
+        sizes["f"] = len(self.plant.f)
+        if self.sweeps is not None:
+            sizes["rest"] = len(self.sweeps.carried)
+        return {f"{k}_{end}": size for k, size in sizes.items() for end in ("lower", "upper")}
+
     def layout(self) -> dict[str, slice]:
         """Return where the parts of the memory are; the older copy has the core's own names."""
-        n, n_f = len(self.plant.x), len(self.plant.f)
         known = len(self.plant.u) + sum(s.measured for s in self.plant.rho)
-        boxes = {"x_lower": n, "x_upper": n} if self.discrete else {}
-        boxes |= {"f_lower": n_f, "f_upper": n_f}
-        if self.sweeps is not None:
-            boxes |= dict.fromkeys(("rest_lower", "rest_upper"), len(self.sweeps.carried))
         single = dict(self.sizes)
-        twice = {k: s for k, s in single.items() if k not in self.shared} | boxes | {"begin": 1}
+        own = {k: s for k, s in single.items() if k not in self.shared}
+        twice = own | self.boxes | {"begin": 1}
         young = {name + YOUNG: size for name, size in twice.items()}
         before = {"before": known} if self.discrete else {}
         ends = {"age": 1, "since": 1, "initialised": 1}

@@ -11,7 +11,14 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before, covered_inputs
 from obsynth.designs.core.guard import YOUNG, Guard
 from obsynth.designs.core.lifted import FAR
-from obsynth.designs.core.stepping import FINITE, all_finite, finite_or, make_step, status_word
+from obsynth.designs.core.stepping import (
+    FINITE,
+    all_finite,
+    could_be_written,
+    finite_or,
+    make_step,
+    status_word,
+)
 from obsynth.designs.core.sweeps import Pair
 
 HUGE = 1e50
@@ -31,10 +38,12 @@ class _Copy:
         again: ca.SX,
         told: ca.SX,
         pair: Pair,
+        written: ca.SX,
     ) -> None:
         self.X, self.now, self.late, self.shown, self.known = X, now, late, shown, known
         self.again, self.told, self.rest = again, told, pair.now.rest
         self.empty = ca.logic_or(ca.logic_and(told, known.empty), pair.empty)
+        self.empty = ca.logic_or(self.empty, ca.logic_not(written))
         for box in (X, now, late, shown):
             self.empty = ca.logic_or(self.empty, box.empty())
 
@@ -156,6 +165,8 @@ class Step:
         if core.advance is not None:
             own = {**core.advance(Seen({**kept, **own}, *signals))}
         own = {name: select(begins, begun[name], own[name]) for name in names}
+        boxes = {name: self.part[name + end] for name in self.guard.boxes}
+        written = could_be_written({**kept, **own, **boxes}, core.nonnegative, self.guard.precision)
         seen = Seen({**kept, **own}, *signals)
         known = core.run(seen)
         told = ca.SX(1) if core.bridges else seen.all_used
@@ -175,18 +186,31 @@ class Step:
             shown = now.meet(known.f).where(told, now)
             now = now if core.mean_fault else shown
         again = ca.logic_or(ca.logic_not(ca.logic_and(told, known.sound)), huge)
-        return _Copy(X, now, late, shown, known, again, told, pair)
+        return _Copy(X, now, late, shown, known, again, told, pair, written)
 
     @property
     def y_clean(self) -> ca.SX:
         """The readings, zero where they are not used."""
         return ca.vertcat(*(ca.if_else(bit, self.y[i], 0.0) for i, bit in enumerate(self.used)))
 
+    def _turns(self, age: ca.SX) -> ca.SX:
+        """Return 1 where the younger copy begins, at one of the ages of any row of them."""
+        N = float(self.guard.horizon)
+        return ca.logic_and(age >= N - 0.5, age < N + 0.5)
+
+    @property
+    def _counts(self) -> ca.SX:
+        """1 where a step can have written the counters and what is known of the call before."""
+        limits = {"age": 2.0 * self.guard.horizon - 0.5, "since": self.guard.watch.recovery + 0.5}
+        counts = [(self.part[name], limit) for name, limit in limits.items()]
+        held = every(ca.logic_and(count >= 0.0, count <= limit) for count, limit in counts)
+        return ca.logic_and(held, all_finite(self.part["before"]))
+
     def build(self) -> ca.Function:
         """Assemble the function."""
-        N, age = float(self.guard.horizon), self.part["age"]
+        age = self.part["age"]
         have = age > 0.5
-        both = have, ca.logic_and(have, ca.fabs(age - N) > 0.5)
+        both = have, ca.logic_and(have, ca.logic_not(self._turns(age)))
         sets = [self._sets(end, one) for end, one in zip(("", YOUNG), both, strict=True)]
         begins = self.part["begin"] > 0.5, self.part["begin" + YOUNG] > 0.5
         kept = self._kept(begins, (sets[0].now.states, sets[0].now.faults))
@@ -200,8 +224,10 @@ class Step:
         empty = ca.logic_or(
             ca.logic_or(old.empty, young.empty), ca.logic_or(X.empty(), shown.empty())
         )
-        initialised = self.part["initialised"] > 0.5
-        void = ca.logic_and(initialised, ca.logic_or(empty, self.impossible))
+        one = self.part["initialised"]
+        initialised = ca.logic_and(one > 0.5, one < 1.5)
+        contradicted = ca.logic_or(empty, ca.logic_or(self.impossible, ca.logic_not(self._counts)))
+        void = ca.logic_and(initialised, contradicted)
         F = shown.where(have, self.reset[1]) if self.guard.delay else shown
         X, F = self._returned(X, 0, void, initialised), self._returned(F, 1, void, initialised)
         moved = self._moved(old, young, void)
@@ -235,7 +261,7 @@ class Step:
         N, age = float(self.guard.horizon), self.part["age"] + 1.0
         going = ca.logic_and(ca.logic_not(void), ca.logic_and(self.finite, self.covered))
         over = age >= 2.0 * N - 0.5
-        turn = ca.logic_or(over, ca.fabs(age - N) < 0.5)
+        turn = ca.logic_or(over, self._turns(age))
         moved: dict[str, ca.SX] = {}
         for name in self.guard.sizes:
             mine, other = old.known.moved[name], young.known.moved[name]

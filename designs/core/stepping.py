@@ -81,6 +81,31 @@ def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float]) -> ca.SX:
     return column(ca.if_else(ca.fabs(vector[i]) <= FINITE, vector[i], other[i]) for i in rows)
 
 
+def could_be_written(parts: Mapping[str, ca.SX], nonnegative: Sequence[str], real: str) -> ca.SX:
+    """Return 1 where a step can have written parts of a memory, else 0.
+
+    Some are not negative, ends of boxes are in order, and the sum of all others is a finite number
+    of the precision `real`.
+    """
+    total, held = ca.SX(0), ca.SX(1)
+    for name, part in parts.items():
+        ends = parts.get(name.replace("_lower", "_upper"))
+        for i in range(part.numel()):
+            if name in nonnegative:
+                held = ca.logic_and(held, part[i] >= 0.0)
+            elif name.endswith("_lower") and ends is not None:
+                held = ca.logic_and(held, part[i] <= ends[i])
+            elif not (name.endswith("_upper") and name.replace("_upper", "_lower") in parts):
+                total = total + part[i]
+    largest = np.finfo("f4" if real == "single" else "f8").max
+    return ca.logic_and(held, ca.fabs(total) <= float(largest))
+
+
+def counter(count: ca.SX, limit: float) -> ca.SX:
+    """Return a counter, zero in place of what lies outside of [0, limit] or is no number."""
+    return ca.if_else(ca.logic_and(count >= 0.0, count <= limit), count, 0.0)
+
+
 def extended(
     ode: ca.Function, sizes: Mapping[str, int], layout: Mapping[str, slice], mark: str
 ) -> ca.Function:

@@ -20,6 +20,7 @@ from obsynth.designs.core.observer import (
     STEP_OUTPUTS,
     Observer,
 )
+from obsynth.designs.core.stepping import counter
 from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
@@ -224,8 +225,9 @@ class FaultDetector:
             for lower, upper, sound in zip(told[::3], told[1::3], valid, strict=True):
                 apart = ca.logic_or(lower[i] > 0, upper[i] < 0)
                 outside = ca.logic_or(outside, ca.logic_and(sound, apart))
-            counted = ca.if_else(outside, ca.fmin(count[i] + 1, needed), 0)
-            kept = ca.if_else(bit("void", told[2]), 0, count[i])
+            before = counter(count[i], needed)
+            counted = ca.if_else(outside, ca.fmin(before + 1, needed), 0)
+            kept = ca.if_else(bit("void", told[2]), 0, before)
             following.append(ca.if_else(ca.logic_or(valid[0], outside), counted, kept))
             alarm.append(following[-1] >= needed)
         return ca.Function(

@@ -26,7 +26,7 @@ from obsynth.designs.core.equations import Before, Equations
 from obsynth.designs.core.lifted import Lifted, Rounding, combine
 from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
 from obsynth.designs.core.step import HUGE
-from obsynth.designs.core.stepping import slices
+from obsynth.designs.core.stepping import counter, slices
 from obsynth.designs.detection.relations import relations
 from obsynth.symbolic.arrays import FloatArray
 
@@ -84,14 +84,14 @@ class Window:
         newest = ca.vertcat(*(e.lower for e in row), *(e.upper for e in row))
         parts = ca.vertcat(newest, part["parts"])
         going = ca.logic_and(good, part["ready"] > 0.5)
-        count = ca.if_else(going, ca.fmin(part["count"] + 1, self.m), 0)
+        count = ca.if_else(going, ca.fmin(counter(part["count"], self.m) + 1, self.m), 0)
         full = count > self.m - 0.5
         mean = declared.meet(self._mean(parts, now))
         void = ca.logic_and(full, mean.empty())
         mean = mean.where(ca.logic_and(full, ca.logic_not(void)), declared)
         word, since = STATUS["fault_not_valid"] * ca.logic_not(full), []
         for i, name in enumerate(_JOINED):
-            age = ca.fmin(part["since"][i] + 1, self.m + 1)
+            age = ca.fmin(counter(part["since"][i], self.m + 1) + 1, self.m + 1)
             since.append(ca.if_else(bit[name], 0, age))
             flag = since[i] < self.m + 0.5
             word += STATUS[name] * (ca.logic_or(flag, void) if name == "void" else flag)

@@ -262,4 +262,4 @@ def build_core(design: GeneralDesign) -> Core:
         ends = (column(end[k] for k in design.places) for end in (f.lower, f.upper))
         return {"prediction": ca.vertcat(near, Ends(*ends).nearest(kept["prediction"][n:]))}
 
-    return Core(run, begin, place, domain=domain)
+    return Core(run, begin, place, domain=domain, nonnegative=("bound",))

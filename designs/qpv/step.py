@@ -284,7 +284,7 @@ def build_core(design: QPVDesign) -> Core:
 
     c, half = design.region.c[:n], design.region.half_widths[:n]
     domain = np.column_stack([c - half * _UP, c + half * _UP])
-    return Core(run, begin, place, domain=domain, bridges=True)
+    return Core(run, begin, place, domain=domain, bridges=True, nonnegative=("level",))
 
 
 def found_again(design: QPVDesign) -> bool:

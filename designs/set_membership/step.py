@@ -306,4 +306,5 @@ def build_core(design: SetMembershipDesign) -> Core:
     """Build the bank."""
     bank = Bank(design)
     place, domain = (None, None) if bank.inner is None else (bank.place, bank.inner.domain)
-    return Core(bank.run, bank.begin, place, domain, bridges=True, advance=bank.advance)
+    signs = ("bound", "clock")
+    return Core(bank.run, bank.begin, place, domain, True, advance=bank.advance, nonnegative=signs)

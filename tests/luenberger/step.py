@@ -73,4 +73,5 @@ def build_core(design: LuenbergerDesign) -> Core:
         xhat = clip(kept["prediction"], box)
         return {"bound": ca.fmax(x.upper - xhat, xhat - x.lower) * UP + 2.0**-40 * ca.fabs(xhat)}
 
-    return Core(run, begin, lambda x, f, kept: kept, domain=box, bridges=True)
+    own = {"domain": box, "bridges": True, "nonnegative": ("bound",)}
+    return Core(run, begin, lambda x, f, kept: kept, **own)
