@@ -5,8 +5,14 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from obsynth.codegen.description import describe
+from obsynth.codegen.single import machine_of
+from obsynth.codegen.vectors import Drive
+from obsynth.designs.core.observer import STEP_OUTPUTS
 
 HERE = Path(__file__).parent
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O2")
@@ -19,8 +25,10 @@ CORES: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 TICK, TURNS = 40, 100_000
 """Instructions a tick of SysTick (25 MHz, one instruction a nanosecond), turns of the loop."""
+RECORDS, TIMED, SPOILT = 256, 64, 4
+"""Steps, how many of them are counted, and every which of the others has a number spoilt."""
 _NOTHING = 2
-_REPORT = 5
+_REPORT = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +38,15 @@ class Ran:
     found: outputs, status, next memory of every record, (N, n)
     instructions: of one call, mean over the timed records, between entry and return
     stack: bytes below the caller, those of the libraries included
-    text: bytes of code and constants of the project alone
+    text: bytes of code and constants of the step alone
+    selftest: the first step of the project's own test that differs, 0 if none does
     """
 
     found: np.ndarray
     instructions: float
     stack: int
     text: int
+    selftest: int
 
 
 def _first_line(program: str) -> str:
@@ -61,17 +71,17 @@ def run(
     include: Sequence[Path],
     records: np.ndarray,
     width: int,
-    timed: int,
 ) -> Ran:
     """Build and run the steps of one project on one board.
 
+    sources: the step, and what has ``NAME_selftest`` where there is one
     records: states and inputs (N, n), of the project's type
     width: how many numbers a step returns
-    timed: over how many records, the first ones, instructions are counted
     """
     board, machine = CORES[core]
     build = ["arm-none-eabi-gcc", *machine, *FLAGS, *(f"-I{path.absolute()}" for path in include)]
-    told = [f'-DPROJECT="{name}.h"', f"-DNAME={name}", f"-DTIMED={timed}"]
+    told = [f'-DPROJECT="{name}.h"', f"-DNAME={name}", f"-DTIMED={TIMED}"]
+    told += ["-DSELFTEST"] if len(sources) > 1 else []
     script = ["-nostartfiles", "-T", str(HERE / "mps2.ld")]
     emulate = ["qemu-system-arm", "-M", board, "-nographic", "-monitor", "none", "-serial", "none"]
     with tempfile.TemporaryDirectory(prefix="obsynth-firmware-") as place:
@@ -91,19 +101,20 @@ def run(
         objects = [f"{source.stem}.o" for source in sources]
         for source, built in zip(sources, objects, strict=True):
             call(*build, "-c", str(source.absolute()), "-o", built)
-        sizes = call("arm-none-eabi-size", *objects).splitlines()[1:]
+        text = int(call("arm-none-eabi-size", objects[0]).splitlines()[1].split()[0])
         call(*build, *told, *script, str(HERE / "main.c"), *objects, "-lm", "-o", "firmware.elf")
         call(*emulate, "-icount", "shift=0", "-semihosting", "-kernel", "firmware.elf")
         raw = (Path(place) / "results.bin").read_bytes()
-    text = sum(int(line.split()[0]) for line in sizes)
-    loop, nothing, step, stack, modes = np.frombuffer(raw[: 4 * _REPORT], np.uint32).tolist()
+    head = 4 * _REPORT
+    loop, nothing, step, stack, modes, selftest = np.frombuffer(raw[:head], np.uint32).tolist()
     # two instructions a turn
     if abs(loop * TICK - 2 * TURNS) > 2 * TICK:
         raise RuntimeError(f"{core}: {2 * TURNS} instructions are counted as {loop * TICK}")
     if modes:
         raise RuntimeError(f"{core}: the FPU flushes, or rounds in another way: FPSCR {modes:#x}")
-    found = np.frombuffer(raw[4 * _REPORT :], records.dtype).reshape(len(records), width)
-    return Ran(found, (step - nothing) * TICK / timed + _NOTHING, stack, text)
+    found = np.frombuffer(raw[head:], records.dtype).reshape(len(records), width)
+    instructions = (step - nothing) * TICK / TIMED + _NOTHING
+    return Ran(found, instructions, stack, text, selftest)
 
 
 def apart(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -114,3 +125,31 @@ def apart(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
     a, b = (np.where(v < 0, ~(v & most), v) for v in (a, b))
     both = np.isnan(expected) & np.isnan(found)
     return np.where(both, 0, np.abs(a - b)).astype(float)
+
+
+def recorded(observer: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return states with inputs, and what CasADi's machine (NumPy's float32) makes of them.
+
+    Along trajectories of the plant; behind the timed ones a number of one in `SPOILT` is extreme.
+    """
+    description, rng = describe(observer), np.random.default_rng(0)
+    real = description.real.type
+    step, drive = machine_of(observer.step, description.real), Drive(description, rng)
+    largest, least = np.finfo(real).max, np.finfo(real).smallest_subnormal
+    extremes = np.array([np.nan, np.inf, -np.inf, largest, -largest, least, -0.0, 0.0], real)
+    status = STEP_OUTPUTS.index("status")
+    given, made = [], []
+    for k in range(RECORDS):
+        if k % TIMED == 0:
+            begun = drive.begin(TIMED)
+            memory = description.start if begun is None else begun
+        parts = [memory, *drive.sample(k % TIMED)]
+        row = np.concatenate(parts).astype(real)
+        if k >= TIMED and k % SPOILT == 0:
+            first = memory.size if k % (2 * SPOILT) else 0
+            row[rng.integers(first, row.size)] = rng.choice(extremes)
+        results = step(*np.split(row, np.cumsum([part.size for part in parts[:-1]])))
+        memory, reported = results[0], results.pop(status)
+        given.append(row)
+        made.append(np.concatenate([*results[1:], reported, memory]))
+    return np.array(given), np.array(made, real)

@@ -12,11 +12,14 @@
 #define JOIN(a, b) JOIN_(a, b)
 #define OF(part) JOIN(NAME, part)
 
-typedef OF(_real_t) real;
+typedef OF(_real_t) number_t;
 typedef OF(_state_t) state_t;
 typedef OF(_in_t) in_t;
 typedef OF(_out_t) out_t;
 typedef int step_t(state_t *, const in_t *, out_t *);
+#ifdef SELFTEST
+int OF(_selftest)(void);
+#endif
 typedef struct {
     state_t state;
     in_t in;
@@ -38,6 +41,7 @@ static struct {
     uint32_t loop, nothing, step; /* ticks of 40 instructions: 100,000 turns, no step, steps */
     uint32_t stack;               /* bytes below the caller */
     uint32_t fpscr;               /* modes that were set, before or after */
+    uint32_t selftest;            /* the first step of it that differs */
 } report;
 static state_t state;
 static in_t in;
@@ -155,14 +159,17 @@ static void reset(void)
         leave(5u);
     }
     file = (uint32_t)host(0x01, open);
+#ifdef SELFTEST
+    report.selftest = (uint32_t)OF(_selftest)();
+#endif
     report.fpscr |= modes();
     write(file, &report, sizeof report);
     for (record = records; record < records_end; ++record) {
-        real status;
+        number_t status;
 
         state = record->state;
         in = record->in;
-        status = (real)OF(_step)(&state, &in, &out);
+        status = (number_t)OF(_step)(&state, &in, &out);
         write(file, &out, sizeof out);
         write(file, &status, sizeof status);
         write(file, &state, sizeof state);
