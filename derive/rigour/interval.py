@@ -112,7 +112,8 @@ def outward(box: FloatArray, precision: str) -> FloatArray:
     """Return a box, shape (n, 2), whose ends are numbers of the precision and that holds it."""
     if precision == "double":
         return np.array(box, dtype=float)
-    single = np.asarray(box, dtype=np.float32)
+    with np.errstate(over="ignore"):
+        single = np.asarray(box, dtype=np.float32)
     low = np.where(single[:, 0] > box[:, 0], np.nextafter(single[:, 0], -np.inf), single[:, 0])
     high = np.where(single[:, 1] < box[:, 1], np.nextafter(single[:, 1], np.inf), single[:, 1])
     return np.column_stack([low, high]).astype(float)

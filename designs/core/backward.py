@@ -42,7 +42,7 @@ def contract(
     """
     nodes = needed(program, list(told))
     found = dict(zip(nodes, lift(program, nodes, variables, rounding), strict=True))
-    found |= {index: _meet(found[index], known) for index, known in told.items()}
+    found |= {index: _meet(found[index], known, rounding) for index, known in told.items()}
     loose: set[int] = set()  # what does not depend on known numbers alone
     for index in nodes:
         node = program.nodes[index]
@@ -58,7 +58,7 @@ def contract(
             if index in cut and operand in loose and (index in sure or _defined(node, args)):
                 value = backward.operand(node, k, found[index], args)
                 if value is not None:
-                    found[operand] = _meet(found[operand], value)
+                    found[operand] = _meet(found[operand], value, rounding)
                     cut.add(operand)
     inputs = {program.nodes[k].number: k for k in cut if program.nodes[k].op == "input"}
     seen = [found[k] for k in sorted({*told, *inputs.values()})]
@@ -89,14 +89,14 @@ def _defined(node: Node, args: list[Lifted]) -> bool:
     return not np.isnan(ends).any()
 
 
-def _meet(a: Lifted, b: Lifted) -> Lifted:
+def _meet(a: Lifted, b: Lifted, rounding: Rounding) -> Lifted:
     """Cut an interval; its numbers change only where they gain a sign."""
     lower, upper = ca.fmax(a.lower, b.lower), ca.fmin(a.upper, b.upper)
     low, high = a.low, a.high
     if low <= 0.0 <= b.low != low:
-        low, lower = b.low, ca.fmax(lower, b.low)
+        low, lower = b.low, ca.fmax(lower, rounding.around(b.low, b.low)[0])
     if high >= 0.0 >= b.high != high:
-        high, upper = b.high, ca.fmin(upper, b.high)
+        high, upper = b.high, ca.fmin(upper, rounding.around(b.high, b.high)[1])
     return Lifted(lower, upper, low, high)
 
 
@@ -148,6 +148,10 @@ class _Backward:
             return contract(program, {program.outputs[0]: z}, args, self.rounding)[0][k]
         return None if form is None else form(self, k, z, args, node.number)
 
+    def within(self, a: Lifted, limit: float) -> ca.SX:
+        """Whether an interval is between -limit and limit, which is rounded."""
+        return _inside(a, limit * (1.0 - self.rounding.step))
+
     def do(self, op: str, *args: Lifted, number: int = 0) -> Lifted:
         return combine(op, *args, rounding=self.rounding, number=number)
 
@@ -165,8 +169,9 @@ class _Backward:
 
     def monotone(self, function: _Map, z: Lifted, units: float = _UNITS, sign: int = 1) -> Lifted:
         """Return what an inverse makes of both ends; it falls if the sign is -1."""
-        lower = z.lower - ca.if_else(z.lower <= -FAR, np.inf, 0.0) if z.low <= -FAR else z.lower
-        upper = z.upper + ca.if_else(z.upper >= FAR, np.inf, 0.0) if z.high >= FAR else z.upper
+        lower, upper, far = z.lower, z.upper, self.rounding.limits.far
+        lower = lower - ca.if_else(lower <= -far, np.inf, 0.0) if z.low <= -FAR else lower
+        upper = upper + ca.if_else(upper >= far, np.inf, 0.0) if z.high >= FAR else upper
         ends = [function(lower), function(upper)][::sign]
         return self.rounding.interval(ends[0], ends[1], -FAR, FAR, units)
 
@@ -208,10 +213,10 @@ class _Backward:
 
     def cosine(self, k: int, z: Lifted, args: list[Lifted], n: int) -> Lifted:
         size = self.monotone(ca.acos, z, sign=-1)
-        return _where(_inside(args[0], _PI), _either(args[0], size))
+        return _where(self.within(args[0], _PI), _either(args[0], size))
 
     def atan(self, k: int, z: Lifted, args: list[Lifted], n: int) -> Lifted:
-        return _where(_inside(z, _HALF), self.monotone(ca.tan, z))
+        return _where(self.within(z, _HALF), self.monotone(ca.tan, z))
 
 
 _Form = Callable[[_Backward, int, Lifted, list[Lifted], int], Lifted | None]
@@ -224,7 +229,9 @@ def _through(inverse: _Map, low: float = -FAR, high: float = FAR, sign: int = 1)
 
 def _branch(inverse: _Map) -> _Form:
     """Return the form of a circular function that increases up to a quarter of a period."""
-    return lambda self, k, z, args, n: _where(_inside(args[0], _HALF), self.monotone(inverse, z))
+    return lambda self, k, z, args, n: _where(
+        self.within(args[0], _HALF), self.monotone(inverse, z)
+    )
 
 
 _PAIRS = (("exp", ca.log), ("expm1", ca.log1p), ("log", ca.exp), ("log1p", ca.expm1))

@@ -7,9 +7,12 @@ from functools import reduce
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour import Interval
-from obsynth.designs.core.lifted import FAR
+from obsynth.derive.rigour import Interval, outward
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.symbolic.arrays import FloatArray
+
+_NUMBER = 2.0**120
+"""Estimates beyond count as no number, in either precision."""
 
 
 def cut_box(
@@ -51,6 +54,12 @@ def select(condition: ca.SX, then: ca.SX, otherwise: ca.SX) -> ca.SX:
     return column(ca.if_else(condition, then[i], otherwise[i]) for i in range(then.numel()))
 
 
+def near_box(box: FloatArray, precision: str) -> FloatArray:
+    """Return a box, (n, 2), with what stands for no bound in code in place of such ends."""
+    near: FloatArray = np.clip(box, -LIMITS[precision].far, LIMITS[precision].far)
+    return near
+
+
 @dataclass(frozen=True, eq=False)
 class Ends:
     """A box of code: lower and upper ends, columns."""
@@ -59,21 +68,21 @@ class Ends:
     upper: ca.SX
 
     @classmethod
-    def of(cls, box: FloatArray) -> "Ends":
-        """Return a box of numbers, shape (n, 2)."""
-        near = np.clip(box, -FAR, FAR)
+    def of(cls, box: FloatArray, precision: str = "double") -> "Ends":
+        """Return a box of numbers, shape (n, 2), its ends outside in the precision."""
+        near = outward(near_box(box, precision), precision)
         return cls(ca.SX(ca.DM(near[:, 0])), ca.SX(ca.DM(near[:, 1])))
 
     @classmethod
-    def unbounded(cls, n: int) -> "Ends":
+    def unbounded(cls, n: int, precision: str = "double") -> "Ends":
         """Return a box that holds everything."""
-        return cls.of(np.full((n, 2), [-np.inf, np.inf]))
+        return cls.of(np.full((n, 2), [-np.inf, np.inf]), precision)
 
-    @property
-    def middle(self) -> ca.SX:
-        """The middle, rounded to any side; zero where there is no bound."""
+    def middle(self, precision: str = "double") -> ca.SX:
+        """Return the middle, rounded to any side; zero where there is no bound."""
         middle, width = 0.5 * self.lower + 0.5 * self.upper, self.upper - self.lower
-        return column(ca.if_else(width[i] < FAR, middle[i], 0.0) for i in range(middle.numel()))
+        far = LIMITS[precision].far
+        return column(ca.if_else(width[i] < far, middle[i], 0.0) for i in range(middle.numel()))
 
     def meet(self, other: "Ends") -> "Ends":
         """Cut with another box; an end of it that is not a number cuts nothing."""
@@ -87,7 +96,7 @@ class Ends:
     def nearest(self, value: ca.SX) -> ca.SX:
         """Return the nearest point of the box; of zero for what is not a number."""
         rows = range(value.numel())
-        numbers = [ca.if_else(ca.fabs(value[i]) <= FAR, value[i], 0.0) for i in rows]
+        numbers = [ca.if_else(ca.fabs(value[i]) <= _NUMBER, value[i], 0.0) for i in rows]
         return column(ca.fmin(ca.fmax(numbers[i], self.lower[i]), self.upper[i]) for i in rows)
 
     def where(self, condition: ca.SX, other: "Ends") -> "Ends":

@@ -162,7 +162,7 @@ class Contractor:
         rows = [
             self.equations.image(i, before, self.rounding)
             if "image" in self.cuts and usable[i]
-            else Lifted.number(-FAR, FAR)
+            else self.rounding.number(-FAR, FAR, self.rounding.limits.far)
             for i in range(self.equations.n)
         ]
         return Ends(ca.vertcat(*(r.lower for r in rows)), ca.vertcat(*(r.upper for r in rows)))
@@ -181,10 +181,10 @@ class Contractor:
 
     def drift(self, F: Ends) -> Ends:
         """Return where the faults can be one call later, by their rates."""
-        low, high = ca.SX(F.lower), ca.SX(F.upper)
+        low, high, far = ca.SX(F.lower), ca.SX(F.upper), self.rounding.limits.far
         for j, rate in enumerate(self.rates.tolist()):
             if not np.isfinite(rate) or "rates" not in self.cuts:
-                low[j], high[j] = -FAR, FAR
+                low[j], high[j] = -far, far
             elif rate > 0.0:
                 low[j] = self.rounding.down(low[j] - rate)
                 high[j] = self.rounding.up(high[j] + rate)

@@ -251,7 +251,7 @@ class Equations:
             least[j] = most[j] = Lifted.point(middle, value.low, value.high)
             radius = rounding.up(ca.fmax(value.upper - middle, middle - value.lower))
             limit = float(np.abs(self.slopes[row, j]).max())
-            size = ca.fmin(slope.magnitude, limit)
+            size = ca.fmin(slope.magnitude, limit) if limit < FAR else slope.magnitude
             part = combine(
                 "multiply",
                 Lifted.point(size, 0.0, min(limit, FAR)),

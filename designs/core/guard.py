@@ -30,11 +30,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import outward
+from obsynth.designs.core.boxes import near_box
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
-from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.record import Precision, precision_of
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.core.sweeps import Sweeps
@@ -152,7 +152,7 @@ class Guard:
         ends: dict[str, ArrayLike] = {}
         layout = self.layout()
         for name, box in boxes.items():
-            near = np.clip(outward(box, self.precision), -FAR, FAR)
+            near = outward(near_box(box, self.precision), self.precision)
             ends |= {f"{name}_lower": near[:, 0], f"{name}_upper": near[:, 1]}
         own = {**parts, **ends, "begin": np.array([float(self.discrete)])}
         both = own | {k + YOUNG: v for k, v in own.items() if k not in self.shared}

@@ -9,12 +9,14 @@ has no lifted form is enclosed by these numbers alone.
 One rounded operation is exact up to half a unit in the last place, so ``l - 2 u |l|``, u the unit
 roundoff, is below the exact result: l minus one unit is a number of the format and not above it.
 Products and quotients may underflow as well, which `tiny` covers. What the mathematics library
-returns is stepped by `ULPS` units. There are no infinities: `FAR` stands for them.
+returns is stepped by `ULPS` units. There are no infinities: among numbers `FAR` stands for them, in
+code `Rounding.far` for signals and `Rounding.largest` for nodes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,11 +25,10 @@ from obsynth.derive.intervals.functions import ULPS
 from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import PARTIAL, RULES
-from obsynth.derive.rigour.interval import UNIT
+from obsynth.derive.rigour.interval import UNIT, outward
 
 FAR = 1e100
-"""Ends from which on a signal is not bounded at all."""
-_TINY = {"double": 2.0**-1021, "single": 2.0**-125}
+"""Numbers from which on a signal is not bounded at all, whatever the precision of code."""
 _TWO_PI = 2.0 * np.pi
 _LARGE_ANGLE = 1e8
 
@@ -60,11 +61,39 @@ class Lifted:
         return -self.lower if self.high <= 0.0 else ca.fmax(-self.lower, self.upper)
 
 
+class Limits(NamedTuple):
+    """Numbers that a precision has room for, each small enough for products of three of the next.
+
+    tiny: above what underflow takes
+    far: ends of signals that are not bounded; the truth is not beyond
+    finite: what is larger counts as no number; CasADi folds ``y == y`` to 1, so size is what tells
+    huge: widths of sets from which on they say nothing; declared ranges are within
+    largest: ends of nodes that are not bounded
+    """
+
+    tiny: float
+    far: float
+    finite: float
+    huge: float
+    largest: float
+
+
+LIMITS = {
+    "double": Limits(2.0**-1021, FAR, 1e90, 1e50, FAR),
+    "single": Limits(2.0**-125, 2.0**40, 2.0**39, 2.0**36, 2.0**120),
+}
+
+
 @dataclass(frozen=True)
 class Rounding:
     """How results step outwards in a precision."""
 
     precision: str = "double"
+
+    @property
+    def limits(self) -> Limits:
+        """Numbers that stand for what has no bound."""
+        return LIMITS[self.precision]
 
     @property
     def step(self) -> float:
@@ -74,7 +103,28 @@ class Rounding:
     @property
     def tiny(self) -> float:
         """Above what underflow takes."""
-        return _TINY[self.precision]
+        return self.limits.tiny
+
+    def number(self, low: float, high: float, far: float | None = None) -> Lifted:
+        """Return a constant interval with ends of the precision, `far` for what has no bound."""
+        far = self.limits.largest if far is None else far
+        ends = np.where(
+            np.abs([low, high]) < min(FAR, self.limits.largest), [low, high], [-far, far]
+        )
+        lower, upper = self.around(*ends.tolist())
+        return Lifted(ca.SX(lower), ca.SX(upper), low, high)
+
+    def around(self, low: float, high: float) -> tuple[float, float]:
+        """Return numbers of the precision around an interval of numbers."""
+        lower, upper = outward(np.array([[low, high]]), self.precision)[0].tolist()
+        return lower, upper
+
+    def signal(self, value: Lifted) -> Lifted:
+        """Return a variable; one between numbers has ends of the precision."""
+        if not (value.lower.is_constant() and value.upper.is_constant()):
+            return value
+        ends = self.number(float(value.lower), float(value.upper), self.limits.far)
+        return replace(ends, low=value.low, high=value.high)
 
     def down(self, value: ca.SX, units: float = 1.0, tiny: bool = False) -> ca.SX:
         """Return a number below a value whose rounding error is at most that many half units."""
@@ -121,9 +171,9 @@ def lift(
         node = program.nodes[index]
         if index in program.constants:
             low, high = (float(end[0]) for end in program.constants[index])
-            found[index] = Lifted.number(*_within(low, high))
+            found[index] = arithmetic.rounding.number(*_within(low, high))
         elif node.op == "input":
-            found[index] = variables[node.number]
+            found[index] = arithmetic.rounding.signal(variables[node.number])
         else:
             found[index] = arithmetic.apply(node, [found[a] for a in node.args])
     return [found[index] for index in nodes]
@@ -154,7 +204,7 @@ def is_point(a: Lifted) -> bool:
 def _within(low: float, high: float) -> tuple[float, float]:
     """Return numbers with `FAR` in place of what is beyond, or unknown."""
     known = not (np.isnan(low) or np.isnan(high))
-    return (max(low, -FAR), min(high, FAR)) if known else (-FAR, FAR)
+    return (low if low > -FAR else -FAR, high if high < FAR else FAR) if known else (-FAR, FAR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +221,15 @@ class _Arithmetic:
         low, high = _within(low, high)
         form = _FORMS.get(node.op)
         if form is None or (nowhere and node.op != "divide"):
-            return Lifted.number(low, high)
+            return self.rounding.number(low, high)
         lifted = form(
-            self, [clamped(a) for a in args] if node.op in PARTIAL else args, low, high, *extra
+            self,
+            [clamped(a, self.rounding) for a in args] if node.op in PARTIAL else args,
+            low,
+            high,
+            *extra,
         )
-        return Lifted.number(low, high) if lifted is None else lifted
+        return self.rounding.number(low, high) if lifted is None else lifted
 
     def add(self, args: list[Lifted], low: float, high: float) -> Lifted:
         a, b = args
@@ -236,7 +290,8 @@ class _Arithmetic:
         found = self.rounding.interval(
             reduce(ca.fmin, quotients), reduce(ca.fmax, quotients), -FAR, FAR
         )
-        return Lifted(ca.if_else(apart, found.lower, -FAR), ca.if_else(apart, found.upper, FAR))
+        far = self.rounding.limits.largest
+        return Lifted(ca.if_else(apart, found.lower, -far), ca.if_else(apart, found.upper, far))
 
     def power_int(self, args: list[Lifted], low: float, high: float, n: int) -> Lifted:
         (a,) = args
@@ -348,11 +403,13 @@ class _Arithmetic:
         return self.select([*args, Lifted.number(0.0)], low, high)
 
 
-def clamped(a: Lifted) -> Lifted:
+def clamped(a: Lifted, rounding: Rounding) -> Lifted:
     """Keep the ends between the numbers, where an operation is not defined beyond them."""
+    low, high = rounding.around(a.low, a.high)
     if ca.SX(a.lower).is_constant() and ca.SX(a.upper).is_constant():
         return a
-    return Lifted(ca.fmax(a.lower, a.low), ca.fmin(a.upper, a.high), a.low, a.high)
+    lower = ca.fmax(a.lower, low) if a.low > -FAR else a.lower
+    return Lifted(lower, ca.fmin(a.upper, high) if a.high < FAR else a.upper, a.low, a.high)
 
 
 def _ends(a: Lifted) -> tuple[ca.SX, ...]:
@@ -404,7 +461,7 @@ def _increasing(function: Callable[[ca.SX], ca.SX]) -> Callable[..., Lifted]:
         found = arithmetic.rounding.interval(
             function(args[0].lower), function(args[0].upper), low, high, 2.0 * ULPS
         )
-        return Lifted(ca.fmax(found.lower, low), ca.fmin(found.upper, high), low, high)
+        return clamped(found, arithmetic.rounding)
 
     return form
 

@@ -23,16 +23,13 @@ from obsynth.derive.intervals.functions import ULPS
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import PARTIAL
 from obsynth.designs.core.backward import composed
-from obsynth.designs.core.lifted import FAR, Lifted, Rounding, combine, is_point, lift, needed
+from obsynth.designs.core.lifted import Lifted, Rounding, combine, is_point, lift, needed
 from obsynth.designs.core.lifted import clamped as between
-
-_LIMIT = 1e50
-"""Errors from which on a form says nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """An affine enclosure: slopes by variable, centre and the largest error; `FAR` says nothing."""
+    """An affine enclosure: slopes by variable, centre and the largest error, `far` for none."""
 
     slopes: dict[int, ca.SX]
     centre: ca.SX
@@ -56,6 +53,7 @@ def relax(
     program: Program, nodes: Sequence[int], variables: Sequence[Lifted], rounding: Rounding
 ) -> list[Affine]:
     """Return affine enclosures of nodes over a box; variables that are points are in the centre."""
+    variables = [rounding.signal(v) for v in variables]
     sizes = [v.magnitude for v in variables]
     relaxation = _Relaxation(rounding, 16.0 * rounding.tiny * sum(sizes, ca.SX(1)))
     given = [
@@ -127,7 +125,10 @@ class _Relaxation:
             return self.sum([(ca.SX(w), a) for w, (_, a) in zip(_LINEAR[op], args, strict=True)])
         if op in _FORMS:
             return _FORMS[op](self, z, args)
-        a, exponent = between(args[0][0]) if op in PARTIAL else args[0][0], args[-1][0]
+        a, exponent = (
+            between(args[0][0], self.rounding) if op in PARTIAL else args[0][0],
+            args[-1][0],
+        )
         if op == "power_int" and number == 2:
             return self.square(z, args)
         if not args[0][1].slopes or (op == "power_const" and exponent.low != exponent.high):
@@ -155,7 +156,7 @@ class _Relaxation:
         return _Form({}, middle, radius, ca.fabs(middle))
 
     def known(self, a: _Form) -> Affine:
-        """Add what rounding has taken, and say `FAR` where there is no bound or no number.
+        """Add what rounding has taken, and say `Limits.far` where there is no bound or no number.
 
         A node with weights w of others has lost two roundings of its size T = sum |w_i| T_i + |q|
         and |w_i| times what these have; T holds every slope times its variable, and the centre.
@@ -163,9 +164,12 @@ class _Relaxation:
         step = self.rounding.step
         error = (1.0 + (8 + 12 * a.depth) * step) * (a.error + (2.0 * a.depth * step) * a.size)
         error = error if a.depth else a.error
-        known = error < _LIMIT
+        limits = self.rounding.limits
+        known = error < limits.huge
         slopes = {j: ca.if_else(known, s, 0.0) for j, s in a.slopes.items()}
-        return Affine(slopes, ca.if_else(known, a.centre, 0.0), ca.if_else(known, error, FAR))
+        return Affine(
+            slopes, ca.if_else(known, a.centre, 0.0), ca.if_else(known, error, limits.far)
+        )
 
     def total(self, error: ca.SX, lost: ca.SX) -> ca.SX:
         """Add two roundings of some numbers and what underflow takes to an error, upwards."""
@@ -277,7 +281,7 @@ class _Relaxation:
         r = self.do("divide", one, b)
         inverse: _Form | None = self.flat(r)
         if form.slopes:
-            inverse = self.chord("inverse", 0, r, (between(b), form), one)
+            inverse = self.chord("inverse", 0, r, (between(b, self.rounding), form), one)
         return None if inverse is None else self.product([args[0], (r, inverse)])
 
 

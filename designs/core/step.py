@@ -5,14 +5,11 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends, column, every, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before, covered_inputs
 from obsynth.designs.core.guard import YOUNG, Guard
-from obsynth.designs.core.lifted import FAR
 from obsynth.designs.core.stepping import (
-    FINITE,
     all_finite,
     could_be_written,
     finite_or,
@@ -20,9 +17,7 @@ from obsynth.designs.core.stepping import (
     status_word,
 )
 from obsynth.designs.core.sweeps import Pair
-
-HUGE = 1e50
-"""Widths of a core's set from which on it knows nothing."""
+from obsynth.symbolic.arrays import FloatArray
 
 
 class _Copy:
@@ -63,13 +58,11 @@ class Step:
                 np.minimum(self.contractor.domain[:, 1], own[:, 1]),
             ]
         )
-        self.domain, x_box, f_box = (
-            outward(box, guard.precision) for box in (self.domain, x_box, f_box)
-        )
-        self.reset = Ends.of(x_box), Ends.of(f_box)
-        self.ranges = Ends.of(self.domain), self.reset[1]
+        self.precision, self.limits = guard.precision, self.contractor.rounding.limits
+        self.reset = self._box(x_box), self._box(f_box)
+        self.ranges = self._box(self.domain), self.reset[1]
         if "ranges" not in self.contractor.cuts:
-            self.ranges = Ends.unbounded(len(x_box)), Ends.unbounded(len(f_box))
+            self.ranges = self._open(len(x_box)), self._open(len(f_box))
         self.layout = guard.layout()
         self.memory = ca.SX.sym("memory", self.layout["initialised"].stop)
         self.u, self.y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output_names))
@@ -79,9 +72,16 @@ class Step:
         for name in (*guard.sizes, "f_lower", "f_upper", "rest_lower", "rest_upper", "before"):
             for key in (name, name + YOUNG):
                 self.part.setdefault(key, empty)
-        self.finite = ca.logic_and(all_finite(self.u), all_finite(self.theta))
+        finite = self.limits.finite
+        self.finite = ca.logic_and(all_finite(self.u, finite), all_finite(self.theta, finite))
         self.u_used, self.theta_used, self.covered = self._signals()
         self.used, self.left_out, self.impossible = self._readings()
+
+    def _box(self, box: FloatArray) -> Ends:
+        return Ends.of(box, self.precision)
+
+    def _open(self, n: int) -> Ends:
+        return Ends.unbounded(n, self.precision)
 
     def _signals(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Make inputs and scheduling finite, and tell whether they are covered.
@@ -94,7 +94,8 @@ class Step:
         measured = [s for s in plant.rho if s.measured]
         nominal = [0.0 if s.nominal is None else float(s.nominal) for s in plant.u]
         middle = [0.5 * (s.lower + s.upper) if s.bounded else 0.0 for s in measured]
-        u, theta = finite_or(self.u, nominal), finite_or(self.theta, middle)
+        finite = self.limits.finite
+        u, theta = finite_or(self.u, nominal, finite), finite_or(self.theta, middle, finite)
         matters = covered_inputs(plant).tolist()
         held = [(u[i], s) for i, s in enumerate(plant.u) if matters[i]]
         pairs = [(theta[i], s) for i, s in enumerate(measured)] + held
@@ -106,7 +107,7 @@ class Step:
         declared, shown = self.plant.output_ranges, self.contractor.shown(self.domain)
         used, left_out, impossible = [], ca.SX(0), ca.SX(0)
         for i in range(self.y.numel()):
-            finite = ca.fabs(self.y[i]) <= FINITE
+            finite = ca.fabs(self.y[i]) <= self.limits.finite
             own = bool(np.isfinite(declared[i]).any())
             low, high = declared[i] if own else shown[i]
             fits = ca.logic_and(self.y[i] >= low, self.y[i] <= high)
@@ -121,7 +122,7 @@ class Step:
         kept = {name: self.part[name] for name in self.guard.shared}
         if self.core.place is None:
             return kept
-        X, F = _declared(boxes[0], self.reset[0]), self._faults(boxes[1])
+        X, F = self._declared(boxes[0]), self._faults(boxes[1])
         placed = self.core.place(X, F, kept)
         both = ca.logic_and(*copies)
         return {name: select(both, placed[name], kept[name]) for name in kept}
@@ -137,7 +138,7 @@ class Step:
         X = self.ranges[0]
         if self.guard.discrete and "image" in contractor.cuts:
             X = X.meet(contractor.image(before))
-        X = X.where(have, Ends.of(self.domain).meet(stored))
+        X = X.where(have, self._box(self.domain).meet(stored))
         X = contractor.measure(X, self.y, self.used)
         now = contractor.drift(F).meet(self.ranges[1]).where(have, F)
         known = ca.vertcat(self.u_used, self.theta_used)
@@ -145,8 +146,21 @@ class Step:
         if sweeps is None:
             return Pair(before, Before(X, now, known), ca.SX(0))
         rest = sweeps.rest(part["rest_lower" + end], part["rest_upper" + end])
-        here = Before(X, now, known, Ends.of(sweeps.declared))
+        here = Before(X, now, known, self._box(sweeps.declared))
         return sweeps.run(replace(before, rest=rest), here, have, self.y_clean, self.used)
+
+    def _declared(self, X: Ends) -> Ends:
+        """Return a set with declared ranges in place of ends that nothing bounds."""
+        rows, huge, (declared, _) = range(X.lower.numel()), self.limits.huge, self.reset
+        lower = [ca.if_else(X.lower[i] > -huge, X.lower[i], declared.lower[i]) for i in rows]
+        upper = [ca.if_else(X.upper[i] < huge, X.upper[i], declared.upper[i]) for i in rows]
+        return Ends(ca.vertcat(*lower), ca.vertcat(*upper))
+
+    def _shown(self, ends: ca.SX, sign: float) -> ca.SX:
+        """Write infinity for ends that are none."""
+        far = 0.5 * self.limits.far
+        rows = range(ends.numel())
+        return column(ca.if_else(sign * ends[i] > far, sign * ca.inf, ends[i]) for i in rows)
 
     def _faults(self, F: Ends) -> Ends:
         """Return faults within their ranges, which a core begins from even if they are no cut."""
@@ -159,7 +173,7 @@ class Step:
         names = [name for name in self.guard.sizes if name not in self.guard.shared]
         own = {name: self.part[name + end] for name in names}
         begins = self.part["begin" + end] > 0.5
-        X = _declared(X, self.reset[0]).where(begins, X)
+        X = self._declared(X).where(begins, X)
         begun = core.begin(X, self._faults(now), kept)
         signals = self.u_used, self.theta_used, self.y_clean, self.used, pair
         if core.advance is not None:
@@ -173,7 +187,7 @@ class Step:
         huge = ca.SX(0)
         if known.x is not None:
             widths = ca.vertsplit(known.x.upper - known.x.lower)
-            huge = some(ca.logic_not(width < HUGE) for width in widths)
+            huge = some(ca.logic_not(width < self.limits.huge) for width in widths)
             X = X.meet(known.x).where(told, X)
         late = before.faults
         if self.guard.discrete:
@@ -204,7 +218,7 @@ class Step:
         limits = {"age": 2.0 * self.guard.horizon - 0.5, "since": self.guard.watch.recovery + 0.5}
         counts = [(self.part[name], limit) for name, limit in limits.items()]
         held = every(ca.logic_and(count >= 0.0, count <= limit) for count, limit in counts)
-        return ca.logic_and(held, all_finite(self.part["before"]))
+        return ca.logic_and(held, all_finite(self.part["before"], self.limits.finite))
 
     def build(self) -> ca.Function:
         """Assemble the function."""
@@ -236,24 +250,24 @@ class Step:
         if self.theta.numel():
             inputs["theta"] = self.theta
         # without a reading that its core needs an estimate is no more than the middle of a set
-        xhat = select(old.told, old.known.xhat, X.middle)
-        fhat = select(old.told, old.known.fhat, F.middle)
+        xhat = select(old.told, old.known.xhat, X.middle(self.precision))
+        fhat = select(old.told, old.known.fhat, F.middle(self.precision))
         outputs = {
             "memory": select(initialised, memory, self.memory),
             # estimates of a core without sets are promised for states and faults of any size
             "xhat": old.known.xhat if old.known.x is None else X.nearest(xhat),
             "fhat": old.known.fhat if old.known.f is None else F.nearest(fhat),
-            "x_lower": _open(X.lower, -1.0),
-            "x_upper": _open(X.upper, 1.0),
-            "f_lower": _open(F.lower, -1.0),
-            "f_upper": _open(F.upper, 1.0),
+            "x_lower": self._shown(X.lower, -1.0),
+            "x_upper": self._shown(X.upper, 1.0),
+            "f_lower": self._shown(F.lower, -1.0),
+            "f_upper": self._shown(F.upper, 1.0),
             "status": self._status(initialised, void, have, F, old.known),
         }
         return make_step(inputs, outputs)
 
     def _returned(self, box: Ends, kind: int, void: ca.SX, initialised: ca.SX) -> Ends:
         """Return a set, the declared ranges where it is void, everything before the first call."""
-        everything = Ends.unbounded(box.lower.numel())
+        everything = self._open(box.lower.numel())
         return self.reset[kind].where(void, box).where(initialised, everything)
 
     def _moved(self, old: _Copy, young: _Copy, void: ca.SX) -> dict[str, ca.SX]:
@@ -272,7 +286,7 @@ class Step:
             carried["x"] = (old.X, young.X, self.reset[0])
         if (sweeps := self.guard.sweeps) is not None:
             rests = sweeps.kept(old.rest), sweeps.kept(young.rest)
-            carried["rest"] = (*rests, sweeps.kept(Ends.of(sweeps.declared)))
+            carried["rest"] = (*rests, sweeps.kept(self._box(sweeps.declared)))
         for name, (first, second, reset) in carried.items():
             fresh = second.where(ca.logic_and(going, ca.logic_not(turn)), reset)
             kept = second.where(over, first).where(going, reset)
@@ -295,8 +309,8 @@ class Step:
         if self.guard.delay:
             unknown = ca.logic_or(unknown, ca.logic_not(have))
         for j in range(F.lower.numel() if known.f is not None else 0):
-            unknown = ca.logic_or(unknown, F.lower[j] < -0.5 * FAR)
-            unknown = ca.logic_or(unknown, F.upper[j] > 0.5 * FAR)
+            unknown = ca.logic_or(unknown, F.lower[j] < -0.5 * self.limits.far)
+            unknown = ca.logic_or(unknown, F.upper[j] > 0.5 * self.limits.far)
         recovering = self.part["since"] < self.guard.watch.recovery - 0.5
         out = ca.logic_or(
             ca.logic_not(self.covered), ca.logic_and(known.outside, ca.logic_not(void))
@@ -314,18 +328,3 @@ class Step:
                 ),
             }
         )
-
-
-def _declared(X: Ends, declared: Ends) -> Ends:
-    """Return a set with declared ranges in place of ends that nothing bounds."""
-    rows = range(X.lower.numel())
-    lower = [ca.if_else(X.lower[i] > -HUGE, X.lower[i], declared.lower[i]) for i in rows]
-    upper = [ca.if_else(X.upper[i] < HUGE, X.upper[i], declared.upper[i]) for i in rows]
-    return Ends(ca.vertcat(*lower), ca.vertcat(*upper))
-
-
-def _open(ends: ca.SX, sign: float) -> ca.SX:
-    """Write infinity for ends that are none."""
-    return column(
-        ca.if_else(sign * ends[i] > 0.5 * FAR, sign * ca.inf, ends[i]) for i in range(ends.numel())
-    )

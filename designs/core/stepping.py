@@ -12,8 +12,6 @@ from obsynth.designs.core.boxes import column, every, select
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
-FINITE = 1e90
-"""What is larger counts as no number: CasADi folds ``y == y`` to 1, so size is what tells."""
 MOST_CORNERS = 14
 
 
@@ -70,15 +68,15 @@ def inside(lower: ca.SX, upper: ca.SX, box: FloatArray) -> ca.SX:
     return every(ca.logic_and(lower[i] >= a, upper[i] <= b) for i, (a, b) in ends)
 
 
-def all_finite(vector: ca.SX) -> ca.SX:
-    """Return 1 where every entry is a finite number, else 0."""
-    return every(ca.fabs(vector[i]) <= FINITE for i in range(vector.numel()))
+def all_finite(vector: ca.SX, finite: float) -> ca.SX:
+    """Return 1 where every entry is a number of at most a size (`Limits.finite`), else 0."""
+    return every(ca.fabs(vector[i]) <= finite for i in range(vector.numel()))
 
 
-def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float]) -> ca.SX:
-    """Return the vector with every entry that is no finite number replaced."""
+def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float], finite: float) -> ca.SX:
+    """Return the vector with every entry that is no number of at most that size replaced."""
     rows = range(vector.numel())
-    return column(ca.if_else(ca.fabs(vector[i]) <= FINITE, vector[i], other[i]) for i in rows)
+    return column(ca.if_else(ca.fabs(vector[i]) <= finite, vector[i], other[i]) for i in rows)
 
 
 def could_be_written(parts: Mapping[str, ca.SX], nonnegative: Sequence[str], real: str) -> ca.SX:

@@ -17,7 +17,7 @@ from obsynth.designs.core.backward import contract
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.contractor import SWEEPS, Contractor
 from obsynth.designs.core.equations import Before
-from obsynth.designs.core.lifted import FAR, Lifted
+from obsynth.designs.core.lifted import Lifted
 from obsynth.symbolic.arrays import FloatArray
 
 
@@ -69,7 +69,7 @@ class Sweeps:
 
     def rest(self, lower: ca.SX, upper: ca.SX) -> Ends:
         """Return the rest of the instant before: what was remembered, ranges of all else."""
-        found = Ends.of(self.declared)
+        found = Ends.of(self.declared, self.contractor.precision)
         low, high = ca.SX(found.lower), ca.SX(found.upper)
         for k, j in enumerate(self.carried):
             low[j], high[j] = lower[k], upper[k]
@@ -112,10 +112,10 @@ class Sweeps:
     def _shown(self, now: Before, y: ca.SX, used: Sequence[ca.SX]) -> tuple[Before, ca.SX]:
         """Cut with the readings."""
         program = self.equations.outputs
-        told = {}
+        told, far = {}, self.rounding.limits.far
         for i, node in enumerate(program.outputs):
             if node not in program.constants:
-                low, high = ca.if_else(used[i], y[i], -FAR), ca.if_else(used[i], y[i], FAR)
+                low, high = ca.if_else(used[i], y[i], -far), ca.if_else(used[i], y[i], far)
                 told[node] = Lifted(low, high)
         variables = self.equations.variables(now)
         found, empty = contract(program, told, variables, self.rounding)

@@ -20,12 +20,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.equations import Before, Equations
 from obsynth.designs.core.lifted import Lifted, Rounding, combine
 from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
-from obsynth.designs.core.step import HUGE
 from obsynth.designs.core.stepping import counter, slices
 from obsynth.designs.detection.relations import relations
 from obsynth.symbolic.arrays import FloatArray
@@ -67,13 +65,13 @@ class Window:
         part |= {name[5:]: memory[place] for name, place in self.layout.items()}
         bit = {k: ca.fmod(ca.floor(status / value), 2) >= 1 for k, value in STATUS.items()}
         good = ca.logic_not(ca.logic_or(bit["not_initialised"], bit["void"]))
-        declared = Ends.of(outward(self.plant.box("f").reshape(-1, 2), self.precision))
+        declared = Ends.of(self.plant.box("f").reshape(-1, 2), self.precision)
         F = declared.where(bit["fault_not_valid"], declared.meet(Ends(f_lower, f_upper)))
         earlier = F if self.delay else _unpacked(part["f"])
         X, known, usable, now = Ends(x_lower, x_upper), ca.vertcat(u, theta), good, []
         row: list[Any] = [earlier]
         if equations is not None:
-            X = X.meet(Ends.of(equations.box[: equations.n]))
+            X = X.meet(Ends.of(equations.box[: equations.n], self.precision))
             then = Before(_unpacked(part["x"]), earlier, part["known"])
             r, q = Rounding(self.precision), len(found)
             row += [equations.image(i, then, r) for i in range(2 * q)]
@@ -100,9 +98,14 @@ class Window:
         moved |= {"known": ca.vertcat(*kept), "x": ca.vertcat(X.lower, X.upper)}
         moved |= {"f": ca.vertcat(F.lower, F.upper), "parts": parts[: -newest.numel()]}
         following = ca.vertcat(*(moved[name[5:]] for name in self.layout))
-        results = ca.cse([following, _open(mean.lower), _open(mean.upper), word])
+        results = ca.cse([following, self._open(mean.lower), self._open(mean.upper), word])
         labels = ["memory", *self.sizes], ["next", *MEAN_OUTPUTS]
         return ca.Function("window", [memory, *ports], [*map(ca.densify, results)], *labels)
+
+    def _open(self, ends: ca.SX) -> ca.SX:
+        """Write infinities for ends that some unbounded set went into."""
+        entries, huge = ca.vertsplit(ends), Rounding(self.precision).limits.huge
+        return ca.vertcat(*(ca.if_else(ca.fabs(e) > huge, ca.sign(e) * ca.inf, e) for e in entries))
 
     def _mean(self, parts: ca.SX, now: list[Lifted]) -> Ends:
         """Enclose the means from (F, D, P) of m instants, the newest first, and P of this one."""
@@ -147,9 +150,3 @@ def _unpacked(ends: ca.SX) -> Ends:
     """Return a box from its lower ends with the upper ones behind."""
     half = ends.numel() // 2
     return Ends(ends[:half], ends[half:])
-
-
-def _open(ends: ca.SX) -> ca.SX:
-    """Write infinities for ends that some unbounded set went into."""
-    entries = (ends[j] for j in range(ends.numel()))
-    return ca.vertcat(*(ca.if_else(ca.fabs(e) > HUGE, ca.sign(e) * ca.inf, e) for e in entries))

@@ -11,7 +11,7 @@ from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends, column, every, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray
@@ -130,7 +130,7 @@ def build_core(design: BankDesign) -> Core:
     """
     outputs = design.outputs.tolist()
     box = outward(design.region, design.precision)
-    region = ca.DM(box)
+    region, precision = ca.DM(box), design.precision
 
     def run(seen: Seen) -> Known:
         parts = seen.memory
@@ -154,11 +154,19 @@ def build_core(design: BankDesign) -> Core:
         for side, ends in zip(("lower", "upper"), X, strict=True):
             moved[f"shown_{side}"] = ca.vertcat(*(ends[i] for i in outputs))
         x = Ends(low, high)
-        return Known(x.middle, f.middle, x, f, moved, sound=contained, empty=contradicted)
+        return Known(
+            x.middle(design.precision),
+            f.middle(design.precision),
+            x,
+            f,
+            moved,
+            sound=contained,
+            empty=contradicted,
+        )
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
         response = ca.SX.zeros(len(design.gain) * len(design.filters))
-        near = x.meet(Ends.of(box))
+        near = x.meet(Ends.of(box, precision))
         return {**begun(design, (near.lower, near.upper)), "response": response}
 
     return Core(run, begin, domain=box, bridges=True, mean_fault=True)
@@ -226,7 +234,7 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
     numbers while it is zero.
     """
     outputs, rates = design.outputs.tolist(), len(design.filters)
-    found = []
+    found, far = [], LIMITS[design.precision].far
     for number in range(rates):
         low, high = [], []
         for j, i in enumerate(design.fault_rows.tolist()):
@@ -239,8 +247,8 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
             started = N > 0.0 if rises else N < 0.0
             safe = ca.if_else(started, N, 1.0)
             ends = (below - slack, above + slack) if rises else (above + slack, below - slack)
-            low.append(ca.if_else(started, ends[0] / safe, -FAR))
-            high.append(ca.if_else(started, ends[1] / safe, FAR))
+            low.append(ca.if_else(started, ends[0] / safe, -far))
+            high.append(ca.if_else(started, ends[1] / safe, far))
         found.append(Ends(ca.vertcat(*low), ca.vertcat(*high)))
     return found
 

@@ -11,7 +11,7 @@ from obsynth.designs.core.boxes import Ends, column
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.running import (
     ROUND_UP,
     SETTLED,
@@ -217,7 +217,7 @@ def build_core(design: GeneralDesign) -> Core:
     """
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
-    limits = Limits.of(plant)
+    limits, far = Limits.of(plant), LIMITS[design.precision].far
     bounds = running(design)
     names, followed = design.plant.names("f"), design.extended.followed
     own = curved_states(plant, noise=True)[:n]
@@ -249,7 +249,7 @@ def build_core(design: GeneralDesign) -> Core:
             c[:n],
             spread(c, 0.0),
             Ends(low[:n], high[:n]),
-            Ends(spread(low, -FAR), spread(high, FAR)) if followed else None,
+            Ends(spread(low, -far), spread(high, far)) if followed else None,
             moved,
             sound=sound,
         )

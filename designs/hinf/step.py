@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.boxes import Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.core.stepping import all_finite, clip, inside
 from obsynth.designs.hinf.record import HinfDesign
@@ -72,9 +73,9 @@ def build_core(design: HinfDesign) -> Core:
         return Known(xhat, fhat, None, None, moved, outside=away, valid=valid)
 
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
-        near = all_finite(kept["prediction"])
+        near = all_finite(kept["prediction"], LIMITS[design.precision].finite)
         return {
-            "prediction": select(near, kept["prediction"], x.middle),
+            "prediction": select(near, kept["prediction"], x.middle(design.precision)),
             "innovation": select(near, kept["innovation"], 0.0 * kept["innovation"]),
             "running": ca.logic_and(near, kept["running"] > 0.5),
         }

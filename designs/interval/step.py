@@ -147,11 +147,18 @@ def build_core(design: IntervalDesign) -> Core:
             "share_lower": late.lower,
             "share_upper": late.upper,
         }
-        return Known(x.middle, f.middle, x, f if n_f else None, moved, empty=r.empty())
+        return Known(
+            x.middle(design.precision),
+            f.middle(design.precision),
+            x,
+            f if n_f else None,
+            moved,
+            empty=r.empty(),
+        )
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
         r = first.bounds({"x_upper": x.upper, "x_lower": x.lower, "one": ca.SX(1)})
-        open_ends = Ends.unbounded(n_f)
+        open_ends = Ends.unbounded(n_f, design.precision)
         return {
             "r_lower": r.lower,
             "r_upper": r.upper,

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.boxes import Ends, cut_box, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices
@@ -246,11 +247,13 @@ def build_core(design: QPVDesign) -> Core:
         if design.bounded:
             half = ca.DM(sizes.half) * reach
             half = half + 2.0**-40 * (ca.fabs(state) + half)
-            found = Ends(state - half, state + half).where(certified, Ends.unbounded(state.numel()))
+            found = Ends(state - half, state + half).where(
+                certified, Ends.unbounded(state.numel(), design.precision)
+            )
             x = Ends(found.lower[:n], found.upper[:n])
             f = Ends(found.lower[n:], found.upper[n:])
         after = follow(state, seen.u, y, seen.theta)
-        going = all_finite(after)
+        going = all_finite(after, LIMITS[design.precision].finite)
         after = select(going, after, state)
         moved = {"xhat": after[:n], "fhat": after[n:], "level": equations.next_level(level)}
         return Known(
@@ -273,8 +276,8 @@ def build_core(design: QPVDesign) -> Core:
     def place(x: Ends, f: Ends, kept: Parts) -> Parts:
         """Move the estimates towards the middle, as little as their bound needs to be below 1."""
         box = Ends(ca.vertcat(x.lower, f.lower), ca.vertcat(x.upper, f.upper))
-        middle, state = box.middle, ca.vertcat(kept["xhat"], kept["fhat"])
-        state = select(all_finite(state), state, middle)
+        middle, state = box.middle(design.precision), ca.vertcat(kept["xhat"], kept["fhat"])
+        state = select(all_finite(state, LIMITS[design.precision].finite), state, middle)
         least, away = ca.sqrt(_box_level(design, box, middle)), _length(design, state - middle)
         share = ca.fmin((_PLACED - least) / ca.fmax(away, _PLACED - least), 1.0)
         share = ca.if_else(least < _PLACED, share, 1.0)

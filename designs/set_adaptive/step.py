@@ -76,7 +76,7 @@ def build_core(design: SetDesign) -> Core:
     m = len(plant.output)
     x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
     y_box = outward(design.output_box, design.precision)
-    guaranteed = design.law == "cooperative"
+    guaranteed, precision = design.law == "cooperative", design.precision
 
     def run(seen: Seen) -> Known:
         memory = Memory(seen.memory, design)
@@ -101,12 +101,22 @@ def build_core(design: SetDesign) -> Core:
         changed |= _predict(design, memory, lower, upper, smallest, largest)
         changed |= _monitor(design, memory, r, seen.all_used)
         f = Ends(smallest, largest)
-        known = Known(x.middle, f.middle, x, f, columns(changed), empty=empty)
+        known = Known(
+            x.middle(design.precision),
+            f.middle(design.precision),
+            x,
+            f,
+            columns(changed),
+            empty=empty,
+        )
         return known if guaranteed else replace(known, x=None, f=None, empty=no, valid=no)
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
         nothing = {name: ca.SX.zeros(sizes[name]) for name in ("Omega_m", "Omega_M")}
-        near, faults = x.meet(Ends.of(x_box)), f.meet(Ends.of(f_box))
+        near, faults = (
+            x.meet(Ends.of(x_box, precision)),
+            f.meet(Ends.of(f_box, precision)),
+        )
         z = into(design, near.lower, near.upper)
         return {**nothing, **begun(z, (faults.lower, faults.upper))}
 
@@ -190,7 +200,7 @@ def _state(design: SetDesign, low: ca.SX, high: ca.SX, x: Ends) -> Ends:
     ):
         i = names.index(state.name)
         lower[i], upper[i] = ca.fmax(lower[i], first), ca.fmin(upper[i], second)
-    return Ends(lower, upper).meet(Ends.of(outward(design.plant.box("x"), design.precision)))
+    return Ends(lower, upper).meet(Ends.of(design.plant.box("x"), design.precision))
 
 
 def _reached(design: SetDesign, now: Ends, speed: Pair, box: FloatArray) -> Pair:

@@ -20,7 +20,7 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.guard import Watch
-from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.general import step as general
 from obsynth.designs.general.record import GeneralDesign
@@ -117,8 +117,17 @@ class Bank:
         """Affine enclosures of the equations."""
         plant, watch = self.design.plant, Watch.of(self.design.options)
         assert plant.Ts is not None
-        sweeps = Sweeps(Contractor(plant, plant.Ts, watch.cuts))
+        sweeps = Sweeps(Contractor(plant, plant.Ts, watch.cuts, watch.precision))
         return Enclosures(sweeps, self.design.places)
+
+    @property
+    def far(self) -> float:
+        """The end of what has no bound."""
+        return LIMITS[self.design.precision].far
+
+    def open(self, n: int) -> Ends:
+        """Return a box that holds everything."""
+        return Ends.unbounded(n, self.design.precision)
 
     @property
     def names(self) -> list[int]:
@@ -189,12 +198,16 @@ class Bank:
             memory[name] = select(memory["anew"] > 0.5, value, memory[name])
         known = self.inner.run(replace(seen, memory=memory))
         assert known.x is not None
-        f = Ends.unbounded(now.faults.lower.numel()) if known.f is None else known.f
+        f = (
+            Ends.unbounded(now.faults.lower.numel(), self.design.precision)
+            if known.f is None
+            else known.f
+        )
         held = self.box(known.x, f)
-        nothing = Ends.unbounded(self.N)
+        nothing = self.open(self.N)
         told = seen.all_used
         width = held.upper - held.lower
-        near = every(width[i] < 0.5 * FAR for i in range(self.N))
+        near = every(width[i] < 0.5 * self.far for i in range(self.N))
         sound = ca.logic_and(ca.logic_and(told, known.sound), near)
         return held.where(told, nothing), {**known.moved, "anew": ca.logic_not(sound)}
 
@@ -278,7 +291,7 @@ class Bank:
         sweeps, enclosures = self.enclosures.sweeps, self.enclosures
         n, n_f = sweeps.n, sweeps.n_f
         x = Ends(X.lower[:n], X.upper[:n])
-        f = Ends.unbounded(n_f)
+        f = self.open(n_f)
         low, high, fhat = ca.SX(f.lower), ca.SX(f.upper), ca.SX(n_f, 1)
         late = float(fault_delay(self.design))
         for k, j in enumerate(enclosures.followed.tolist()):
@@ -296,8 +309,8 @@ class Bank:
                 row[0, k] = radius
                 own = Zonotope(middle, row, ca.SX(1, 1))
                 told = told.meet(cut(own, strip, used))
-            low[j] = ca.if_else(fresh, told.lower, -FAR)
-            high[j] = ca.if_else(fresh, told.upper, FAR)
+            low[j] = ca.if_else(fresh, told.lower, -self.far)
+            high[j] = ca.if_else(fresh, told.upper, self.far)
             fhat[j] = middle
         return x, Ends(low, high), fhat
 

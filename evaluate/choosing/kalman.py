@@ -5,7 +5,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.stepping import FINITE, clip, make_step
+from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.stepping import clip, make_step
 from obsynth.evaluate.truth import parameters
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -66,7 +67,7 @@ class ExtendedKalman:
         P = ca.diagcat(ca.reshape(memory[kept:], kept, kept), ca.SX.eye(wide - kept) / 3.0)
         _, shown, _, C = self.both(mean, u, rho)
         for i in range(y.numel()):
-            c, read = C[i, :].T * half, ca.fabs(y[i]) <= FINITE
+            c, read = C[i, :].T * half, ca.fabs(y[i]) <= LIMITS["double"].finite
             seen, spread = P @ c, c.T @ P @ c
             gain = ca.if_else(ca.logic_and(read, spread > 1e-16 * c.T @ c), seen / spread, 0.0)
             off = ca.if_else(read, y[i], 0.0) - shown[i] - c.T @ ((mean - start) / half)
