@@ -100,6 +100,7 @@ def build_and_compare(
     *,
     compiler: Sequence[str],
     extra_flags: Sequence[str] = ("-O2",),
+    shared: tuple[Path, Path] | None = None,
 ) -> tuple[Build, Comparison]:
     """Compile library, test and example of a project elsewhere and run them.
 
@@ -115,6 +116,8 @@ def build_and_compare(
         The compiler's command, see `find_compiler`.
     extra_flags : sequence of str
         Flags besides `FLAGS`.
+    shared : tuple of two paths, optional
+        A shared library to make of the object that was compared and of a further source file.
 
     Returns
     -------
@@ -148,6 +151,10 @@ def build_and_compare(
             [str(test), str(project / "tests" / "vectors.txt")], "the test", out, (0, 1)
         )
         _run([str(example)], "the example", out)
+        if shared is not None:
+            target, more = shared
+            files = ["-shared", "-s", str(more), str(library), "-o", str(target), "-lm"]
+            _run([*command, *files], f"linking {target.name}", out)
     return Build(_version(compiler), flags), _read(compared, name)
 
 

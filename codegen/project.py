@@ -171,32 +171,13 @@ def generate_c(
 'single'
     """
     _available("precision", precision, (*PRECISIONS, None))
-    _available("backend", backend, (*BACKENDS, None))
-    count, start = _whole("vectors", vectors), _whole("seed", seed)
-    if start < 0:
-        raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
     description = describe(observer, name, memory, precision)
-    real = description.real
-    if backend == "casadi" and real is not DOUBLE:
-        raise CodegenError(
-            f"backend='casadi' computes with constants of double, not in {real.precision} precision"
-            " (which the design has): say backend='tape', or precision='double'",
-            backend=backend,
-        )
-    if backend == "tape" or real is not DOUBLE:
-        kernel = write_tape(observer.step, description.name, description.place, real)
-    else:
-        kernel = generate_kernel(observer.step, description.name)
-    recorded = make_vectors(description, count, start)
+    kernel, recorded = write_step(description, backend, vectors, seed)
     files = render(description, kernel, recorded, start_given=memory is not None)
-    files[MANIFEST] = _manifest(description, kernel, recorded, start, files)
+    files[MANIFEST] = _manifest(description, kernel, recorded, operator.index(seed), files)
 
     with complete_folder(folder, KIND, overwrite=overwrite, built=_BUILT) as place:
-        for path, text in files.items():
-            file = place / path
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text, encoding="utf-8", newline="\n")
-        build, comparison = _compared(place, description.name, recorded)
+        build, comparison = compared(place, files, description.name, recorded)
     return CProject(
         name=description.name,
         folder=Path(folder).expanduser().resolve(),
@@ -210,14 +191,40 @@ def generate_c(
     )
 
 
-def _compared(
-    place: Path, name: str, recorded: Vectors
+def write_step(
+    description: Description, backend: str | None, vectors: int, seed: int
+) -> tuple[Kernel, Vectors]:
+    """Write the kernel and record its vectors."""
+    _available("backend", backend, (*BACKENDS, None))
+    count, start = _whole("vectors", vectors), _whole("seed", seed)
+    if start < 0:
+        raise CodegenError(f"seed={seed}; a seed is not negative", seed=seed)
+    step, name, real = description.observer.step, description.name, description.real
+    if backend == "casadi" and real is not DOUBLE:
+        raise CodegenError(
+            f"backend='casadi' computes with constants of double, not in {real.precision} precision"
+            " (which the design has): say backend='tape', or precision='double'",
+            backend=backend,
+        )
+    if backend == "tape" or real is not DOUBLE:
+        kernel = write_tape(step, name, description.place, real)
+    else:
+        kernel = generate_kernel(step, name)
+    return kernel, make_vectors(description, count, start)
+
+
+def compared(
+    place: Path, files: Mapping[str, str], name: str, recorded: Vectors, **build_options: Any
 ) -> tuple[Build, Comparison] | tuple[None, None]:
-    """Build the project and compare every recorded step; None where there is no compiler."""
+    """Write the files, build them and compare every recorded step; None without a compiler."""
+    for path, text in files.items():
+        file = place / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8", newline="\n")
     compiler = find_compiler()
     if compiler is None:
         return None, None
-    build, comparison = build_and_compare(place, name, compiler=compiler)
+    build, comparison = build_and_compare(place, name, compiler=compiler, **build_options)
     if (comparison.vectors, comparison.values) != (recorded.count, recorded.values):
         raise BuildError(
             f"the test compared {comparison.vectors} steps and {comparison.values} values of"

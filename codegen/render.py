@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
-from obsynth.codegen.kernel import Kernel, Machine, Real
+from obsynth.codegen.kernel import DOUBLE, Kernel, Machine, Real
 from obsynth.codegen.recording import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
@@ -74,23 +74,8 @@ def _listed(ports: tuple[Port, ...]) -> str:
 def render(
     description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
 ) -> dict[str, str]:
-    """Fill in the templates."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,
-    )
-    real, name = description.real, description.name
-    environment.filters["number"] = real.number
-    environment.filters["constant"] = lambda value: real.literal(value, f"{name}_real_t")
-    environment.filters["comment"] = c_comment
-    environment.filters["cell"] = lambda text: " ".join(text.replace("|", "\\|").split())
-    values = _values(description, kernel, vectors, start_given)
+    """Return the files of a project, without its manifest."""
+    name = description.name
     templates = {
         f"include/{name}.h": "header.h.j2",
         f"src/{name}.c": "source.c.j2",
@@ -106,18 +91,40 @@ def render(
         "Makefile": "Makefile.j2",
         "README.md": "README.md.j2",
     }
-    files = {
-        path: environment.get_template(template).render(values)
-        for path, template in templates.items()
-    }
+    values = template_values(description, kernel, vectors, start_given)
+    files = fill(description, templates, values)
     files["tests/vectors.txt"] = vectors.text
     files["design.json"] = description.design
     return files
 
 
-def _values(
+def fill(
+    description: Description, templates: Mapping[str, str], values: Mapping[str, Any]
+) -> dict[str, str]:
+    """Fill in templates: texts by the paths of their files."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    real, prefix = description.real, description.name
+    environment.filters["number"] = real.number
+    environment.filters["constant"] = lambda value: real.literal(value, f"{prefix}_real_t")
+    environment.filters["double"] = lambda value: DOUBLE.literal(value, "double")
+    environment.filters["comment"] = c_comment
+    environment.filters["cell"] = lambda text: " ".join(text.replace("|", "\\|").split())
+    return {path: environment.get_template(name).render(values) for path, name in templates.items()}
+
+
+def template_values(
     description: Description, kernel: Kernel, vectors: Vectors, start_given: bool
 ) -> Mapping[str, Any]:
+    """Return what the templates of a project call by name."""
     observer, sizes = description.observer, description.sizes
     signals = {"u": description.u, "y": description.y, "theta": description.theta}
     signals |= {"x": description.x, "f": description.f}

@@ -1,6 +1,8 @@
 # The one list of public names: __init__.py loads them from here, type checkers read it.
 from .codegen import CProject as CProject
+from .codegen import Fmu as Fmu
 from .codegen import generate_c as generate_c
+from .codegen import generate_fmu as generate_fmu
 from .derive import Equilibrium as Equilibrium
 from .derive import JacobianBounds as JacobianBounds
 from .derive import Split as Split

@@ -211,6 +211,23 @@ def simulate(
 
 
 @app.command()
+def export(
+    design: Annotated[Path, typer.Argument(help="A design saved by obsynth, a JSON file.")],
+    target: Annotated[Path, typer.Argument(help="A file NAME.fmu, or a folder for C.")],
+    name: Annotated[str | None, typer.Option(help="Prefix of C names, model identifier.")] = None,
+    backend: Annotated[str, typer.Option(help="Who writes the step: tape or casadi.")] = "tape",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older one.")] = False,
+) -> None:
+    """Write a saved observer as a unit for co-simulation (FMI 2.0) or as a C project."""
+    with _refusals():
+        import obsynth
+
+        write: Any = obsynth.generate_fmu if target.suffix == ".fmu" else obsynth.generate_c
+        observer = obsynth.load(design)
+        print(write(observer, target, name, backend=backend, overwrite=overwrite))
+
+
+@app.command()
 def choose(
     plant: PlantGiven,
     ts: Annotated[

@@ -1,5 +1,6 @@
 """The command: what it prints, its exit codes, and refusals without tracebacks."""
 
+import functools
 import json
 import os
 import subprocess
@@ -248,6 +249,22 @@ def design(leaking, monkeypatch):
     """A saved design, whose proof is not waited for again."""
     monkeypatch.setattr(obsynth, "load", {leaking[0]: leaking[1]}.__getitem__)
     return leaking[0]
+
+
+def test_export_writes_a_unit_or_a_project(design, monkeypatch):
+    """Mutants: one writer for both; options not handed on."""
+    calls = []
+    for name in ("generate_fmu", "generate_c"):
+        note = functools.partial(
+            lambda name, _, *args, **options: calls.append((name, args, options)), name
+        )
+        monkeypatch.setattr(obsynth, name, note)
+    for args in (["x.fmu", "--name", "x", "--overwrite"], ["x", "--backend", "casadi"]):
+        assert runner.invoke(app, ["export", str(design), *args]).exit_code == 0
+    assert calls == [
+        ("generate_fmu", (Path("x.fmu"), "x"), {"backend": "tape", "overwrite": True}),
+        ("generate_c", (Path("x"), None), {"backend": "casadi", "overwrite": False}),
+    ]
 
 
 def channels(**changed):

@@ -1,0 +1,194 @@
+"""How the first memory depends on a guess and on first ranges, as sums that C can form."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.codegen.description import nominal_values
+from obsynth.codegen.kernel import DOUBLE
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
+
+LARGEST = 1e90
+"""Numbers of larger size are no start values."""
+
+_SCALES = (1.0, 1.0, 1.0, 0.3, 0.01, 1e-4)
+_ROUNDED = 1e-13
+_ENDS = ("lower", "upper")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that the first memory is made of, with the limits of the ends of ranges."""
+
+    name: str
+    unit: str
+    description: str
+    start: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A first memory, and what it is made of.
+
+    memory (n_memory,): for the start values of the parameters
+    parameters: parts of the guess, then pairs of ends of ranges
+    guesses: how many parts of the guess there are
+    rules: entries of the memory that depend on parameters v, in C
+    """
+
+    memory: FloatArray
+    parameters: tuple[Parameter, ...] = ()
+    guesses: int = 0
+    rules: tuple[tuple[int, str], ...] = ()
+
+
+def start_of(
+    observer: Observer | FaultDetector,
+    guess: ArrayLike | None = None,
+    x_range: ArrayLike | None = None,
+    f_range: ArrayLike | None = None,
+) -> Start:
+    """Return what `memory0` returns, and the numbers on which its entries depend as sums.
+
+    The guess, or ranges of states or of faults, are left out where a start value is not finite,
+    nothing depends on them, or something does in another way.
+    """
+    model = observer.model
+    fixed = {
+        "guess": np.asarray(nominal_values(model, "x") if guess is None else guess, dtype=float),
+        "x_range": x_range,
+        "f_range": f_range,
+    }
+    memory = np.asarray(observer.memory0(**fixed), dtype=float)
+
+    def made(**given: Any) -> FloatArray | None:
+        try:
+            return np.asarray(observer.memory0(**{**fixed, **given}), dtype=float)
+        except ObsynthError:
+            return None
+
+    x, f = (np.asarray(model.box(kind), dtype=float).reshape(-1, 2) for kind in "xf")
+    boxes = {"guess": x, "x_range": x, "f_range": f}
+    # a first set is for no faults, or for faults anywhere in their ranges
+    tried = {name: [fixed[name]] for name in boxes}
+    tried["x_range"] += [x]
+    tried["f_range"] += [np.zeros(f.shape), f]
+    starts: dict[str, FloatArray] = {}
+    for name, candidates in tried.items():
+        for value in (np.asarray(one, dtype=float) for one in candidates if one is not None):
+            sound = value.size and np.all(np.abs(value) <= LARGEST)
+            if sound and _same(made(**{name: value}), memory):
+                starts.setdefault(name, value)
+    for count in range(len(starts), 0, -1):
+        for names in combinations(starts, count):
+            chosen = {name: starts[name] for name in names}
+            rules = _rules(made, memory, chosen, boxes)
+            if rules:
+                parts = [p for name in names for p in _parameters(observer, name, chosen[name])]
+                return Start(memory, tuple(parts), len(chosen.get("guess", ())), rules)
+    return Start(memory)
+
+
+def _same(one: FloatArray | None, other: FloatArray) -> bool:
+    return one is not None and np.array_equal(one, other, equal_nan=True)
+
+
+def _drawn(start: FloatArray, box: FloatArray, scale: float, rng: np.random.Generator) -> Any:
+    """Return a guess, or ranges, within declared ranges or nearer to the start."""
+    ends = np.clip(box, -1e3, 1e3)
+    drawn = np.sort(rng.uniform(ends[:, 0], ends[:, 1], (start.ndim, len(box))), axis=0)
+    return start + scale * ((drawn.T if start.ndim == 2 else drawn[0]) - start)
+
+
+def _rules(
+    made: Callable[..., FloatArray | None],
+    memory: FloatArray,
+    starts: Mapping[str, FloatArray],
+    boxes: Mapping[str, FloatArray],
+) -> tuple[tuple[int, str], ...]:
+    """Return entries of the memory as copies, middles or sums; none if that is not what they are.
+
+    Each start, flattened, is a part of the vector of parameters v; all of them have to matter.
+    """
+    rng = np.random.default_rng(0)
+    draws = [{k: _drawn(v, boxes[k], s, rng) for k, v in starts.items()} for s in _SCALES]
+    found = [made(**draw) for draw in draws]
+    rows = [row for row in found if row is not None]
+    if len(rows) < len(draws):
+        return ()
+    m = np.array(rows)
+    v = np.array([np.concatenate([value.ravel() for value in draw.values()]) for draw in draws])
+    guesses = len(starts.get("guess", ()))
+    base, *ones = (made(guess=e) if guesses else None for e in np.eye(guesses + 1, guesses, -1))
+    rules = []
+    for i in np.flatnonzero(np.any((m != memory) & ~(np.isnan(m) & np.isnan(memory)), axis=0)):
+        rule = _rule(m[:, i], v, guesses)
+        if not rule and base is not None:
+            linear = [one[i] - base[i] for one in ones if one is not None]
+            rule = _sum(m[:, i], v, [float(base[i]), *linear])
+        if not rule:
+            return ()
+        rules.append((int(i), rule))
+    k = 0
+    for value in starts.values():
+        if not any(f"v[{j}]" in rule for j in range(k, k + value.size) for _, rule in rules):
+            return ()
+        k += value.size
+    return tuple(rules)
+
+
+def _rule(entry: FloatArray, v: FloatArray, guesses: int) -> str:
+    """Return an entry, (draws,), as a parameter or the middle of a range; empty if it is none."""
+    for k in range(v.shape[1]):
+        if np.array_equal(entry, v[:, k]):
+            return f"v[{k}]"
+    for k in range(guesses, v.shape[1], 2):
+        if np.array_equal(entry, 0.5 * (v[:, k] + v[:, k + 1])):
+            return f"0.5 * (v[{k}] + v[{k + 1}])"
+    return ""
+
+
+def _sum(entry: FloatArray, v: FloatArray, terms: list[float]) -> str:
+    """Return an entry as a constant and multiples of parts of the guess; empty if it is none."""
+    constant, *factors = terms
+    guess = v[:, : len(factors)]
+    size = abs(constant) + np.abs(guess) @ np.abs(factors)
+    if not np.all(np.abs(entry - constant - guess @ factors) <= _ROUNDED * size):
+        return ""
+    parts = [DOUBLE.number(constant)] * (constant != 0.0)
+    parts += [f"{DOUBLE.number(c)} * v[{j}]" for j, c in enumerate(factors) if c != 0.0]
+    return " + ".join(parts)
+
+
+def _parameters(
+    observer: Observer | FaultDetector, group: str, start: FloatArray
+) -> list[Parameter]:
+    """Return the parameters of a guess, or of ranges."""
+    model = observer.model
+    signals = model.f if group == "f_range" else model.x
+    if group == "guess":
+        return [
+            Parameter(f"{s.name}_guess", s.unit, f"guess of the first {s.name}", a, -np.inf, np.inf)
+            for s, a in zip(signals, start.tolist(), strict=True)
+        ]
+    box = np.asarray(model.box(group[0]), dtype=float).reshape(-1, 2).tolist()
+    return [
+        Parameter(
+            f"{s.name}_first_{end}",
+            s.unit,
+            f"{end} end of the range of the first {s.name}",
+            value,
+            *limits,
+        )
+        for (s, pair, limits) in zip(signals, start.tolist(), box, strict=True)
+        for end, value in zip(_ENDS, pair, strict=True)
+    ]
