@@ -4,6 +4,8 @@ from obsynth.evaluate.bounds.identify import Identified as Identified
 from obsynth.evaluate.bounds.identify import identify as identify
 from obsynth.evaluate.bounds.least_bounds import LeastBounds as LeastBounds
 from obsynth.evaluate.bounds.least_bounds import least_bounds as least_bounds
+from obsynth.evaluate.campaigns.campaign import Campaign as Campaign
+from obsynth.evaluate.campaigns.campaign import campaign as campaign
 from obsynth.evaluate.choosing.choice import Choice as Choice
 from obsynth.evaluate.choosing.choose import choose as choose
 from obsynth.evaluate.coverage import coverage_table as coverage_table

@@ -36,6 +36,7 @@ from .designs import SolverTrouble as SolverTrouble
 from .designs import load as load
 from .designs import worst_case as worst_case
 from .evaluate import BoundsError as BoundsError
+from .evaluate import Campaign as Campaign
 from .evaluate import Choice as Choice
 from .evaluate import Estimate as Estimate
 from .evaluate import Identified as Identified
@@ -44,6 +45,7 @@ from .evaluate import Run as Run
 from .evaluate import SimulationError as SimulationError
 from .evaluate import Study as Study
 from .evaluate import Table as Table
+from .evaluate import campaign as campaign
 from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
 from .evaluate import estimate as estimate
