@@ -31,6 +31,7 @@ def test_the_wheel_holds_every_module(tmp_path):
     expected |= {"obsynth/py.typed", "obsynth/__init__.pyi"}
     expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/*.py")}
     expected |= {f"obsynth/{name}" for room in ROOMS for name in tracked(f"{room}/templates/*")}
+    expected |= {f"obsynth/{name}" for name in tracked("symbolic/*.toml")}
     data = ("csv", "md", "LICENSE")
     expected |= {f"obsynth/{n}" for end in data for n in tracked(f"symbolic/records/*.{end}")}
     assert names == expected
