@@ -1,7 +1,6 @@
 """The instructions of a step in IEEE single precision: what generated C of type float computes."""
 
 import math
-import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,9 +11,34 @@ from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.functions import ULPS, own_function
 from obsynth.codegen.kernel import DOUBLE, OPERATIONS, SINGLE, Machine, Real, scalar_function
 
-_F = np.float32
-_ONE, _ZERO = _F(1.0), _F(0.0)
-_Run = Callable[..., Any]
+# Python's text of operations; a test chooses between two, `choose` stands for how
+_PLAIN: Mapping[str, str] = {
+    "assign": "{0}",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "fabs": "abs({0})",
+    "sq": "{0} * {0}",
+    "twice": "{0} + {0}",
+    "inv": "one / {0}",
+    **{name: f"{name}({{0}})" for name in ("sqrt", "floor", "ceil")},
+    **{name: f"{name}({{0}}, {{1}})" for name in ("fmod", "copysign", "remainder")},
+}
+_CHOSEN: Mapping[str, tuple[str, str, str]] = {
+    "lt": ("{0} < {1}", "one", "zero"),
+    "le": ("{0} <= {1}", "one", "zero"),
+    "eq": ("{0} == {1}", "one", "zero"),
+    "ne": ("{0} != {1}", "one", "zero"),
+    "and": ("({0} != zero) & ({1} != zero)", "one", "zero"),
+    "or": ("({0} != zero) | ({1} != zero)", "one", "zero"),
+    "not": ("{0} == zero", "one", "zero"),
+    "if_else_zero": ("{0} != zero", "{1}", "zero"),
+    "fmax": ("({0} < {1}) | ({0} != {0})", "{1}", "{0}"),
+    "fmin": ("({1} < {0}) | ({0} != {0})", "{1}", "{0}"),
+    "sign": ("({0} < zero) | ({0} > zero)", "copysign(one, {0})", "{0}"),
+}
 
 
 @np.vectorize
@@ -22,53 +46,12 @@ def _remainder(a: float, b: float) -> float:
     return math.remainder(a, b) if math.isfinite(a) and b and b == b else math.nan
 
 
-_PLAIN: Mapping[str, _Run] = {
-    "assign": lambda a: a,
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "neg": operator.neg,
-    "fabs": abs,
-    "sq": lambda a: a * a,
-    "twice": lambda a: a + a,
-    "inv": lambda a: _ONE / a,
-    "sqrt": np.sqrt,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "fmod": np.fmod,
-    "copysign": np.copysign,
-    "remainder": lambda a, b: _F(_remainder(a, b)),
+_NAMES: Mapping[str, Any] = {
+    "one": np.float32(1.0),
+    "zero": np.float32(0.0),
+    "remainder": lambda a, b: np.float32(_remainder(a, b)),
+    **{name: getattr(np, name) for name in ("sqrt", "floor", "ceil", "fmod", "copysign", "where")},
 }
-_TESTS: Mapping[str, _Run] = {
-    "lt": operator.lt,
-    "le": operator.le,
-    "eq": operator.eq,
-    "ne": operator.ne,
-    "and": lambda a, b: (a != 0) & (b != 0),
-    "or": lambda a, b: (a != 0) | (b != 0),
-    "not": lambda a: a == 0,
-}
-
-
-def _one(test: Any, a: Any, b: Any) -> Any:
-    return a if test else b
-
-
-def _told(choose: _Run, test: _Run) -> _Run:
-    return lambda *arguments: choose(test(*arguments), _ONE, _ZERO)
-
-
-def _operations(choose: _Run) -> dict[str, _Run]:
-    """Return operations by CasADi's names, of what ``choose`` chooses from."""
-    return {
-        **_PLAIN,
-        **{name: _told(choose, test) for name, test in _TESTS.items()},
-        "if_else_zero": lambda c, a: choose(c != 0, a, _ZERO),
-        "fmax": lambda a, b: choose((a < b) | (a != a), b, a),
-        "fmin": lambda a, b: choose((b < a) | (a != a), b, a),
-        "sign": lambda a: choose(a < 0, -_ONE, choose(a > 0, _ONE, a)),
-    }
 
 
 class SingleMachine:
@@ -82,56 +65,59 @@ class SingleMachine:
     def __init__(self, function: ca.Function) -> None:
         tape = scalar_function(function)
         self._lengths = [tape.numel_out(i) for i in range(tape.n_out())]
-        self._size = max(tape.sz_w(), 1)
-        self._program: list[tuple[str, int, Any, Any]] = []
+        self._names = dict(_NAMES)
+        # Python evaluates a text of its own several times as fast as it walks through a list
+        self._texts = [self._text(tape, how) for how in ("({1} if {0} else {2})", "where({})")]
+        self._runs: dict[int, Callable[..., None]] = {}
+
+    def _text(self, tape: ca.Function, how: str) -> str:
+        lines = ["def run(given, results):"]
         for k in range(tape.n_instructions()):
             name = OPERATIONS[tape.instruction_id(k)]
             out, args = tape.instruction_output(k), tape.instruction_input(k)
             if name == "const":
-                number = _F(SINGLE.rounded(tape.instruction_constant(k)))
-                self._program.append((name, out[0], number, None))
+                self._names[f"c{k}"] = np.float32(SINGLE.rounded(tape.instruction_constant(k)))
+                text = f"c{k}"
+            elif name == "input":
+                text = f"given[{args[0]}][{args[1]}]"
             elif name == "output":
-                self._program.append((name, out[0], out[1], args[0]))
+                lines.append(f" results[{out[0]}][{out[1]}] = w{args[0]}")
+                continue
             else:
-                name = "pow" if name == "constpow" else name
-                self._program.append((name, out[0], args[0], args[1] if len(args) > 1 else None))
-        self._own = {
-            name: SingleMachine(own_function(name))
-            for name in {line[0] for line in self._program} & set(ULPS)
-        }
-        self._tables = [self._table(_one), self._table(np.where)]
+                text = self._operation(name, [f"w{a}" for a in args], how)
+            lines.append(f" w{out[0]} = {text}")
+        return "\n".join([*lines, " return None"])
 
-    def _table(self, choose: _Run) -> dict[str, _Run]:
-        own = {name: _called(machine) for name, machine in self._own.items()}
-        table = {**_operations(choose), **own}
-        for name, *_ in self._program:
-            if name not in {*table, "const", "input", "output"}:
-                raise CodegenError(f"no form of {name!r} in single precision", symbol=name)
-        return table
+    def _operation(self, name: str, args: list[str], how: str) -> str:
+        if name in _PLAIN:
+            return _PLAIN[name].format(*args)
+        if name in _CHOSEN:
+            test, *values = (part.format(*args) for part in _CHOSEN[name])
+            if "{1}" in how:
+                return how.format(test.replace("|", "or").replace("&", "and"), *values)
+            return how.format(", ".join((test, *values)))
+        name = "pow" if name == "constpow" else name
+        if name not in ULPS:
+            raise CodegenError(f"no form of {name!r} in single precision", symbol=name)
+        self._names.setdefault(name, _called(SingleMachine(own_function(name))))
+        return f"{name}({', '.join(args)})"
 
     def __call__(self, *arguments: Any) -> list[Any]:
         """Return the results as new vectors."""
-        given = [np.asarray(argument).astype(_F) for argument in arguments]
+        given = [np.asarray(argument).astype(np.float32) for argument in arguments]
         lanes = max((argument.shape[1:] for argument in given), default=())
-        table = self._tables[len(lanes)]
-        results = [np.zeros((length, *lanes), _F) for length in self._lengths]
-        w: list[Any] = [_ZERO] * self._size
+        kind = len(lanes)
+        if kind not in self._runs:
+            found = dict(self._names)
+            exec(self._texts[kind], found)
+            self._runs[kind] = found["run"]
+        results = [np.zeros((length, *lanes), np.float32) for length in self._lengths]
         with np.errstate(all="ignore"):
-            for name, out, a, b in self._program:
-                if name == "const":
-                    w[out] = a
-                elif name == "input":
-                    w[out] = given[a][b]
-                elif name == "output":
-                    results[out][a] = w[b]
-                elif b is None:
-                    w[out] = table[name](w[a])
-                else:
-                    w[out] = table[name](w[a], w[b])
+            self._runs[kind]([list(argument) for argument in given], results)
         return results
 
 
-def _called(machine: SingleMachine) -> _Run:
+def _called(machine: SingleMachine) -> Callable[..., Any]:
     def run(*arguments: Any) -> Any:
         return machine(*(np.asarray(a)[None] for a in np.broadcast_arrays(*arguments)))[0][0]
 

@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import methods
-from obsynth.codegen import CodegenError, build_and_compare, find_compiler, generate_c
+from obsynth.codegen import CodegenError, find_compiler, generate_c
 from obsynth.codegen import parts as parts_module
 from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.kernel import DOUBLE, REALS, SINGLE, Real
@@ -255,17 +254,3 @@ def test_a_project_of_the_tape(toy: Any, tmp_path: Path, monkeypatch: pytest.Mon
     theirs = generate_kernel(toy.step, "p")
     assert sum(manifest["operation_counts"].values()) < sum(theirs.counts.values())
     assert sum(theirs.counts.values()) < theirs.operations == manifest["operations"]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", methods.METHODS)
-def test_every_method_under_every_compiler(name: str, tmp_path: Path) -> None:
-    """Ten thousand steps, gcc and clang, without and with all optimisation."""
-    project = generate_c(methods.observer_of(name), tmp_path / "p", backend="tape")
-    assert project.comparison is not None
-    for compiler in filter(shutil.which, ("gcc", "clang", "clang-14")):
-        for level in (("-O0",), ("-O3", "-march=native")):
-            _, comparison = build_and_compare(
-                project.folder, project.name, compiler=(compiler,), extra_flags=(*level, *WARNINGS)
-            )
-            assert comparison == project.comparison
