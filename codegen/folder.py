@@ -15,7 +15,11 @@ MANIFEST = "manifest.json"
 
 @contextmanager
 def complete_folder(
-    folder: str | os.PathLike[str], kind: str, *, overwrite: bool = True, built: str | None = None
+    folder: str | os.PathLike[str],
+    kind: str,
+    *,
+    overwrite: bool = True,
+    built: tuple[str, ...] = (),
 ) -> Iterator[Path]:
     """Give a new folder to write to; it takes the target's place when all went well.
 
@@ -50,12 +54,16 @@ def complete_folder(
 
 
 def check_target(
-    folder: str | os.PathLike[str], kind: str, *, overwrite: bool = True, built: str | None = None
+    folder: str | os.PathLike[str],
+    kind: str,
+    *,
+    overwrite: bool = True,
+    built: tuple[str, ...] = (),
 ) -> Path:
     """Return the folder's full path, or refuse one that is not free.
 
     Free are new and empty folders and, with `overwrite`, what an earlier call of this kind
-    left; files below `built` are made from those and go with them.
+    left; files whose paths begin with `built` are made from those and go with them.
     """
     target = Path(folder).expanduser().resolve()
     if target.exists() and not target.is_dir():
@@ -67,8 +75,7 @@ def check_target(
         foreign, word = sorted(path.name for path in target.iterdir()), f" and is no {kind}"
     else:
         foreign, word = sorted(_files(target) - ours), ""
-        if built is not None:
-            foreign = [path for path in foreign if not path.startswith(f"{built}/")]
+        foreign = [path for path in foreign if not path.startswith(built)]
     if foreign:
         shown = ", ".join(foreign[:5]) + (", ..." if len(foreign) > 5 else "")
         raise FolderError(

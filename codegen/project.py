@@ -18,7 +18,7 @@ from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
 from obsynth.codegen.kernel import DOUBLE, REALS, Kernel
 from obsynth.codegen.recording import Vectors
-from obsynth.codegen.render import render
+from obsynth.codegen.render import package_name, render
 from obsynth.codegen.tape import write_tape
 from obsynth.codegen.vectors import make_vectors
 from obsynth.designs.core.observer import Observer
@@ -35,7 +35,7 @@ KIND = "obsynth C project"
 
 _FORMAT = 1
 _TOOLS = ("obsynth", "casadi", "numpy", "sympy", "jinja2")
-_BUILT = "build"
+_BUILT = ("build/", "dist/")
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,8 @@ def generate_c(
     files = render(description, kernel, recorded, start_given=memory is not None)
     files[MANIFEST] = _manifest(description, kernel, recorded, operator.index(seed), files)
 
-    with complete_folder(folder, KIND, overwrite=overwrite, built=_BUILT) as place:
+    built = (*_BUILT, f"python/{package_name(description.name)}.egg-info/")
+    with complete_folder(folder, KIND, overwrite=overwrite, built=built) as place:
         build, comparison = compared(place, files, description.name, recorded)
     return CProject(
         name=description.name,

@@ -1,6 +1,8 @@
 """The text files of a project, from templates."""
 
+import keyword
 import math
+import sys
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -89,6 +91,9 @@ def render(
         "library.properties": "library.properties.j2",
         "zephyr/module.yml": "module.yml.j2",
         "Makefile": "Makefile.j2",
+        "pyproject.toml": "pyproject.toml.j2",
+        "python/library.c": "library.c.j2",
+        f"python/{package_name(name)}/__init__.py": "package.py.j2",
         "README.md": "README.md.j2",
     }
     values = template_values(description, kernel, vectors, start_given)
@@ -96,6 +101,12 @@ def render(
     files["tests/vectors.txt"] = vectors.text
     files["design.json"] = description.design
     return files
+
+
+def package_name(name: str) -> str:
+    """Return the name of the Python package of a project: none of the language or its library."""
+    taken = keyword.iskeyword(name) or name in sys.stdlib_module_names
+    return f"{name}_observer" if taken else name
 
 
 def fill(
@@ -135,6 +146,9 @@ def template_values(
     return {
         "name": description.name,
         "macro": description.name.upper(),
+        "package": package_name(description.name),
+        "names": {kind: tuple(p.name for p in ports) for kind, ports in signals.items()},
+        "units": {kind: tuple(p.unit for p in ports) for kind, ports in signals.items()},
         "generator": generator_name(),
         "casadi": ca.CasadiMeta.version(),
         "method": observer.method,

@@ -85,8 +85,7 @@ def start_of(
     starts: dict[str, FloatArray] = {}
     for name, candidates in tried.items():
         for value in (np.asarray(one, dtype=float) for one in candidates if one is not None):
-            sound = value.size and np.all(np.abs(value) <= LARGEST)
-            if sound and _same(made(**{name: value}), memory):
+            if np.all(np.abs(value) <= LARGEST) and _same(made(**{name: value}), memory):
                 starts.setdefault(name, value)
     for count in range(len(starts), 0, -1):
         for names in combinations(starts, count):

@@ -364,12 +364,19 @@ def test_the_first_memory_follows_the_parameters(make_toy: Any, tmp_path: Path) 
 
 
 def test_a_memory_that_depends_in_another_way_has_no_parameters(make_toy: Any) -> None:
-    """Mutant: sums that are not compared with further draws."""
+    """Nor has one whose start is no number. Mutants: sums compared with one draw, or with none."""
     toy = make_toy()
     first = toy.memory0
-    toy.memory0 = lambda guess, **boxes: first(np.maximum(guess, 20.0))
-    assert start_of(toy).parameters == ()
+    for bent in (lambda x: np.maximum(x, 20.0), lambda x: np.abs(x - 20.0)):
+        toy.memory0 = lambda guess, bent=bent, **boxes: first(bent(np.asarray(guess)))
+        assert start_of(toy).parameters == ()
     toy.memory0 = lambda guess, **boxes: first([1.0, 2.0])
+    assert start_of(toy).parameters == ()
+    toy.memory0 = lambda guess, x_range=None, f_range=None: first(
+        [1.0, 50.0 if x_range is None else x_range[0][1]]
+    )
+    assert [p.upper for p in start_of(toy).parameters] == [50.0, 50.0, 40.0, 40.0]
+    toy.model.boxes["x"] = [(1.0, 50.0), (1.0, np.inf)]
     assert start_of(toy).parameters == ()
     toy.memory0 = lambda guess, x_range=None, f_range=None: first(np.asarray(guess) ** 2)
     np.testing.assert_array_equal(start_of(toy, [2.0, 3.0]).memory, first([4.0, 9.0]))
