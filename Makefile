@@ -27,7 +27,7 @@ test: $(VENV)/.installed lint ## lint, types and all tests except the long stati
 	$(BIN)/python -m pytest -m "not long" -n $(WORKERS) --dist worksteal
 
 test-long: $(VENV)/.installed ## the long statistics only
-	$(BIN)/python -m pytest -m long -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -m long -n $(WORKERS) --dist worksteal --durations=40 --durations-min=5
 
 mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print those that no test sees
 	$(BIN)/python tools/mutants.py --workers $(WORKERS) --minutes 6
