@@ -8,6 +8,8 @@ from obsynth.evaluate.campaigns.campaign import Campaign as Campaign
 from obsynth.evaluate.campaigns.campaign import campaign as campaign
 from obsynth.evaluate.choosing.choice import Choice as Choice
 from obsynth.evaluate.choosing.choose import choose as choose
+from obsynth.evaluate.control import from_control as from_control
+from obsynth.evaluate.control import to_control as to_control
 from obsynth.evaluate.coverage import coverage_table as coverage_table
 from obsynth.evaluate.data.estimate import estimate as estimate
 from obsynth.evaluate.data.estimated import Estimate as Estimate

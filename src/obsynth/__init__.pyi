@@ -49,6 +49,7 @@ from .evaluate import campaign as campaign
 from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
 from .evaluate import estimate as estimate
+from .evaluate import from_control as from_control
 from .evaluate import identify as identify
 from .evaluate import least_bounds as least_bounds
 from .evaluate import plot_alarms as plot_alarms
@@ -59,6 +60,7 @@ from .evaluate import plot_widths as plot_widths
 from .evaluate import read_study as read_study
 from .evaluate import report as report
 from .evaluate import simulate as simulate
+from .evaluate import to_control as to_control
 from .symbolic import ObsynthError as ObsynthError
 from .symbolic import Plant as Plant
 from .symbolic import PlantError as PlantError
