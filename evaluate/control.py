@@ -57,7 +57,7 @@ def from_control(
     >>> system = control.ss([[-1.0]], [[2.0]], [[1.0]], 0, states="h", inputs="v", outputs="y")
     >>> plant = from_control(system, noise={"y": 0.1}, range={"h": (0, 9), "v": (0, 4)})
     >>> plant.rhs, plant.output
-    (Matrix([[-1.0*h + 2.0*v]]), Matrix([[1.0*h + noise_y]]))
+    (Matrix([[-h + 2*v]]), Matrix([[h + noise_y]]))
     """
     labels = [system.state_labels, system.input_labels, system.output_labels]
     states, inputs, outputs = ([re.sub(r"\W", "_", label) for label in names] for names in labels)
