@@ -76,14 +76,19 @@ def observers() -> Iterator[str]:
 
 
 def make(what: str) -> Any:
-    """Return the observer, or the detector, of that name."""
+    """Return the observer, or the detector, of that name; None where single is not proved."""
     of = what.removesuffix(DETECTOR).removesuffix(SINGLE)
     entry = METHODS.get(of)
     method: Any = entry.method if entry else ob.BoundedErrorUIO(bounds="peak")
     plant = entry.plant if entry else tank
-    if SINGLE in what:
-        method = replace(method, precision="single")
-    observer = method.design(plant())
+    try:
+        if SINGLE in what:
+            method = replace(method, precision="single")
+        observer = method.design(plant())
+    except ob.ObsynthError as error:
+        if "not proved in single precision" in str(error):
+            return None
+        raise
     return ob.FaultDetector(observer, window=5) if DETECTOR in what else observer
 
 
@@ -94,15 +99,12 @@ def planted(kernel: Path) -> None:
     kernel.write_text(text.replace(old, repr(float(np.nextafter(float(old), 9.0)))))
 
 
-def rows(what: str, backend: Any, mutant: bool = False) -> list[Any]:
-    """Generate, build and run one project on every board, or tell why there is none in single."""
-    try:
-        observer = make(what)
-        given, made = recorded(observer)
-    except ob.ObsynthError as error:
-        if SINGLE not in what:
-            raise
-        return [f"{what:28} refused: {error}"]
+def rows(what: str, backend: Any, mutant: bool = False) -> list[Row]:
+    """Generate, build and run one project on every board."""
+    observer = make(what)
+    if observer is None:
+        return []
+    given, made = recorded(observer)
     with tempfile.TemporaryDirectory(prefix="obsynth-firmware-") as place:
         folder = Path(place) / "project"
         writer = "tape" if SINGLE in what else backend
@@ -134,12 +136,14 @@ def main() -> int:
         changed = pool.apply_async(rows, ("luenberger", args.backend, True))
         found = {what: jobs[what].get() for what in names}
         seen = all(row.wrong for row in changed.get())
-    print(f"-O2 -ffp-contract=off, {args.backend}, {RECORDS} steps; {compiler()}, {emulator()}")
+    print(f"-std=gnu17 -O2, {args.backend}, {RECORDS} steps; {compiler()}, {emulator()}")
     print(f"{'':28} {'':4} {'text':>7} {'stack':>6} {'instr.':>9} {'differ':>7} {'ulps':>5}")
     table = [*itertools.chain(*found.values())]
     print("\n".join(map(str, table)))
+    if none := [what.removesuffix(SINGLE) for what in names if not found[what]]:
+        print("not proved in single precision:", "; ".join(none))
     print("a constant changed by one unit in the last place", "is seen" if seen else "IS NOT SEEN")
-    return int(not seen or any(isinstance(row, Row) and row.wrong for row in table))
+    return int(not seen or any(row.wrong for row in table))
 
 
 if __name__ == "__main__":

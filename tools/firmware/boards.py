@@ -15,7 +15,7 @@ from obsynth.codegen.vectors import Drive
 from obsynth.designs.core.observer import STEP_OUTPUTS
 
 HERE = Path(__file__).parent
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O2")
+FLAGS = ("-Wall", "-Wextra", "-Werror", "-O2")
 CORES: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "M3": ("mps2-an385", ("-mcpu=cortex-m3", "-mfloat-abi=soft")),
     "M4F": ("mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")),
@@ -71,15 +71,23 @@ def run(
     include: Sequence[Path],
     records: np.ndarray,
     width: int,
+    std: str = "gnu17",
 ) -> Ran:
     """Build and run the steps of one project on one board.
 
     sources: the step, and what has ``NAME_selftest`` where there is one
     records: states and inputs (N, n), of the project's type
     width: how many numbers a step returns
+    std: with GNU's extensions the compiler may fuse operations, where the source lets it
     """
     board, machine = CORES[core]
-    build = ["arm-none-eabi-gcc", *machine, *FLAGS, *(f"-I{path.absolute()}" for path in include)]
+    build = [
+        "arm-none-eabi-gcc",
+        f"-std={std}",
+        *machine,
+        *FLAGS,
+        *(f"-I{path.absolute()}" for path in include),
+    ]
     told = [f'-DPROJECT="{name}.h"', f"-DNAME={name}", f"-DTIMED={TIMED}"]
     told += ["-DSELFTEST"] if len(sources) > 1 else []
     script = ["-nostartfiles", "-T", str(HERE / "mps2.ld")]
