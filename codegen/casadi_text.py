@@ -8,11 +8,10 @@ from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import (
     DOUBLE,
     LIBRARY,
-    OPERATIONS,
     RESULTS,
     STEP_INPUTS,
     Kernel,
-    counted,
+    instructions,
     scalar_function,
 )
 
@@ -95,14 +94,13 @@ def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
     ]
     enclosed, arguments = _enclose(function, prefix, body)
     parts.append(enclosed)
-    count = function.n_instructions()
     return Kernel(
         backend="casadi",
         functions="\n\n".join(parts),
         arguments=arguments,
         library=library,
-        operations=int(count),
-        counts=counted(OPERATIONS[function.instruction_id(i)] for i in range(count)),
+        operations=int(function.n_instructions()),
+        counts=instructions(function),
     )
 
 

@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -107,7 +107,7 @@ class Description:
     design: the stored design, as `Observer.save` writes it
     detector: options of a fault detector; empty for an observer
     design_hash: SHA-256 of the record of the design, with those options
-    claims: names of what is proved: loading a design proves less than designing it
+    claims: names of what is proved, from the stored equations on
     certificate_hash: SHA-256 of its claims, without margins, whose last digits are the machine's
     real: the type that the step computes in
     """
@@ -137,6 +137,13 @@ class Description:
         step = self.observer.step
         places = range(len(STEP_OUTPUTS), step.n_out())
         return [(step.name_out(i), int(step.numel_out(i))) for i in places]
+
+    @property
+    def outputs(self) -> list[tuple[str, int]]:
+        """The results of a step beside memory and status, with their lengths."""
+        ends = [(f"{kind}_{end}", kind) for kind in "xf" for end in ("lower", "upper")]
+        names = [("xhat", "x"), ("fhat", "f"), *ends]
+        return [(name, self.sizes[kind]) for name, kind in names] + self.further
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -189,6 +196,8 @@ def describe(
     scheduling = _scheduling(observer.step, model)
     _check_step(observer.step, model, n_memory, len(scheduling))
     inner, options = _taken_apart(observer)
+    # loading a design proves less than designing it: what ships is proved
+    inner = replace(inner, certificate=inner.certificate.check("full"))
     real = _real(inner, precision)
     start = np.array([real.rounded(v) for v in _start(observer, memory, n_memory).tolist()])
     _check_not_initialised(observer)

@@ -70,6 +70,12 @@ class Kernel:
         return tuple(name for name in self.library if name not in exact)
 
 
+def instructions(function: ca.Function) -> dict[str, int]:
+    """Return how often CasADi's machine does what in a scalar function."""
+    codes = (function.instruction_id(k) for k in range(function.n_instructions()))
+    return counted(OPERATIONS[code] for code in codes)
+
+
 def counted(operations: Iterable[str]) -> dict[str, int]:
     """Return how often each operation occurs, without loads, stores and constants."""
     return dict(sorted(Counter(name for name in operations if name not in _MOVES).items()))

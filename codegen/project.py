@@ -16,10 +16,10 @@ from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
-from obsynth.codegen.kernel import DOUBLE, REALS, Kernel
+from obsynth.codegen.kernel import DOUBLE, REALS, Kernel, instructions, scalar_function
 from obsynth.codegen.recording import Vectors
 from obsynth.codegen.render import package_name, render
-from obsynth.codegen.tape import write_tape
+from obsynth.codegen.tape import write_tape, written
 from obsynth.codegen.vectors import make_vectors
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -36,6 +36,11 @@ KIND = "obsynth C project"
 _FORMAT = 1
 _TOOLS = ("obsynth", "casadi", "numpy", "sympy", "jinja2")
 _BUILT = ("build/", "dist/")
+_ARITHMETIC = (
+    "every operation of {} is rounded once, to the nearest number, and kept in its type",
+    "numbers below the normal ones are kept, not taken for zero",
+    "no operations are fused, exchanged or left out",
+)
 
 
 @dataclass(frozen=True)
@@ -260,7 +265,7 @@ def _manifest(
     seed: int,
     files: Mapping[str, str],
 ) -> str:
-    observer = description.observer
+    observer, real = description.observer, description.real
     kinds = ("u", "y", "theta", "x", "f") if description.theta else ("u", "y", "x", "f")
     data = {
         "kind": KIND,
@@ -272,11 +277,20 @@ def _manifest(
         "design": {"sha256": description.design_hash, "detector": dict(description.detector)},
         "certificate": {"sha256": description.certificate_hash, "claims": list(description.claims)},
         "method": observer.method,
-        "precision": description.real.precision,
+        "precision": real.precision,
         "backend": kernel.backend,
+        "arithmetic": {
+            "type": real.c,
+            "format": f"binary{real.bits} of IEEE 754",
+            "assumptions": [text.format(real.c) for text in _ARITHMETIC],
+        },
         "sample_time": description.sample_time,
         "fault_delay": observer.fault_delay,
         "sizes": description.sizes,
+        "bytes": {
+            "state": real.bits // 8 * description.sizes["memory"],
+            "out": real.bits // 8 * sum(length for _, length in description.outputs),
+        },
         "memory": {
             field.name: [field.start, field.start + field.size] for field in description.fields
         },
@@ -286,6 +300,10 @@ def _manifest(
             "assumptions": list(observer.guarantee.assumptions),
         },
         "operations": kernel.operations,
+        "operations_of_backends": {
+            "casadi": sum(instructions(scalar_function(observer.step)).values()),
+            "tape": sum(written(observer.step, real).values()),
+        },
         "operation_counts": dict(kernel.counts),
         "library_functions": list(kernel.library),
         "not_defined_to_the_last_bit": list(kernel.inexact),

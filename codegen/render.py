@@ -139,9 +139,6 @@ def template_values(
     observer, sizes = description.observer, description.sizes
     signals = {"u": description.u, "y": description.y, "theta": description.theta}
     signals |= {"x": description.x, "f": description.f}
-    outputs = [("xhat", sizes["x"]), ("fhat", sizes["f"])]
-    outputs += [(f"{kind}_{end}", sizes[kind]) for kind in "xf" for end in ("lower", "upper")]
-    outputs += description.further
     start = nominal_values(observer.model, "x")
     return {
         "name": description.name,
@@ -186,11 +183,11 @@ def template_values(
         "inexact": kernel.inexact,
         "alarms": bool(description.further),
         "window": getattr(observer, "window", None),
-        "outputs": [(name, length) for name, length in outputs if length],
+        "outputs": [(name, length) for name, length in description.outputs if length],
         "example": _example(description),
         "count": vectors.count,
         "numbers": sum(sizes.get(kind, 0) for kind in ("u", "y", "theta"))
-        + sum(length for _, length in outputs),
+        + sum(length for _, length in description.outputs),
         "small": vectors.small,
         "few": vectors.few,
         "word": vectors.word,

@@ -107,6 +107,13 @@ def toy_step(n_u: int = 1, n_f: int = 1, limit: float = FINITE, **changes: Any) 
     return ca.Function("step", [memory, u, y], list(outputs.values()), ports, named)
 
 
+class Proved(tuple[Any, ...]):
+    """Claims that can be proved again."""
+
+    def check(self, level: str) -> Proved:
+        return self
+
+
 @dataclass
 class Toy:
     """The part of an observer that ships."""
@@ -117,7 +124,7 @@ class Toy:
     precision: str = "double"
     fault_delay: int = 0
     record: Any = field(default_factory=lambda: {"design": 1})
-    certificate: tuple[Any, ...] = ()
+    certificate: Proved = field(default_factory=Proved)
     memory_layout: dict[str, slice] = field(
         default_factory=lambda: {
             "y_last": slice(0, 1),
@@ -136,6 +143,11 @@ class Toy:
 
     def memory0(self, guess: Any, x_range: Any = None, f_range: Any = None, y0: Any = None) -> Any:
         return np.array([0.0, 1.0, 10.0, 0.0, *np.asarray(guess, dtype=float)])
+
+
+@pytest.fixture
+def proved() -> type[Proved]:
+    return Proved
 
 
 @pytest.fixture

@@ -65,6 +65,13 @@ def step(n_theta: int = 2, last: str = "theta") -> ca.Function:
     return ca.Function("step", [memory, u, y, theta], outputs, inputs, list(NAMES))
 
 
+class Unproved(tuple[Any, ...]):
+    """No claims."""
+
+    def check(self, level: str) -> Unproved:
+        return self
+
+
 @dataclass
 class Scheduled:
     step: ca.Function
@@ -73,7 +80,7 @@ class Scheduled:
     precision: str = "double"
     fault_delay: int = 0
     record: Any = field(default_factory=lambda: {"design": 1})
-    certificate: tuple[Any, ...] = ()
+    certificate: Unproved = field(default_factory=Unproved)
 
     @property
     def memory_layout(self) -> dict[str, slice]:

@@ -48,6 +48,8 @@ def test_it_says_so(project: Path) -> None:
     """Header, README, manifest and design; default writer; every literal typed."""
     manifest = json.loads((project / "manifest.json").read_text())
     assert (manifest["precision"], manifest["backend"]) == ("single", "tape")
+    assert manifest["arithmetic"]["format"] == "binary32 of IEEE 754"
+    assert manifest["bytes"] == {"state": 24, "out": 36}
     header = (project / "include/two_tanks.h").read_text()
     assert "typedef float two_tanks_real_t;" in header
     assert "#define TWO_TANKS_SAMPLE_TIME 0.5f" in header

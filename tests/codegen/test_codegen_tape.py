@@ -254,3 +254,7 @@ def test_a_project_of_the_tape(toy: Any, tmp_path: Path, monkeypatch: pytest.Mon
     theirs = generate_kernel(toy.step, "p")
     assert sum(manifest["operation_counts"].values()) < sum(theirs.counts.values())
     assert sum(theirs.counts.values()) < theirs.operations == manifest["operations"]
+    assert manifest["operations_of_backends"] == {
+        "casadi": sum(theirs.counts.values()),
+        "tape": sum(manifest["operation_counts"].values()),
+    }
