@@ -43,6 +43,9 @@ _TARGET_TEXT = """
     package_source rebuild_cache run_tests test uninstall zero_check c dl gcc m pthread rt util
 """
 
+_DEVICE = re.compile(r"aux|con|nul|prn|(com|lpt)\d", re.IGNORECASE)
+_LONGEST = 200
+
 _KEYWORDS = frozenset(_KEYWORD_TEXT.split())
 _TAKEN = frozenset(f"{_HEADER_TEXT} {_TARGET_TEXT}".split())
 
@@ -445,6 +448,12 @@ def project_name(name: str | None, plant: str) -> str:
         raise CodegenError(
             f"name={chosen!r} would hide a header, a library or a target of the build; {advice},"
             f" for example name={chosen + '_observer'!r}",
+            symbol=chosen,
+        )
+    if _DEVICE.fullmatch(chosen) or len(chosen) > _LONGEST:
+        raise CodegenError(
+            f"name={chosen[:30]!r} ({len(chosen)} letters) is no name of a file under Windows or is"
+            f" longer than {_LONGEST} letters; {advice}",
             symbol=chosen,
         )
     return chosen

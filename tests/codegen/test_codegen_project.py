@@ -400,6 +400,12 @@ def test_fast_math_is_refused_by_the_sources(
         ({"name": "stdio"}, "stdio_observer"),
         ({"name": "m"}, "hide a header, a library or a target"),
         ({"name": "Nightly"}, "hide a header, a library or a target"),
+        ({"name": "class"}, "for example name='class_'"),
+        ({"name": "nullptr"}, "for example name='nullptr_'"),
+        ({"name": "con"}, "no name of a file under Windows"),
+        ({"name": "com1"}, "no name of a file under Windows"),
+        ({"name": "a" * 300}, "300 letters"),
+        ({"precision": 32}, "available: 'double', 'single'"),
     ],
 )
 def test_options_that_cannot_be_met_are_refused(
