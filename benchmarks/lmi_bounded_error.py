@@ -12,13 +12,13 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from lmi_relaxation import relax_sum
 
 from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.lmi.expression import full, scalar, symmetric, trace
 from obsynth.designs.lmi.problem import Problem, he, symmetric_block
 from obsynth.designs.lmi.proof import prove_family
 from obsynth.designs.lmi.reductions import split_common
-from obsynth.designs.lmi.relaxation import relax_sum
 
 __all__ = ["ROWS"]
 

@@ -14,6 +14,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from lmi_relaxation import (
+    RowMultipliers,
+    UncertainRow,
+    corner_block,
+    row_multipliers,
+)
 
 from obsynth.derive.rigour import Enclosure, prove_positive_definite
 from obsynth.designs.lmi.expression import full, symmetric
@@ -21,12 +27,6 @@ from obsynth.designs.lmi.margin import solve_with_margin
 from obsynth.designs.lmi.problem import Problem, symmetric_block
 from obsynth.designs.lmi.proof import prove_family
 from obsynth.designs.lmi.reductions import split_common
-from obsynth.designs.lmi.relaxation import (
-    RowMultipliers,
-    UncertainRow,
-    corner_block,
-    row_multipliers,
-)
 
 __all__ = ["WAYS", "run"]
 

@@ -6,10 +6,8 @@ import platform
 import sys
 import uuid
 import zipfile
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +20,7 @@ from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.project import compared, write_step
 from obsynth.codegen.render import fill, render, template_values
-from obsynth.codegen.start import Start, start_of
+from obsynth.codegen.start import Start, Variable, start_of
 from obsynth.designs.core.files import replaced
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -30,6 +28,7 @@ from obsynth.designs.detection.detector import FaultDetector
 _PLATFORMS = {("linux", "x86_64"): ("linux64", "so"), ("darwin", "x86_64"): ("darwin64", "dylib")}
 _FLAGS = ("-O2", "-fPIC", "-fvisibility=hidden")
 _DESCRIPTION = "modelDescription.xml"
+_RANKS = ("parameter", "input", "Real", "Boolean", "Integer")
 _ORDER = ("input", "output", "parameter")
 _INPUTS = {"u": "input", "y": "measurement (NaN: missing)", "theta": "scheduling signal"}
 _OUTPUTS = {
@@ -44,26 +43,6 @@ _OUTPUTS = {
     "alarm": ("alarm", "whether the interval excludes zero of", 0.0),
 }
 _BITS = "sum of " + ", ".join(f"{bit} {word.replace('_', ' ')}" for word, bit in STATUS.items())
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A variable of the unit; its value reference is its place among all in their order.
-
-    field: of the structs of the C interface, with its entry; empty for parameters
-    first: start value, or the value before the first step
-    """
-
-    name: str
-    type: Literal["Real", "Boolean", "Integer"]
-    causality: Literal["parameter", "input", "output"]
-    field: str
-    first: float
-    description: str
-    unit: str = ""
-    lower: float = -math.inf
-    upper: float = math.inf
-    reference: int = 0
 
 
 @dataclass(frozen=True)
@@ -224,27 +203,20 @@ def generate_fmu(
 
 def _checked(path: Path, overwrite: bool) -> Path:
     """Return the file's full path, or refuse one that is not free."""
+    target = path.expanduser().resolve()
     if path.suffix != ".fmu":
         raise CodegenError(f"{path}: name a file that ends with .fmu", path=str(path))
-    target = path.expanduser().resolve()
     if not target.parent.is_dir():
         raise CodegenError(f"{target}: there is no folder {target.parent}", path=str(target))
-    if not target.exists():
-        return target
-    if not _is_unit(target):
-        raise CodegenError(f"{target} is no FMU; name another file", path=str(target))
-    if not overwrite:
-        raise CodegenError(
-            f"{target} is there already; say overwrite=True to replace it", path=str(target)
-        )
+    if target.exists():
+        ours = target.is_file() and zipfile.is_zipfile(target)
+        if not ours or _DESCRIPTION not in zipfile.ZipFile(target).namelist():
+            raise CodegenError(f"{target} is no FMU; name another file", path=str(target))
+        if not overwrite:
+            raise CodegenError(
+                f"{target} is there already; say overwrite=True to replace it", path=str(target)
+            )
     return target
-
-
-def _is_unit(path: Path) -> bool:
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as unit:
-        return _DESCRIPTION in unit.namelist()
 
 
 def _pack(path: Path, contents: dict[str, bytes]) -> None:
@@ -262,10 +234,7 @@ def _variables(description: Description, start: Start, inputs: Sequence[str]) ->
     Among the outputs real ones come before booleans, and booleans before integers.
     inputs: start values of u, y and theta, as lists of C
     """
-    found = [
-        Variable(p.name, "Real", "parameter", "", p.start, p.description, p.unit, p.lower, p.upper)
-        for p in start.parameters
-    ]
+    found = list(start.parameters)
     for kind, values in zip(_INPUTS, inputs, strict=True):
         ports: tuple[Port, ...] = getattr(description, kind)
         numbers = (float(text.rstrip("f")) for text in values.split(", ") if text)
@@ -282,37 +251,27 @@ def _variables(description: Description, start: Start, inputs: Sequence[str]) ->
                 found.append(Variable(name, type_, "output", kind, first, told_, unit))
     words = ("status", *further & {"mean_status"})
     found += [Variable(kind, "Integer", "output", kind, 1.0, _BITS) for kind in words]
-    names: dict[int, str] = {}
-    for i, v in sorted(enumerate(found), key=lambda item: item[1].causality != "input"):
-        names[i], count = v.name, 1
-        while names[i] in [name for j, name in names.items() if j != i]:
+    names: dict[str, int] = {}
+    for i in sorted(range(len(found)), key=lambda i: found[i].causality != "input"):
+        name, count = found[i].name, 1
+        while name in names:
             count += 1
-            names[i] = f"{v.name}_{count}"
-    return [replace(v, name=names[i], reference=i) for i, v in enumerate(found)]
+            name = f"{found[i].name}_{count}"
+        names[name] = i
+        found[i] = replace(found[i], name=name)
+    return found
 
 
 def _template_values(variables: Sequence[Variable], start: Start) -> dict[str, Any]:
     """Return what the templates of a unit call by name beside those of a project."""
-    fields = Counter(v.field for v in variables)
-    places = {v.field: (v.reference, fields[v.field]) for v in reversed(variables)}
-    kinds = {
-        "parameters": [v for v in variables if v.causality == "parameter"],
-        "inputs": [v for v in variables if v.causality == "input"],
-        "real": [v for v in variables if v.causality == "output" and v.type == "Real"],
-        "boolean": [v for v in variables if v.type == "Boolean"],
-        "integer": [v for v in variables if v.type == "Integer"],
-    }
-    ends = zip(kinds, accumulate(map(len, kinds.values())), strict=True)
-    listed = sorted(variables, key=lambda v: _ORDER.index(v.causality))
+    ranks = [_RANKS.index(v.type if v.causality == "output" else v.causality) for v in variables]
+    fields = [v.field for v in variables]
     return {
         "ordered": variables,
-        "variables": listed,
+        "variables": sorted(enumerate(variables), key=lambda item: _ORDER.index(item[1].causality)),
         "units": sorted({v.unit for v in variables if v.unit}),
-        "ends": {"guess": start.guesses, **dict(ends)},
-        "in_places": [(k, *place) for k, place in places.items() if k in _INPUTS],
-        "out_places": [
-            (k, *place) for k, place in places.items() if k in _OUTPUTS or k == "mean_status"
-        ],
-        "status_place": places["status"][0],
+        "ends": [sum(rank <= i for rank in ranks) for i in range(len(_RANKS))],
+        "guesses": start.guesses,
+        "places": [(k, fields.index(k), fields.count(k)) for k in dict.fromkeys(fields) if k],
         "rules": start.rules,
     }

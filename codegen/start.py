@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,19 +20,26 @@ LARGEST = 1e90
 
 _SCALES = (1.0, 1.0, 1.0, 0.3, 0.01, 1e-4)
 _ROUNDED = 1e-13
-_ENDS = ("lower", "upper")
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A number that the first memory is made of, with the limits of the ends of ranges."""
+class Variable:
+    """A variable of a unit for co-simulation.
+
+    field: of the structs of the C interface; empty for parameters
+    first: start value, or the value before the first step
+    lower, upper: limits of a parameter
+    """
 
     name: str
-    unit: str
+    type: Literal["Real", "Boolean", "Integer"]
+    causality: Literal["parameter", "input", "output"]
+    field: str
+    first: float
     description: str
-    start: float
-    lower: float
-    upper: float
+    unit: str = ""
+    lower: float = -np.inf
+    upper: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +53,7 @@ class Start:
     """
 
     memory: FloatArray
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[Variable, ...] = ()
     guesses: int = 0
     rules: tuple[tuple[int, str], ...] = ()
 
@@ -170,24 +177,17 @@ def _sum(entry: FloatArray, v: FloatArray, terms: list[float]) -> str:
 
 def _parameters(
     observer: Observer | FaultDetector, group: str, start: FloatArray
-) -> list[Parameter]:
-    """Return the parameters of a guess, or of ranges."""
-    model = observer.model
-    signals = model.f if group == "f_range" else model.x
-    if group == "guess":
-        return [
-            Parameter(f"{s.name}_guess", s.unit, f"guess of the first {s.name}", a, -np.inf, np.inf)
-            for s, a in zip(signals, start.tolist(), strict=True)
-        ]
-    box = np.asarray(model.box(group[0]), dtype=float).reshape(-1, 2).tolist()
-    return [
-        Parameter(
-            f"{s.name}_first_{end}",
-            s.unit,
-            f"{end} end of the range of the first {s.name}",
-            value,
-            *limits,
-        )
-        for (s, pair, limits) in zip(signals, start.tolist(), box, strict=True)
-        for end, value in zip(_ENDS, pair, strict=True)
-    ]
+) -> list[Variable]:
+    """Return the parameters of a guess, (n,), or of ranges, (n, 2)."""
+    ranges = group != "guess"
+    kind, words = (group[0], ["first_lower", "first_upper"]) if ranges else ("x", ["guess"])
+    limits = np.asarray(observer.model.box(kind), dtype=float).reshape(-1, 2)
+    if not ranges:
+        limits = np.full(limits.shape, [-np.inf, np.inf])
+    found = []
+    for s, row, pair in zip(getattr(observer.model, kind), start, limits.tolist(), strict=True):
+        for word, value in zip(words, np.atleast_1d(row).tolist(), strict=True):
+            told = f"{word.replace('_', ' ')} of {s.name}"
+            name = f"{s.name}_{word}"
+            found.append(Variable(name, "Real", "parameter", "", value, told, s.unit, *pair))
+    return found

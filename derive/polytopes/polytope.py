@@ -144,26 +144,6 @@ class Polytope:
         x = exact(np.ravel(np.asarray(point, dtype=float)))
         return bool((exact(self.normals) @ x <= exact(self.offsets)).all())
 
-    @property
-    def volume(self) -> float:
-        """Volume of the hull of the vertices; a length in one dimension."""
-        return hull_volume(self.vertices)
-
-
-def hull_volume(points: FloatArray) -> float:
-    """Return the volume of the hull of points, 0 when it is flat."""
-    if points.shape[1] == 1:
-        return float(np.ptp(points[:, 0])) if len(points) else 0.0
-    from scipy.spatial import ConvexHull, QhullError
-
-    size = np.ptp(points, axis=0) if len(points) else np.zeros(points.shape[1])
-    if len(points) <= points.shape[1] or not size.all():
-        return 0.0
-    try:
-        return float(ConvexHull(points / size).volume * np.prod(size))
-    except QhullError:
-        return 0.0
-
 
 def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope:
     """Find the vertices of a polytope that is given by half-spaces.

@@ -1,4 +1,4 @@
-"""Reductions say the same as what they reduce; relaxations imply it."""
+"""Reductions say the same as what they reduce."""
 
 from fractions import Fraction
 from itertools import product
@@ -8,17 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.derive.rigour import Enclosure
 from obsynth.designs.lmi.expression import full, symmetric
 from obsynth.designs.lmi.problem import Problem, symmetric_block
 from obsynth.designs.lmi.reductions import extreme_points, split_common
-from obsynth.designs.lmi.relaxation import (
-    RowMultipliers,
-    UncertainRow,
-    corner_block,
-    relax_sum,
-    row_multipliers,
-)
 from obsynth.symbolic.errors import ObsynthError
 
 PROPERTY = settings(derandomize=True, max_examples=15, deadline=None)
@@ -140,102 +132,3 @@ def test_vertex_pairs_of_a_box_that_enter_through_differences():
 def test_extreme_points_need_finite_rows():
     with pytest.raises(ObsynthError, match="finite"):
         extreme_points([[np.nan]])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_relaxation_implies_every_vertex_and_groups_make_it_sharper(seed):
-    A, M, C, W = data(seed)
-    vertices = A + np.einsum("vk,kij->vij", signs(3), M)
-
-    def block_of(P, directions):
-        changes = np.einsum("vk,kij->vij", signs(len(directions)), directions)
-        side = P @ changes
-        rows = [[np.zeros((4, 4))], [np.zeros((3, 4)), np.zeros((3, 3))]]
-        return symmetric_block([*rows, [side, np.zeros((4, 3)), np.zeros((4, 4))]])
-
-    def relaxed(groups):
-        def add(problem, P, H):
-            centre = decay(P, H, A, C, W)
-            relax_sum(problem, "decay", centre, [block_of(P, M[g]) for g in groups])
-
-        return optimum(add)
-
-    def whole(problem, P, H):
-        problem.add("family", decay(P, H, vertices, C, W) >> 0)
-
-    exact = optimum(whole)
-    by_entry, by_row = relaxed([[0], [1], [2]]), relaxed([[0, 1], [2]])
-    together = relaxed([[0, 1, 2]])
-    slack = 1e-6 * exact.objective
-    assert exact.objective <= by_row.objective + slack <= by_entry.objective + 2 * slack
-    assert together.objective == pytest.approx(exact.objective, rel=1e-5)
-    P, H = symmetric("P", 4), full("H", 4, 2)
-    for solution in (by_entry, by_row):
-        value = decay(P, H, vertices, C, W).value(solution.values)
-        assert np.linalg.eigvalsh(value).min() > -1e-6
-    # A relaxation that forgot one uncertain entry is found out at a vertex.
-    forgetful = relaxed([[0]])
-    value = decay(P, H, vertices, C, W).value(forgetful.values)
-    assert np.linalg.eigvalsh(value).min() < -1e-4
-
-
-def chain_rows(rows, size):
-    return [UncertainRow(i, columns, size * signs(len(columns))) for i, columns in rows.items()]
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_row_multipliers_imply_every_vertex(seed):
-    A, _, C, W = data(seed)
-    size, rows = 0.08, {0: (0, 1), 1: (1, 2), 3: (3,)}
-    places = [(i, j) for i, columns in rows.items() for j in columns]
-    vertices = np.repeat(A[None], 2 ** len(places), axis=0)
-    for k, (i, j) in enumerate(places):
-        vertices[:, i, j] += size * signs(len(places))[:, k]
-
-    def relaxed(uncertain):
-        def add(problem, P, H):
-            m = row_multipliers(problem, "m", uncertain, (4, 4))
-            X = P @ A - H @ C
-            rows_of = [[0.9 * P - m.Q], [-m.S.T, m.R], [0, 0, np.eye(3)], [X, P @ m.rows, P @ W, P]]
-            problem.add("decay", symmetric_block(rows_of) >> 0)
-
-        return optimum(add)
-
-    def whole(problem, P, H):
-        problem.add("family", decay(P, H, vertices, C, W) >> 0)
-
-    exact, by_row = optimum(whole), relaxed(chain_rows(rows, size))
-    assert exact.objective * (1 - 1e-6) <= by_row.objective < 1.5 * exact.objective
-    P, H = symmetric("P", 4), full("H", 4, 2)
-    value = decay(P, H, vertices, C, W).value(by_row.values)
-    assert np.linalg.eigvalsh(value).min() > -1e-6
-    # Corners that leave out a row, or are too small, do not imply all vertices.
-    for wrong in (chain_rows({0: (0, 1)}, size), chain_rows(rows, 0.2 * size)):
-        value = decay(P, H, vertices, C, W).value(relaxed(wrong).values)
-        assert np.linalg.eigvalsh(value).min() < -1e-4
-
-
-def test_multipliers_are_assembled_alike_in_every_arithmetic():
-    uncertain = chain_rows({0: (0, 1), 2: (2,)}, 0.1)
-    problem = Problem("assemble")
-    m = row_multipliers(problem, "m", uncertain, (3, 3))
-    rng = np.random.default_rng(0)
-    values = {
-        name: 0.5 * (x + x.T) if x.shape[0] == x.shape[1] else x
-        for name, v in problem.variables.items()
-        for x in [rng.normal(size=v.shape)]
-    }
-    enclosed = RowMultipliers.assemble(
-        uncertain, {n: Enclosure.of(v) for n, v in values.items()}, "m", (3, 3), Enclosure.of
-    )
-    for mine, other in ((m.Q, enclosed.Q), (m.S, enclosed.S), (m.R, enclosed.R)):
-        assert np.allclose(mine.value(values), other.mid, rtol=1e-14)
-    corner = problem.blocks["m.0"].expression.value(values)
-    parts = [Enclosure.of(values[f"m.{part}0"]) for part in "QSR"]
-    again = corner_block(*parts, Enclosure.of(uncertain[0].vertices))
-    assert again.contains(corner) and again.rad.max() < 1e-14
-
-
-def test_corners_have_to_fit_their_columns():
-    with pytest.raises(ObsynthError, match="row 1"):
-        row_multipliers(Problem("p"), "m", [UncertainRow(1, (0, 1), np.zeros((2, 3)))], (2, 2))

@@ -1,7 +1,7 @@
 """Sufficient conditions that replace exponentially many vertices by a few per row.
 
 What stands here implies the inequality at every vertex and may ask for more than that; the
-loss is measured in ``benchmarks/lmi.py``.
+loss is measured in ``lmi.py``.
 """
 
 from __future__ import annotations
