@@ -1,13 +1,19 @@
 """What `make firmware` takes for equal, and that it sees a difference."""
 
 import importlib.util
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+
+from obsynth.codegen.kernel import DOUBLE, SINGLE
+from obsynth.codegen.single import machine_of
 
 FIRMWARE = Path(__file__).parents[2] / "tools" / "firmware"
 
@@ -37,9 +43,26 @@ def test_results_are_apart_by_the_numbers_between_them(boards: ModuleType, real:
 @pytest.mark.long
 def test_a_changed_constant_is_seen_on_every_board() -> None:
     """Mutant: the allowance for library functions given to a step that calls none."""
-    if subprocess.run(["which", "qemu-system-arm", "arm-none-eabi-gcc"], check=False).returncode:
+    if not (shutil.which("qemu-system-arm") and shutil.which("arm-none-eabi-gcc")):
         pytest.skip("make firmware installs the compiler and the emulator")
     command = [sys.executable, str(FIRMWARE), "luenberger", "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "is seen" in done.stdout and "WRONG" not in done.stdout
+
+
+def test_records_hold_what_the_machine_makes_of_them(
+    boards: ModuleType, make_toy: Callable[[], Any], make_single: Callable[[], Any]
+) -> None:
+    """Mutants: the memory of the step before in place of its own; records in another type."""
+    for toy, real in ((make_toy(), np.float64), (make_single(), np.float32)):
+        given, made = boards.recorded(toy)
+        assert (given.dtype, made.dtype, len(given)) == (real, real, boards.RECORDS)
+        step = machine_of(toy.step, SINGLE if real is np.float32 else DOUBLE)
+        size = toy.step.numel_in(0)
+        for k in (0, 1, boards.TIMED, boards.RECORDS - 1):
+            results = step(given[k, :size], *np.split(given[k, size:], [toy.step.numel_in(1)]))
+            np.testing.assert_array_equal(made[k, -size:], results[0])
+            np.testing.assert_array_equal(made[k, 0], results[1][0])
+        assert np.isfinite(given[: boards.TIMED]).all()
+        assert not np.isfinite(given).all()
