@@ -11,8 +11,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.description import Description, Port, c_comment, midpoints, nominal_values
+from obsynth.codegen.description import Description, Port, midpoints, nominal_values
 from obsynth.codegen.kernel import DOUBLE, Kernel, Machine, Real
+from obsynth.codegen.names import c_comment
 from obsynth.codegen.recording import Vectors
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray

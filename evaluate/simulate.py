@@ -48,6 +48,8 @@ def simulate(
         The truth: the observer's own discrete model, another discretisation,
         or, with `substeps`, the continuous plant behind it.
     observer : Observer or FaultDetector
+        Its step runs in double precision, also where it was designed for single: the sets hold, as
+        rounding is less than they count. What a target computes are the numbers of `generate_c`.
     scenario : Scenario
         Inputs, faults, disturbances and initial values.
     seed : int

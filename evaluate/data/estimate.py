@@ -39,7 +39,8 @@ def estimate(
     Parameters
     ----------
     observer : Observer or FaultDetector
-        Of any method, for the plant of the record.
+        Of any method, for the plant of the record. Its step runs in double precision, also where
+        it was designed for single: the sets hold, as rounding is less than they count.
     record : Record, or whatever `read_record` reads
         Rows are instants one sample time apart; a missing reading is NaN and costs that reading
         only, an instant at which nothing was measured all of them.

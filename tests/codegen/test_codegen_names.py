@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.codegen import CodegenError
-from obsynth.codegen.description import c_comment, identifier, project_name, unique
 from obsynth.codegen.kernel import DOUBLE, SINGLE
+from obsynth.codegen.names import c_comment, identifier, project_name, unique
 from obsynth.codegen.recording import Word, tokens
 
 C_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*_?")
