@@ -6,7 +6,6 @@ import operator
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +23,7 @@ from obsynth.codegen.vectors import make_vectors
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 
 PRECISIONS = tuple(REALS)
 """Precisions that a project can be generated for."""
@@ -101,12 +101,7 @@ class CProject:
         )
 
     def _repr_html_(self) -> str:
-        left = "style='text-align:left'"
-        rows = "".join(
-            f"<tr><th {left}>{escape(key)}</th><td {left}>{escape(text)}</td></tr>"
-            for key, text in self._rows()
-        )
-        return f"<table><caption>C project {escape(self.name)}</caption>{rows}</table>"
+        return html_table((), self._rows(), f"C project {self.name}")
 
 
 def generate_c(

@@ -200,8 +200,12 @@ def _curve(z: int, a: int, known: _Known, ranges: Mapping[int, Interval]) -> lis
     middle = 0.5 * ends[0] + 0.5 * ends[1]
     rows = _chord(z, a, known, ends, convex, concave)
     for point in (ends[0], middle, ends[1]):
-        rows += _tangent(z, a, known, ends, point, convex, concave)
-    return rows + _band(z, a, known, ends, middle, convex | concave)
+        value, derivative, _ = _over(known, (point, point))
+        rows += _touching(z, a, ends, point, value, derivative, convex, concave)
+    # the mean value form, where nothing is known of how it bends
+    value, derivative = _over(known, (middle, middle))[0], _over(known, ends)[1]
+    open_ = ~(convex | concave)
+    return rows + _touching(z, a, ends, middle, value, derivative, open_, open_)
 
 
 def _over(known: _Known, ends: Interval) -> list[Interval]:
@@ -223,45 +227,32 @@ def _chord(
     width = ends[1] - ends[0]
     slope = np.where(width > 0.0, (high[0] - low[0]) / np.where(width > 0.0, width, 1.0), 0.0)
     left, right = _above(low, slope, ends[0]), _above(high, slope, ends[1])
-    one = np.ones_like(slope)
     most = np.where(convex, np.maximum(left[1], right[1]), np.inf)
     least = np.where(concave, np.minimum(left[0], right[0]), -np.inf)
-    return [_row((z, a), (one, -slope), most), _row((z, a), (-one, slope), -least)]
+    return _between(z, a, slope, least, most)
 
 
-def _tangent(
+def _touching(
     z: int,
     a: int,
-    known: _Known,
     ends: Interval,
     point: FloatArray,
-    convex: BoolArray,
-    concave: BoolArray,
+    value: Interval,
+    derivative: Interval,
+    below: BoolArray,
+    above: BoolArray,
 ) -> list[Row]:
-    """Return the tangent at a point, below what is convex, above what is concave."""
-    value, derivative, _ = _over(known, (point, point))
-    slope = 0.5 * derivative[0] + 0.5 * derivative[1]
-    reach = up(np.maximum(ends[1] - point, point - ends[0]))
-    spread = (0.0 * slope, up(derivative[1] - derivative[0]))
-    lost = ar.multiply(spread, (0.0 * reach, reach))[1]
-    start = _above(value, slope, point)
-    one = np.ones_like(slope)
-    most = np.where(concave, up(start[1] + lost), np.inf)
-    least = np.where(convex, -up(lost - start[0]), -np.inf)
-    return [_row((z, a), (one, -slope), most), _row((z, a), (-one, slope), -least)]
-
-
-def _band(
-    z: int, a: int, known: _Known, ends: Interval, middle: FloatArray, bent: BoolArray
-) -> list[Row]:
-    """Return the mean value form about the middle, where nothing is known of how it bends."""
-    value = _over(known, (middle, middle))[0]
-    derivative = _over(known, ends)[1]
+    """Return lines through a point below and above, for a derivative that is in an interval."""
     slope, radius = middle_and_radius(*derivative)
-    reach = up(np.maximum(ends[1] - middle, middle - ends[0]))
+    reach = up(np.maximum(ends[1] - point, point - ends[0]))
     lost = ar.multiply((0.0 * radius, radius), (0.0 * reach, reach))[1]
-    start = _above(value, slope, middle)
+    start = _above(value, slope, point)
+    most = np.where(above, up(start[1] + lost), np.inf)
+    least = np.where(below, -up(lost - start[0]), -np.inf)
+    return _between(z, a, slope, least, most)
+
+
+def _between(z: int, a: int, slope: FloatArray, least: FloatArray, most: FloatArray) -> list[Row]:
+    """Return ``least <= z - slope a <= most``."""
     one = np.ones_like(slope)
-    most = np.where(bent, np.inf, up(start[1] + lost))
-    least = np.where(bent, -np.inf, -up(lost - start[0]))
     return [_row((z, a), (one, -slope), most), _row((z, a), (-one, slope), -least)]
