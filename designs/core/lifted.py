@@ -30,7 +30,6 @@ from obsynth.derive.rigour.interval import UNIT, outward
 FAR = 1e100
 """Numbers from which on a signal is not bounded at all, whatever the precision of code."""
 _TWO_PI = 2.0 * np.pi
-_LARGE_ANGLE = 1e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +68,8 @@ class Limits(NamedTuple):
     finite: what is larger counts as no number; CasADi folds ``y == y`` to 1, so size is what tells
     huge: widths of sets from which on they say nothing; declared ranges are within
     largest: ends of nodes that are not bounded
+    angle: from which on sine and cosine are not followed; functions of single precision give no
+        number beyond
     """
 
     tiny: float
@@ -76,11 +77,12 @@ class Limits(NamedTuple):
     finite: float
     huge: float
     largest: float
+    angle: float
 
 
 LIMITS = {
-    "double": Limits(2.0**-1021, FAR, 1e90, 1e50, FAR),
-    "single": Limits(2.0**-125, 2.0**40, 2.0**39, 2.0**36, 2.0**120),
+    "double": Limits(2.0**-1021, FAR, 1e90, 1e50, FAR, 1e8),
+    "single": Limits(2.0**-125, 2.0**40, 2.0**39, 2.0**36, 2.0**120, 6433.0),
 }
 
 
@@ -366,7 +368,9 @@ class _Arithmetic:
         found = self.rounding.interval(
             ca.fmin(left, right), ca.fmax(left, right), -1.0, 1.0, 2.0 * ULPS
         )
-        unknown = ca.logic_not(ca.fmax(ca.fabs(a.lower), ca.fabs(a.upper)) < _LARGE_ANGLE)
+        unknown = ca.logic_not(
+            ca.fmax(ca.fabs(a.lower), ca.fabs(a.upper)) < self.rounding.limits.angle
+        )
         lower, upper = ca.fmax(found.lower, -1.0), ca.fmin(found.upper, 1.0)
         if self._may_cross(a, crest):
             top = ca.logic_or(self._crosses(a, crest), unknown)
@@ -381,7 +385,7 @@ class _Arithmetic:
 
     def _may_cross(self, a: Lifted, phase: float) -> bool:
         """Whether an extremum can lie between the numbers at all."""
-        if max(abs(a.low), abs(a.high)) >= _LARGE_ANGLE:
+        if max(abs(a.low), abs(a.high)) >= self.rounding.limits.angle:
             return True
         margin = self._margin() * (abs(a.low) + abs(a.high) + 4.0)
         first = np.ceil((a.low - phase - margin) / _TWO_PI)

@@ -39,6 +39,7 @@ from obsynth.derive.intervals.program import constant_interval
 from obsynth.derive.intervals.rules import NAMES, RULES
 from obsynth.derive.rigour import Interval, down, up
 from obsynth.derive.rigour.interval import TINY, UNIT, multiply, raised
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.rounding_rules import (
     NO_ROUNDING,
     ONE_ROUNDING,
@@ -55,6 +56,7 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray
 _LARGEST = {"double": float(np.finfo(np.float64).max), "single": float(np.finfo(np.float32).max)}
 # above half the smallest positive number, and above `ULPS` of it
 _UNDERFLOW = {"double": TINY, "single": 2.0**-145}
+_WAVES = ("sine", "cosine", "tangent")
 _TESTS = (ca.OP_LT, ca.OP_LE, ca.OP_SIGN)
 _MOST_CELLS = 4096
 _ZERO: Interval = (np.zeros((2, 1)), np.zeros((2, 1)))
@@ -221,6 +223,8 @@ class _Tape:
             units = 1.0 if name in ONE_ROUNDING else 2.0 * ULPS
             self._round(node, units, is_exact(name, operands), sums=name in ("add", "subtract"))
         undefined = ~(node.size <= _LARGEST[self.precision]).all(axis=0)
+        if name in _WAVES and self.precision == "single":
+            undefined |= ~(operands[0].size <= LIMITS["single"].angle).all(axis=0)
         node.e = np.where(undefined, np.inf, node.e)
         return node
 

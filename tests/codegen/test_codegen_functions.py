@@ -6,12 +6,15 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from obsynth.codegen import functions
 from obsynth.codegen.functions import FARTHEST, ULPS, own_function
 from obsynth.codegen.single import SingleMachine
+from obsynth.designs.core.lifted import Lifted, Rounding, combine
+from obsynth.designs.core.rounding import rounding_bound
 
 NAMES = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "pow": "power"}
 NAMES |= {"asinh": "arcsinh", "acosh": "arccosh", "atanh": "arctanh"}
@@ -101,3 +104,27 @@ def test_limits_and_what_is_not_defined(name: str) -> None:
         truth = np.where(np.abs(flat[0]) <= FARTHEST, truth, np.nan)
     told = errors(found[0].astype(float), truth)
     assert (told <= ULPS[name]).all(), [a[~(told <= ULPS[name])] for a in flat]
+
+
+@pytest.mark.parametrize("op", ["sine", "cosine", "tangent"])
+def test_sets_hold_where_an_angle_is_none_any_more(op: str) -> None:
+    """An end whose sine is a NaN leaves the other end. Mutant: the angle of double in single."""
+    low, high = ca.SX.sym("low"), ca.SX.sym("high")
+    angle = Lifted(low, high, -1e4, 1e4)
+    found = combine(op, angle, rounding=Rounding("single"))
+    ends = SingleMachine(ca.Function("f", [low, high], [found.lower, found.upper]))
+    left, right = FARTHEST - 0.1, FARTHEST + 0.1
+    told = [float(end[0]) for end in ends(np.array([left]), np.array([right]))]
+    function = {"sine": np.sin, "cosine": np.cos, "tangent": np.tan}[op]
+    truth = function(np.linspace(left, right, 99))
+    assert told[0] <= truth.min()
+    assert truth.max() <= told[1]
+
+
+def test_rounding_is_not_bounded_where_an_angle_is_none_any_more() -> None:
+    """Mutant: the same bound on both sides."""
+    x = ca.SX.sym("x")
+    sine = ca.Function("f", [x], [ca.sin(x)], ["x"], ["s"])
+    for end, known in ((FARTHEST - 1.0, True), (FARTHEST + 1.0, False)):
+        box = {"x": (np.array([[6000.0]]), np.array([[end]]))}
+        assert np.isfinite(rounding_bound(sine, box, "single")["s"].error[0]) == known
