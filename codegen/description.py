@@ -111,6 +111,12 @@ class Description:
             "f": len(self.f),
         }
 
+    def split(self, inputs: FloatArray) -> list[FloatArray]:
+        """Return u, y and theta where there is one, of one vector."""
+        sizes = [self.sizes.get(kind, 0) for kind in STEP_INPUTS[1:]]
+        parts = np.split(inputs.astype(float), np.cumsum(sizes)[:-1])
+        return parts if self.theta else parts[:-1]
+
     def place(self, port: str, i: int) -> str:
         """Return what entry i of a vector of the step is called in C, between its structs."""
         if port in {"memory", "next"}:

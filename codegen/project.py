@@ -19,8 +19,8 @@ from obsynth.codegen.kernel import DOUBLE, REALS, Kernel, instructions, scalar_f
 from obsynth.codegen.recording import Vectors
 from obsynth.codegen.render import package_name, render
 from obsynth.codegen.tape import write_tape, written
-from obsynth.codegen.vectors import make_vectors
-from obsynth.designs.core.observer import Observer
+from obsynth.codegen.vectors import COUNT, make_vectors
+from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.display import html_table
@@ -110,7 +110,7 @@ def generate_c(
     name: str | None = None,
     precision: Literal["double", "single"] | None = None,
     backend: Literal["casadi", "tape"] | None = None,
-    vectors: int = 10_000,
+    vectors: int = COUNT,
     seed: int = 0,
     overwrite: bool = False,
     memory: FloatArray | None = None,
@@ -138,7 +138,8 @@ def generate_c(
         from the instructions of the same function, shorter and quicker (the only one in single
         precision). Interface and results are the same to the last bit.
     vectors : int
-        Number of recorded steps, at least 100.
+        Number of recorded steps, at least 100: most of them healthy ones, and steps on both sides
+        of every limit that the step compares something with.
     seed : int
         Seed of the vectors.
     overwrite : bool
@@ -308,6 +309,9 @@ def _manifest(
             "seed": seed,
             "kinds": dict(vectors.kinds),
             "statuses": {str(status): times for status, times in vectors.statuses.items()},
+            "bits_never_set": [
+                name for name, bit in STATUS.items() if not any(bit & s for s in vectors.statuses)
+            ],
         },
         "files": {
             path: hashlib.sha256(text.encode()).hexdigest() for path, text in sorted(files.items())

@@ -149,8 +149,8 @@ class Recorder:
             self.memory = memory.astype(self._type)
         self.calls.append((letter, self.memory))
 
-    def step(self, inputs: list[FloatArray]) -> None:
-        """Record one step with u, y and theta where there is one; carry the memory along."""
+    def step(self, inputs: list[FloatArray]) -> int:
+        """Record one step with u, y and theta where there is one; return its status."""
         with np.errstate(over="ignore"):
             inputs = [values.astype(self._type) for values in inputs]
         arrays = self.machine(self.memory, *inputs)
@@ -167,6 +167,7 @@ class Recorder:
         before, self.memory = self.memory, arrays.pop(0)
         told = np.concatenate(inputs), int(status), np.concatenate(arrays)
         self.calls.append(("S", Step(before, *told, self.memory)))
+        return int(status)
 
     @property
     def steps(self) -> list[Step]:

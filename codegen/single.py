@@ -9,7 +9,16 @@ import numpy as np
 
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.functions import ULPS, own_function
-from obsynth.codegen.kernel import DOUBLE, OPERATIONS, SINGLE, Machine, Real, scalar_function
+from obsynth.codegen.kernel import (
+    DOUBLE,
+    EXACT,
+    LIBRARY,
+    OPERATIONS,
+    SINGLE,
+    Machine,
+    Real,
+    scalar_function,
+)
 
 # Python's text of operations; a test chooses between two, `choose` stands for how
 _PLAIN: Mapping[str, str] = {
@@ -127,3 +136,30 @@ def _called(machine: SingleMachine) -> Callable[..., Any]:
 def machine_of(function: ca.Function, real: Real) -> Callable[..., list[Any]]:
     """Return what evaluates a function of vectors in a type."""
     return Machine(function) if real is DOUBLE else SingleMachine(function)
+
+
+def lane_operations(real: Real) -> dict[str, Callable[..., Any]]:
+    """Return operations on arrays by CasADi's names, those of the library or our own among them."""
+    names: dict[str, Any] = dict(_NAMES)
+    if real is DOUBLE:
+        beyond = {name: _each(getattr(math, name)) for name in LIBRARY - EXACT}
+        beyond["constpow"] = beyond["pow"]
+        names["remainder"] = _remainder
+    else:
+        beyond = {name: _called(SingleMachine(own_function(name))) for name in ULPS}
+    texts = {**_PLAIN, **{name: f"where({', '.join(parts)})" for name, parts in _CHOSEN.items()}}
+    for name, text in texts.items():
+        beyond[name] = eval(f"lambda a, b=None: {text.format('a', 'b')}", names)
+    return beyond
+
+
+def _each(function: Callable[..., Any]) -> Callable[..., Any]:
+    def run(*arguments: float) -> float:
+        try:
+            return float(function(*arguments))
+        except OverflowError:
+            return math.inf
+        except ValueError:
+            return math.nan
+
+    return np.vectorize(run, otypes=[float])

@@ -18,6 +18,7 @@ What runs is what CasADi's virtual machine runs, to the last bit but for which N
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
@@ -306,6 +307,12 @@ def _joins(value: _Value, reader: _Value, text: str) -> bool:
     """Whether an expression may stand inside of that of its reader."""
     fused = value.product and reader.name in {"add", "sub", "choose"}
     return not fused and reader.name not in _TWICE and len(text) <= _LONGEST
+
+
+def read_tape(step: ca.Function, real: Real) -> tuple[list[Any], list[tuple[int, int, Any]]]:
+    """Return the values that are written in their order, and results: port, place, value."""
+    reader = _Reader(scalar_function(step), real)
+    return reader.used(), reader.results
 
 
 def write_tape(

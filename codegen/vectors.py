@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from obsynth.codegen.description import Description, midpoints, nominal_values
+from obsynth.codegen.description import Description
+from obsynth.codegen.drive import Drive, spread
 from obsynth.codegen.errors import CodegenError
-from obsynth.codegen.kernel import DOUBLE, SINGLE, Machine
-from obsynth.codegen.recording import Recorder, Vectors
+from obsynth.codegen.kernel import DOUBLE, SINGLE
+from obsynth.codegen.lanes import Lanes
+from obsynth.codegen.limits import Limit, Limits
+from obsynth.codegen.recording import Recorder, Step, Vectors
 from obsynth.codegen.single import machine_of
 from obsynth.symbolic.arrays import FloatArray
 
 MINIMUM = 100
 """Fewest vectors that still hold some of every kind."""
 
+COUNT = 3000
+"""How many there are by default: files stay below a megabyte."""
+
 SHARES: Mapping[str, float] = {
-    "closed loop": 0.5,
-    "closed loop with failing signals": 0.2,
+    "closed loop": 0.32,
+    "closed loop with failing signals": 0.08,
+    "limits": 0.38,
     "random": 0.14,
-    "extreme": 0.14,
+    "extreme": 0.06,
     "not initialised": 0.02,
 }
-"""Share of every kind of vectors."""
+"""Share of every kind of vectors; what limits do not need goes to the closed loop."""
 
-_KINDS = ("u", "d", "f", "w", "p", "rho")
-_HOLD = 20
-_SMALL = 0.01
-_SEQUENCE = 250
+_SEQUENCE = 120
+_STRETCH = 10
+_BASES = 8
+_EACH = 6
+_VALUES = 2_000_000
 _EXTREMES: Mapping[str, FloatArray] = {
     real.precision: np.array(
         [
@@ -45,13 +54,22 @@ _EXTREMES: Mapping[str, FloatArray] = {
 }
 
 
-def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -> Vectors:
-    """Run the step on the virtual machine and record every input and result.
+def make_vectors(description: Description, count: int = COUNT, seed: int = 0) -> Vectors:
+    """Run the step and record every input and result, see `record`."""
+    recorder, kinds = record(description, count, seed)
+    return recorder.vectors(kinds)
 
-    Half of the steps are sequences of 250 along trajectories of the plant, the memory carried
-    along by the C program itself; another fifth are such sequences with failing signals. The
-    others start from random memories, hold extreme and non-finite numbers anywhere,
-    or follow `NAME_init` without an initialised memory.
+
+def record(
+    description: Description, count: int = COUNT, seed: int = 0
+) -> tuple[Recorder, dict[str, int]]:
+    """Run the step on its machine; return what was recorded, and how many steps of which kind.
+
+    Trajectories of the plant, some with failing signals, lead to memories that are met in service;
+    stretches of them are recorded, most of all healthy ones. From the memories of these start steps
+    on both sides of every limit that the step compares something with, and steps with a few numbers
+    that are random, extreme or not finite. The others follow `NAME_init` without an initialised
+    memory.
     """
     if count < MINIMUM:
         raise CodegenError(
@@ -59,57 +77,169 @@ def make_vectors(description: Description, count: int = 10_000, seed: int = 0) -
             vectors=count,
         )
     rng = np.random.default_rng(seed)
-    recorder = Recorder(description, machine_of(description.observer.step, description.real))
+    machine = machine_of(description.observer.step, description.real)
     drive = Drive(description, rng)
-    kinds = _quotas(count)
-    visited = [description.start]
-    for kind, failing in (("closed loop", False), ("closed loop with failing signals", True)):
-        for length in _lengths(kinds[kind]):
-            _follow(recorder, drive, length, failing)
-            visited.append(recorder.memory.astype(float))
-    scale = _scale(visited)
-    for i in range(kinds["random"]):
-        recorder.load(random_memory(rng, visited[i % len(visited)], scale))
-        recorder.step(drive.wide())
-    for i in range(kinds["extreme"]):
-        memory = visited[i % len(visited)].copy()
-        inputs = drive.wide()
-        if i % 2:
-            memory = random_memory(rng, memory, scale)
-        # Extremes in the memory would hide those in the inputs: a step must cope with either.
-        _spoil(drive, [memory] if i % 3 == 0 else inputs)
-        recorder.load(memory)
-        recorder.step(inputs)
-    for length in _lengths(kinds["not initialised"], 4):
-        recorder.forget()
-        for _ in range(length):
-            recorder.step(drive.wide())
-    return recorder.vectors(kinds)
-
-
-def _quotas(count: int) -> dict[str, int]:
     kinds = {kind: int(share * count) for kind, share in SHARES.items()}
+    sound, failing = (_driven(description, machine, drive, kinds, kind) for kind in list(kinds)[:2])
+    healthy = [step for step in sound if step.status == 0] or sound
+    bases = [steps[i] for steps in (healthy, failing) for i in rng.permutation(len(steps))[:_BASES]]
+    limits = Limits(Lanes(description.observer.step, description.real))
+    alone = limits.alone()
+    rng.shuffle(alone)
+    alone = alone[: kinds["limits"]]
+    ports = _ports(description, [(base.before, base.inputs) for base in bases])
+    pairs = min(2 * (kinds["limits"] - len(alone)) // 3, _VALUES // len(limits.lanes.values))
+    around = limits.around([port[:, :_BASES] for port in ports], pairs, rng)
+    kinds["limits"] = min(kinds["limits"], len(alone) + len(around))
+    tried = _beside(description, bases, [*alone, *around])
+    tried += _changed(description, drive, bases, _scale([step.before for step in sound]), kinds)
+    turns = limits.turns(_ports(description, [(c.memory, np.concatenate(c.inputs)) for c in tried]))
+    most = sum(kinds[kind] for kind in ("limits", "random", "extreme"))
+    # both sides of one limit of every comparison, where there is room for them
+    first = len(alone) + min(len(around), 3 * (kinds["limits"] - len(alone)) // 8 * 2)
+    chosen = [tried[i] for i in _rare(turns, range(first), most, rng)]
+    kinds |= {kind: sum(c.kind == kind for c in chosen) for kind in ("limits", "random", "extreme")}
     kinds["closed loop"] += count - sum(kinds.values())
-    return kinds
+
+    recorder = Recorder(description, machine)
+    recorder.default()
+    for steps, kind in ((sound, "closed loop"), (failing, "closed loop with failing signals")):
+        turns = limits.turns(_ports(description, [(step.before, step.inputs) for step in steps]))
+        rare = _rare(turns, [0], kinds[kind] // _STRETCH // 4, rng)
+        for step in _stretches(steps, kinds[kind], rare, rng):
+            _repeat(recorder, step.before, description.split(step.inputs))
+    # memories that have much in common behind one another: what they have is stored once
+    for case in sorted(chosen, key=lambda case: case.base):
+        _repeat(recorder, case.memory, case.inputs)
+    for i in range(kinds["not initialised"]):
+        if i % 4 == 0:
+            recorder.forget()
+        recorder.step(drive.wide())
+    return recorder, kinds
 
 
-def _lengths(total: int, most: int = _SEQUENCE) -> Iterator[int]:
-    for start in range(0, total, most):
-        yield min(most, total - start)
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A step that starts from another one's memory and inputs, with some numbers changed."""
+
+    kind: str
+    base: int
+    memory: FloatArray
+    inputs: list[FloatArray]
 
 
-def _follow(recorder: Recorder, drive: Drive, length: int, failing: bool) -> None:
-    guess = drive.begin(length)
-    if guess is None:
-        recorder.default()
-    else:
-        recorder.load(guess)
-    for k in range(length):
-        inputs = drive.sample(k)
-        # Whole stretches fail, so that what follows a failure is tested too.
-        if failing and k % 25 in (7, 8, 9, 20):
-            _spoil(drive, inputs)
-        recorder.step(inputs)
+def _ports(
+    description: Description, steps: list[tuple[FloatArray, FloatArray]]
+) -> list[FloatArray]:
+    """Return memories and inputs (n_i, steps), as `Lanes` takes them."""
+    inputs = np.array([given for _, given in steps]).T
+    sizes = [port.size for port in description.split(inputs[:, 0])]
+    return [np.array([m for m, _ in steps]).T, *np.split(inputs, np.cumsum(sizes)[:-1])]
+
+
+def _repeat(recorder: Recorder, memory: FloatArray, inputs: list[FloatArray]) -> None:
+    """Record a step from a memory, which is loaded where it is not there already."""
+    there, wanted = (recorder.word.patterns(values) for values in (recorder.memory, memory))
+    if (there != wanted).any():
+        recorder.load(memory)
+    recorder.step(inputs)
+
+
+def _driven(
+    description: Description,
+    machine: Callable[..., list[FloatArray]],
+    drive: Drive,
+    kinds: Mapping[str, int],
+    kind: str,
+) -> list[Step]:
+    """Return the steps of trajectories, one behind the other."""
+    failing, scout = kind != "closed loop", Recorder(description, machine)
+    # what limits do not need goes to the closed loop
+    total = 2 * kinds[kind] if failing else kinds[kind] + kinds["limits"] + len(kinds)
+    steps, healthy = 0, 0
+    while steps < total or (healthy < 0.75 * total and steps < 3 * total):
+        steps += _SEQUENCE
+        guess = drive.begin(_SEQUENCE)
+        if guess is None:
+            scout.default()
+        else:
+            scout.load(guess)
+        for k in range(_SEQUENCE):
+            inputs = drive.sample(k)
+            # Whole stretches fail, so that what follows a failure is tested too.
+            if failing and k % 25 in (7, 8, 9, 20):
+                _spoil(drive, inputs)
+            healthy += scout.step(inputs) == 0
+    return scout.steps
+
+
+def _stretches(
+    steps: list[Step], count: int, rare: list[int], rng: np.random.Generator
+) -> list[Step]:
+    """Return so many steps, in stretches: those around rare ones, and the healthiest."""
+    order = rng.permutation(len(steps) // _STRETCH).tolist()
+    sound = np.array([step.status == 0 for step in steps])
+    order.sort(key=lambda i: -sound[i * _STRETCH : (i + 1) * _STRETCH].sum())
+    places = dict.fromkeys([*(i // _STRETCH for i in rare), *order])
+    kept = sorted([*places][: -(-count // _STRETCH)])
+    return [step for i in kept for step in steps[i * _STRETCH : (i + 1) * _STRETCH]][:count]
+
+
+def _rare(
+    turns: NDArray[np.bool_], start: Iterable[int], most: int, rng: np.random.Generator
+) -> list[int]:
+    """Return the first steps and others: of every answer of every comparison some, rare ones first.
+
+    Shapes: turns (steps, comparisons).
+    """
+    both = np.hstack([turns, ~turns])
+    chosen = dict.fromkeys(start)
+    met = both[list(chosen)].sum(axis=0)
+    for c in np.argsort(both.sum(axis=0), kind="stable").tolist():
+        for i in rng.permutation(np.flatnonzero(both[:, c])).tolist() if met[c] < _EACH else ():
+            if i not in chosen and met[c] < _EACH and len(chosen) < most:
+                chosen[i] = None
+                met += both[i]
+    others = [i for i in rng.permutation(len(both)).tolist() if i not in chosen]
+    return sorted([*chosen, *others[: max(most - len(chosen), 0)]])
+
+
+def _beside(description: Description, bases: list[Step], limits: list[Limit]) -> list[_Case]:
+    """Return steps beside limits."""
+    found = []
+    for i, limit in enumerate(limits):
+        of = i % _BASES % len(bases) if limit.base is None else limit.base
+        arrays = [bases[of].before.astype(float), *description.split(bases[of].inputs)]
+        arrays[limit.port][limit.entry] = limit.number
+        found.append(_Case("limits", of, arrays[0], arrays[1:]))
+    return found
+
+
+def _changed(
+    description: Description,
+    drive: Drive,
+    bases: list[Step],
+    scale: FloatArray,
+    kinds: Mapping[str, int],
+) -> list[_Case]:
+    """Return three times as many steps as are needed with random, extreme or no finite numbers."""
+    found, rng = [], drive.rng
+    for kind in ("random", "extreme"):
+        for i in range(3 * kinds[kind]):
+            of = i % len(bases)
+            memory, inputs = bases[of].before.astype(float), description.split(bases[of].inputs)
+            if i % 4 < 2:
+                inputs = [spread(rng, values) for values in inputs]
+            if i % 4 > 0:
+                few = np.full(memory.size, i % 24 == 1)
+                for field in rng.choice(np.array(description.fields), 2):
+                    few[field.start + rng.integers(field.size)] = True
+                memory = np.where(few, random_memory(rng, memory, scale), memory)
+            if kind == "extreme":
+                # Extremes in the memory would hide those in inputs: a step must cope with either.
+                _spoil(drive, [memory] if i % 3 == 0 else inputs)
+            found.append(_Case(kind, of, memory, inputs))
+    return found
 
 
 def _spoil(drive: Drive, arrays: list[FloatArray]) -> None:
@@ -128,133 +258,6 @@ def _scale(visited: list[FloatArray]) -> FloatArray:
     return np.where(largest > 0, largest, 1.0)
 
 
-# -- signals as a plant would drive the step ---------------------------------------------
-
-
-def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Return a box to draw from: open ends close one unit from the nominal value."""
-    lower = np.where(np.isfinite(box[:, 0]), box[:, 0], np.minimum(nominal, box[:, 1]) - 1.0)
-    upper = np.where(np.isfinite(box[:, 1]), box[:, 1], np.maximum(nominal, lower) + 1.0)
-    return np.column_stack([lower, upper])
-
-
-class Drive:
-    """Inputs, measurements and scheduling along random trajectories of the plant.
-
-    The trajectories serve to reach the memories and branches that a step meets in service.
-    Whether they are admissible does not matter: states that leave their declared range
-    are put back on its border.
-    """
-
-    def __init__(self, description: Description, rng: np.random.Generator) -> None:
-        model = description.observer.model
-        self.rng, self.precision = rng, description.real.precision
-        self._observer = description.observer
-        self._plant = Machine(model.function())
-        self._slope = Machine(_input_slope(model.function()))
-        self._nominal = nominal_values(model, "x")
-        self._x_box = _finite(self._box("x"), self._nominal)
-        self._boxes = {
-            kind: _finite(self._box(kind), midpoints(self._box(kind))) for kind in _KINDS
-        }
-        self._sequence = 0
-        self._rest = False
-        self._x = self._nominal
-        self._levels = {kind: self._draw(kind) for kind in _KINDS}
-        self._scheduling = list(description.scheduling)
-        self._u = np.empty((0, len(model.u)))
-        self._ramp = np.empty((0, len(model.f)))
-        self._measured = self._measure(self._x)
-
-    def _box(self, kind: str) -> FloatArray:
-        return np.asarray(self._observer.model.box(kind), dtype=float).reshape(-1, 2)
-
-    def _draw(self, kind: str) -> FloatArray:
-        box = self._boxes[kind]
-        return self.rng.uniform(box[:, 0], box[:, 1])
-
-    def _measure(self, x: FloatArray) -> FloatArray:
-        self._following, y = self._plant(x, *(self._levels[kind] for kind in _KINDS))
-        return y
-
-    def begin(self, length: int) -> FloatArray | None:
-        """Start a trajectory of `length` samples; return the observer's memory for it.
-
-        None stands for the default memory. Every second trajectory starts from a guess of
-        its own, and two thirds of them carry a fault that grows from a random instant. Half of
-        them are kept near where they start, with small faults, so that observers whose
-        guarantee holds in a small region are seen at work in it.
-        """
-        rng = self.rng
-        self._sequence += 1
-        holds = -(-length // _HOLD)
-        self._u = np.repeat([self._draw("u") for _ in range(holds)], _HOLD, axis=0)
-        onset = int(rng.integers(length))
-        ramp = np.clip((np.arange(length) - onset) / (0.5 * length), 0.0, 1.0)
-        self._rest = self._sequence % 4 < 2
-        target = self._draw("f") * (self._sequence % 3 > 0) * (_SMALL if self._rest else 1.0)
-        self._ramp = ramp[:, None] * target
-        self._levels["p"] = self._draw("p")
-        self._x = rng.uniform(self._x_box[:, 0], self._x_box[:, 1])
-        if self._sequence % 2:
-            if self._rest:
-                self._x = self._nominal
-            return None
-        return np.array(self._observer.memory0(self._x), dtype=float)
-
-    def sample(self, k: int) -> list[FloatArray]:
-        """Return u_k, y_k and, for scheduled observers, theta_k; move the plant on."""
-        # Measured scheduling moves slower than a sample, as do the inputs.
-        for kind in ("d", "w") if self._scheduling and k % _HOLD else ("d", "w", "rho"):
-            self._levels[kind] = self._draw(kind)
-        if self._rest and k % _HOLD == 0:
-            self._u[k : k + _HOLD] = self._keeping(self._u[k])
-        self._levels["u"] = self._u[k]
-        self._levels["f"] = self._ramp[k]
-        y = self._measure(self._x)
-        following = np.clip(self._following, self._x_box[:, 0], self._x_box[:, 1])
-        self._x = following if np.isfinite(following).all() else self._nominal
-        if np.isfinite(y).all():
-            self._measured = y.copy()
-        return [self._u[k].copy(), y, *self._theta(self._levels["rho"])]
-
-    def _keeping(self, u: FloatArray) -> FloatArray:
-        """Return inputs in their ranges that move the plant as little as inputs can."""
-        low, high = self._boxes["u"].T
-        for _ in range(2):
-            now = [u if kind == "u" else self._levels[kind] for kind in _KINDS]
-            moved, slope = self._slope(self._x, *now)
-            if not (np.isfinite(moved).all() and np.isfinite(slope).all()):
-                break
-            matrix = slope.reshape(u.size, self._x.size).T
-            u = np.clip(u - np.linalg.lstsq(matrix, moved - self._x)[0], low, high)
-        return u
-
-    def wide(self) -> list[FloatArray]:
-        """Return inputs and measurements spread around those seen last, over many magnitudes."""
-        values = [self._draw("u"), self._measured]
-        if self._scheduling:
-            values += self._theta(self._draw("rho"))
-        return [_spread(self.rng, value) for value in values]
-
-    def _theta(self, rho: FloatArray) -> list[FloatArray]:
-        return [rho[self._scheduling]] if self._scheduling else []
-
-
-def _input_slope(plant: ca.Function) -> ca.Function:
-    """Return (x, u, d, f, w, p, rho) -> (next x, its derivative by u, column by column)."""
-    ports = [ca.MX.sym(f"i{i}", plant.numel_in(i)) for i in range(plant.n_in())]
-    following = plant.call(ports)[0]
-    return ca.Function("slope", ports, [following, ca.vec(ca.jacobian(following, ports[1]))])
-
-
-def _spread(rng: np.random.Generator, values: FloatArray) -> FloatArray:
-    size = values.size
-    wide: FloatArray = rng.standard_normal(size) * 10.0 ** rng.uniform(-6, 6, size)
-    near: FloatArray = values * (1.0 + 0.3 * rng.standard_normal(size))
-    return np.where(rng.random(size) < 0.3, wide, near)
-
-
 def random_memory(rng: np.random.Generator, near: FloatArray, scale: FloatArray) -> FloatArray:
     """Return a memory around one that was visited; some entries far from it.
 
@@ -266,5 +269,7 @@ def random_memory(rng: np.random.Generator, near: FloatArray, scale: FloatArray)
     far: FloatArray = scale * rng.standard_normal(size) * 10.0 ** rng.uniform(-3, 3, size)
     choice = rng.random(size)
     kept: FloatArray = np.where(choice < 0.6, close, far)
-    # Flags and counters hold whole numbers; kept as they are often enough, they select branches.
-    return np.where(rng.random(size) < 0.5, base, kept)
+    # Flags and counters hold whole numbers, and select branches.
+    counted = rng.integers(0, 2 * np.minimum(np.abs(base), 1e6).astype(int) + 3)
+    whole = (base == np.rint(base)) & (choice < 0.8)
+    return np.where(rng.random(size) < 0.3, base, np.where(whole, counted, kept))

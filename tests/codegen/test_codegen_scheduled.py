@@ -23,7 +23,7 @@ from obsynth.codegen import (
     generate_c,
 )
 from obsynth.codegen.description import describe
-from obsynth.codegen.vectors import Drive
+from obsynth.codegen.drive import Drive
 from obsynth.symbolic import Plant
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -90,7 +90,7 @@ class Scheduled:
     def guarantee(self) -> SimpleNamespace:
         return SimpleNamespace(claims=("a bound",), assumptions=("theta in its range",))
 
-    def memory0(self, guess: Any) -> Any:
+    def memory0(self, guess: Any, **ranges: Any) -> Any:
         return np.array([1.0, *guess])
 
 
@@ -100,15 +100,15 @@ def observer() -> Scheduled:
 
 
 @needs_compiler
-def test_ten_thousand_scheduled_steps_are_equal_to_the_last_bit(
+def test_all_recorded_scheduled_steps_are_equal_to_the_last_bit(
     observer: Scheduled, tmp_path: Path
 ) -> None:
     project = generate_c(observer, tmp_path / "p")
     assert project.comparison is not None
-    assert project.comparison.vectors == 10_000
+    assert project.comparison.vectors == 3000
     assert dict(project.sizes) == {"memory": 3, "u": 1, "y": 1, "theta": 2, "x": 2, "f": 0}
     assert {1, 2} & set(project.statuses)
-    assert project.statuses[0] > 4_000, "most closed loops stay in the declared ranges"
+    assert project.statuses[0] > 1_500, "most closed loops stay in the declared ranges"
 
 
 def test_the_project_speaks_of_the_measured_signals_only(

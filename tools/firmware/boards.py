@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.codegen.description import describe
+from obsynth.codegen.drive import Drive
 from obsynth.codegen.single import machine_of
-from obsynth.codegen.vectors import Drive
 from obsynth.designs.core.observer import STEP_OUTPUTS
 
 HERE = Path(__file__).parent

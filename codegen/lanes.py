@@ -1,0 +1,118 @@
+"""The values of a step on many inputs at once: what leads where, and what a change would change."""
+
+import heapq
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from obsynth.codegen.kernel import Real
+from obsynth.codegen.single import lane_operations
+from obsynth.codegen.tape import read_tape
+
+_FIRST = 64
+"""Lanes on which a change is followed before it is followed on all."""
+
+Operation = tuple[str, tuple[int | float, ...]]
+"""What is computed in place of a value: its name, operands by their places (int) or numbers."""
+
+
+def differ(a: Any, b: Any) -> Any:
+    """Return where arrays differ in a bit, any NaN being like any other."""
+    unlike = (a != b) & ((a == a) | (b == b))
+    return unlike | ((a == 0) & (b == 0) & (np.signbit(a) != np.signbit(b)))
+
+
+class Lanes:
+    """What the tape's writer makes of a step, evaluated by NumPy in its type.
+
+    values: in their order, without those that no result needs
+    places: of the operands of every value
+    results: port, entry, place of the value
+    """
+
+    def __init__(self, step: ca.Function, real: Real) -> None:
+        self.values, results = read_tape(step, real)
+        self.real = real
+        at = {id(value): k for k, value in enumerate(self.values)}
+        self.places = [tuple(at[id(a)] for a in value.args) for value in self.values]
+        self._constants = [k for k, value in enumerate(self.values) if value.name == "const"]
+        numbers = [[self.values[k].number] for k in self._constants]
+        self._numbers = np.array(numbers, real.type).reshape(-1, 1)
+        self.results = [(port, i, at[id(value)]) for port, i, value in results]
+        self._told = {k for *_, k in self.results}
+        self._readers: list[list[int]] = [[] for _ in self.values]
+        for k, places in enumerate(self.places):
+            for place in set(places):
+                self._readers[place].append(k)
+        self._table = lane_operations(real)
+        zero: Any = real.type(0.0)
+        self._table["choose"] = lambda c, a, b: np.where(c != 0, a, b) + zero
+
+    def run(self, ports: Sequence[Any], wanted: Sequence[int] | None = None) -> list[Any]:
+        """Return values, all or those of a list of `needed`, for inputs (n, lanes)."""
+        with np.errstate(over="ignore"):
+            given = [np.asarray(port).astype(self.real.type) for port in ports]
+        found: list[Any] = [None] * len(self.values)
+        lanes = max((port.shape[1] for port in given), default=0)
+        for k, row in zip(self._constants, self._numbers.repeat(lanes, axis=1), strict=True):
+            found[k] = row
+        with np.errstate(all="ignore"):
+            for k in range(len(self.values)) if wanted is None else wanted:
+                value = self.values[k]
+                if value.name == "input":
+                    found[k] = given[value.place[0]][value.place[1]]
+                elif value.name != "const":
+                    found[k] = self._table[value.name](*(found[p] for p in self.places[k]))
+        return found
+
+    def needed(self, wanted: Sequence[int]) -> list[int]:
+        """Return the places of values and of all that they are made of, in order."""
+        entered, waiting = set(wanted), [*wanted]
+        while waiting:
+            for place in self.places[waiting.pop()]:
+                if place not in entered:
+                    entered.add(place)
+                    waiting.append(place)
+        return sorted(entered)
+
+    def instead(self, found: Sequence[Any], change: Operation) -> Any:
+        """Return (lanes,) what another operation makes of values that were found."""
+        name, operands = change
+        taken = (found[p] if isinstance(p, int) else np.full_like(found[0], p) for p in operands)
+        with np.errstate(all="ignore"):
+            return self._table[name](*taken)
+
+    def seen(self, found: Sequence[Any], k: int, other: Any) -> bool:
+        """Whether a result changes in any lane if value k is another one."""
+        rows = np.flatnonzero(differ(found[k], other))
+        few = rows[:: -(-len(rows) // _FIRST)] if len(rows) else rows
+        return self._reaches(found, k, other, few) or (
+            len(few) < len(rows) and self._reaches(found, k, other, rows)
+        )
+
+    def _reaches(self, found: Sequence[Any], k: int, other: Any, rows: Any) -> bool:
+        if not len(rows):
+            return False
+        changed, waiting, entered = {k: other[rows]}, [k], {k}
+        with np.errstate(all="ignore"):
+            while waiting:
+                place = heapq.heappop(waiting)
+                if place != k:
+                    taken = (changed.get(p) for p in self.places[place])
+                    operands = [
+                        found[p][rows] if new is None else new
+                        for p, new in zip(self.places[place], taken, strict=True)
+                    ]
+                    new = self._table[self.values[place].name](*operands)
+                    if not differ(found[place][rows], new).any():
+                        continue
+                    changed[place] = new
+                if place in self._told:
+                    return True
+                for reader in self._readers[place]:
+                    if reader not in entered:
+                        entered.add(reader)
+                        heapq.heappush(waiting, reader)
+        return False
