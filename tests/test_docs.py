@@ -2,15 +2,30 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import obsynth as ob
+
 ROOT = Path(__file__).parents[1]
 ELSEWHERE = ("docs/fmu.md",)
 """With its shell commands in tests/codegen/test_codegen_fmu.py."""
+SEARCHED = {
+    "Kalman": "topics/kalman.html",
+    "CSV": "topics/csv.html",
+    "Simulink": "topics/simulink.html",
+    "FMU": "fmu.html",
+    "infeasible": "topics/infeasible.html",
+    "sensor fault": "topics/sensor_fault.html",
+    "units": "topics/units.html",
+    "real time": "topics/real_time.html",
+    "MISRA": "topics/misra.html",
+    "Monte Carlo": "topics/monte_carlo.html",
+}
 FENCE = re.compile(r"((?:<!--[^\n]*-->\n)?)```python\n(.*?)```", re.DOTALL)
 HOST = re.compile(
     r"""(?:<(?:script|img|iframe|source)[^>]*\ssrc=|<link[^>]*\shref=|url\()["']?(?:https?:)?//"""
@@ -83,3 +98,22 @@ def test_the_site_needs_no_other_host_and_every_formula_is_known(site):
         ]
         assert not unknown, (page, unknown)
         assert "arithmatex" not in text, page
+
+
+def test_the_api_page_has_every_public_name():
+    """Mutant: a name left out of docs/api.md."""
+    told = re.findall(r"^::: (\S+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(name.rpartition(".")[2] for name in told) == sorted(ob.__all__)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("node") is None, reason="runs the site's search in node")
+def test_what_one_searches_for_from_another_tool_is_the_first_hit(site):
+    """The worker of the built site ranks. Mutant: "Units for co-simulation" as title of the
+    page on FMUs, which is the second for both words."""
+    command = ["node", str(ROOT / "tests" / "search.js"), str(site), *SEARCHED]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert dict(zip(SEARCHED, told, strict=True)) == SEARCHED
+    for page in SEARCHED.values():
+        source = "docs/" + page.replace(".html", ".md")
+        assert source in examples() or source in ELSEWHERE

@@ -15,6 +15,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 OF_THE_ROOT = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+ERRATA = re.compile(r"<!-- errata:.*?-->")
 SHOWN = ("states", "inputs", "unknown_inputs", "actuator_faults", "process_faults")
 SHOWN += ("sensor_faults", "disturbances", "scheduling")
 
@@ -29,10 +30,10 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Let links to the root of the repository lead to its pages here."""
+    """Let links to the root lead to its pages here, and join the errata."""
     for page, source in OF_THE_ROOT.items():
         markdown = markdown.replace(f"](../{source}", f"]({page}")
-    return markdown
+    return ERRATA.sub(errata, markdown)
 
 
 def on_page_content(page_html: str, **_: Any) -> str:
@@ -40,6 +41,18 @@ def on_page_content(page_html: str, **_: Any) -> str:
     page_html = FORMULA.sub(formula, page_html)
     page_html = page_html.replace("<table>", '<div class="wide"><table>')
     return page_html.replace("</table>", "</table></div>")
+
+
+def errata(_: re.Match[str]) -> str:
+    """Return the errata of all papers as one table, from the pages of their methods."""
+    rows = ["| paper | in print | correct | what shows it |", "|---|---|---|---|"]
+    for path in sorted((ROOT / "docs" / "methods").glob("*.md")):
+        _, found, table = path.read_text("utf-8").partition("\n## Errata\n\n")
+        if found:
+            link = f"| [{path.stem}](methods/{path.name}#errata) "
+            lines = table.split("\n\n")[0].splitlines()
+            rows += [link + line for line in lines[2:]]
+    return "\n".join(rows)
 
 
 def formula(found: re.Match[str]) -> str:
