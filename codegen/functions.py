@@ -3,10 +3,11 @@
 Each is a CasADi function of scalars: the writer makes C of it, the machine in single precision
 evaluates it, and both have the same bits wherever arithmetic is that of IEEE 754. Arguments are
 reduced without error, or with the error carried along; polynomials interpolate at Chebyshev nodes,
-coefficients rounded; powers of two are found by halving. `ULPS` bounds the errors: every float was
-tried (``tools/ulps.py``), of functions of two variables a sample. Below the normal numbers the
-unit is the smallest one. Zeros have no sign; what is not defined is a NaN, and so are sine, cosine
-and tangent beyond `FARTHEST`, where a float is no angle any more.
+coefficients rounded; powers of two are found by halving. `ULPS` bounds the errors that
+``tools/ulps.py`` found: over every float (sine, cosine, tangent, exp, log, atan), every seventh,
+or 40 million pairs. Below the normal numbers the unit is the smallest one. Zeros have no sign; what
+is not defined is a NaN, and so are sine, cosine and tangent beyond `FARTHEST`, where a float is no
+angle any more.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -296,8 +297,8 @@ _MADE: Mapping[str, Callable[..., ca.SX]] = {
 
 ULPS: Mapping[str, float] = {
     **{"sin": 0.9, "cos": 0.9, "tan": 2.5, "exp": 0.9, "expm1": 1.5, "log": 0.9, "log1p": 1.0},
-    **{"atan": 1.5, "atan2": 1.7, "asin": 2.4, "acos": 2.5, "sinh": 2.4, "cosh": 2.4, "tanh": 2.6},
-    **{"asinh": 1.9, "acosh": 1.9, "atanh": 2.2, "hypot": 2.2, "pow": 4.5},
+    **{"atan": 1.5, "atan2": 1.7, "asin": 2.6, "acos": 3.0, "sinh": 2.4, "cosh": 2.4, "tanh": 2.6},
+    **{"asinh": 1.9, "acosh": 1.9, "atanh": 2.2, "hypot": 2.2, "pow": 5.5},
 }
 """Largest error in units in the last place, by name."""
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import shutil
+import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -12,7 +16,9 @@ import pytest
 
 from obsynth.codegen import functions
 from obsynth.codegen.functions import FARTHEST, ULPS, own_function
+from obsynth.codegen.kernel import SINGLE
 from obsynth.codegen.single import SingleMachine
+from obsynth.codegen.tape import write_function
 from obsynth.designs.core.lifted import Lifted, Rounding, combine
 from obsynth.designs.core.rounding import rounding_bound
 
@@ -128,3 +134,66 @@ def test_rounding_is_not_bounded_where_an_angle_is_none_any_more() -> None:
     for end, known in ((FARTHEST - 1.0, True), (FARTHEST + 1.0, False)):
         box = {"x": (np.array([[6000.0]]), np.array([[end]]))}
         assert np.isfinite(rounding_bound(sine, box, "single")["s"].error[0]) == known
+
+
+WARNINGS = ("-Wconversion", "-Wdouble-promotion", "-Wfloat-conversion", "-Wshadow")
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", *WARNINGS)
+COMPILERS = [name for name in ("gcc", "clang-14") if shutil.which(name)]
+CROSS = "arm-none-eabi-gcc"
+
+
+def source() -> str:
+    """All functions, one behind the other."""
+    texts = [write_function(name, "p", SINGLE)[0] for name in ULPS]
+    calls = [f"p_{name}(x[i]{', y[i]' * (own_function(name).n_in() == 2)})" for name in ULPS]
+    lines = [f"        out[{len(ULPS)} * i + {j}] = {call};" for j, call in enumerate(calls)]
+    head = "void all(const float *x, const float *y, float *out, int n)"
+    parts = ["#include <math.h>", "typedef float p_real_t;", *texts, f"{head};", head, "{"]
+    loop = ["    int i;", "    for (i = 0; i < n; ++i) {", *lines, "    }", "}"]
+    return "\n".join([*parts, *loop]) + "\n"
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+def test_they_are_the_same_bits_in_c(tmp_path: Path) -> None:
+    """Without a warning, under both compilers. Mutant: a product fused with a sum."""
+    (tmp_path / "all.c").write_text(source())
+    rng = np.random.default_rng(2)
+    x = np.concatenate([spread(rng, 300), SPECIAL.astype(np.float32)])
+    y = rng.permutation(x)
+    with np.errstate(all="ignore"):
+        expected = [
+            SingleMachine(own_function(name))(
+                *(a[None] for a in (x, y)[: own_function(name).n_in()])
+            )
+            for name in ULPS
+        ]
+    told = np.array([values[0][0] for values in expected]).T
+    for compiler, *flags in [(name, "-O1", "-march=native") for name in COMPILERS]:
+        library = tmp_path / f"{compiler}.so"
+        command = [compiler, *STRICT, *flags, "-ffp-contract=off", "-shared", "-fPIC", "all.c"]
+        subprocess.run([*command, "-o", str(library), "-lm"], cwd=tmp_path, check=True)
+        found = np.zeros_like(told, order="C")
+        arrays = (ctypes.c_void_p(a.ctypes.data) for a in (x, y, found))
+        ctypes.CDLL(str(library)).all(*arrays, len(x))
+        same = (found.view(np.uint32) == told.view(np.uint32)) | (np.isnan(found) & np.isnan(told))
+        assert same.all(), [name for name, good in zip(ULPS, same.T, strict=True) if not good.all()]
+
+
+@pytest.mark.skipif(shutil.which(CROSS) is None, reason="no cross compiler")
+def test_they_need_no_routine_of_double(tmp_path: Path) -> None:
+    """Mutant: a literal without its f."""
+    (tmp_path / "all.c").write_text(source())
+    command = [CROSS, *STRICT, "-mcpu=cortex-m3", "-mthumb", "-O0", "-c", "all.c"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    told = subprocess.run(
+        ["arm-none-eabi-nm", "-u", "all.o"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = {line.split()[-1] for line in told.stdout.splitlines()}
+    assert {name for name in found if not name.startswith(("__aeabi_f", "__aeabi_i2f"))} <= {
+        "sqrtf",
+        "floorf",
+    }
