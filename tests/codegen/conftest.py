@@ -151,6 +151,12 @@ def proved() -> type[Proved]:
 
 
 @pytest.fixture
+def unbuilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Projects are written and not compiled: for tests of what is written."""
+    monkeypatch.setattr("obsynth.codegen.project.find_compiler", lambda: None)
+
+
+@pytest.fixture
 def toy() -> Toy:
     return Toy()
 

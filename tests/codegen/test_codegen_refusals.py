@@ -137,6 +137,7 @@ def test_a_file_is_no_folder(toy: Any, tmp_path: Path) -> None:
     refused(toy, tmp_path / "p", "is a file", overwrite=True)
 
 
+@pytest.mark.usefixtures("unbuilt")
 def test_our_own_folder_only_with_overwrite(toy: Any, tmp_path: Path) -> None:
     target = tmp_path / "p"
     target.mkdir()
@@ -149,6 +150,7 @@ def test_our_own_folder_only_with_overwrite(toy: Any, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["p"]
 
 
+@pytest.mark.usefixtures("unbuilt")
 def test_files_the_user_added_are_not_lost(toy: Any, tmp_path: Path) -> None:
     target = generate_c(toy, tmp_path / "p", vectors=100).folder
     (target / "src/board.c").write_text("int board;\n")
@@ -157,6 +159,7 @@ def test_files_the_user_added_are_not_lost(toy: Any, tmp_path: Path) -> None:
     assert (target / "src/board.c").exists()
 
 
+@pytest.mark.usefixtures("unbuilt")
 def test_a_link_to_a_folder_stays_a_link(toy: Any, tmp_path: Path) -> None:
     real = tmp_path / "real"
     real.mkdir()

@@ -152,7 +152,9 @@ MUTANTS = {
 
 @needs_compiler
 @pytest.mark.parametrize("mutant", MUTANTS)
-def test_wrong_scheduling_is_caught(observer: Scheduled, tmp_path: Path, mutant: str) -> None:
+def test_wrong_scheduling_is_caught(
+    observer: Scheduled, tmp_path: Path, mutant: str, unbuilt: None
+) -> None:
     project = generate_c(observer, tmp_path / "p", vectors=300)
     file, pattern, replacement = MUTANTS[mutant]
     path = project.folder / file
