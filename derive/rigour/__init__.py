@@ -43,6 +43,7 @@ from obsynth.derive.rigour.interval import allowance as allowance
 from obsynth.derive.rigour.interval import down as down
 from obsynth.derive.rigour.interval import enclose_number as enclose_number
 from obsynth.derive.rigour.interval import gamma_bound as gamma_bound
+from obsynth.derive.rigour.interval import inward as inward
 from obsynth.derive.rigour.interval import lowered as lowered
 from obsynth.derive.rigour.interval import middle_and_radius as middle_and_radius
 from obsynth.derive.rigour.interval import outward as outward

@@ -119,6 +119,16 @@ def outward(box: FloatArray, precision: str) -> FloatArray:
     return np.column_stack([low, high]).astype(float)
 
 
+def inward(box: FloatArray, precision: str) -> FloatArray:
+    """Return a box, shape (n, 2), whose ends are numbers of the precision and that lies in it."""
+    wide = outward(box, precision)
+    if precision == "double":
+        return wide
+    low, high = wide.astype(np.float32).T
+    near = np.column_stack([np.nextafter(low, np.inf), np.nextafter(high, -np.inf)])
+    return np.asarray(np.where(wide == box, wide, near))
+
+
 _DIGITS = 60
 _BITS = 400
 _CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan")

@@ -23,7 +23,14 @@ from obsynth.designs.bounded_error.step import running_bound
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, beyond, covers_jacobian, prove_boxes, within
+from obsynth.designs.core.signals import (
+    DECLARED,
+    IEEE,
+    beyond,
+    covers_jacobian,
+    prove_boxes,
+    within,
+)
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
@@ -217,10 +224,10 @@ def _on_rounding(design: UioDesign) -> Iterator[str]:
     if not step_error(design)[1]:
         yield f"{said}, which is not proved for this plant"
         return
-    plant, limits = design.plant, Limits.of(design.plant)
+    plant, limits = design.plant, Limits.of(design.plant, design.precision)
     listed = beyond((*plant.x, *plant.f, *plant.u), np.concatenate(limits))
     where = f"{listed}, estimates too: there " if listed else ""
-    yield f"{where}{said}, which is proved for IEEE doubles rounded to nearest"
+    yield (f"{where}{said}, which is proved for {IEEE[design.precision]} rounded to nearest")
 
 
 def _gains(design: UioDesign) -> dict[str, FloatArray]:

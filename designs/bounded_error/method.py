@@ -128,6 +128,7 @@ class BoundedErrorUIO(Method):
         quiet=True,
         settle=settling,
         core=build_core,
+        single=True,
         shared=("z", "fhat", "prediction"),
     )
 

@@ -108,9 +108,9 @@ class Limits(NamedTuple):
     u: FloatArray
 
     @classmethod
-    def of(cls, plant: Plant) -> "Limits":
+    def of(cls, plant: Plant, precision: str = "double") -> "Limits":
         """Read the limits of a plant."""
-        x, f, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xfu")
+        x, f, u = (finite_box(plant, kind, precision).reshape(-1, 2) for kind in "xfu")
         curved, held = curved_states(plant)[:, None], covered_inputs(plant)[:, None]
         return cls(np.where(curved, x, wider(x)), wider(f), np.where(held, u, wider(u)))
 

@@ -25,13 +25,17 @@ from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic.arrays import FloatArray
 
 CELLS = 256
-# Of the magnitude of the states: above it a bound is no help, and an assumption more honest.
+# Of the magnitude of the states, in doubles: above it a bound is no help, and an assumption more
+# honest. In single precision nothing is assumed.
 USEFUL = 2.0**-30
+# What boxes of estimates and readings are widened by, relative to their size.
+WIDER = {"double": 2.0**-40, "single": 2.0**-14}
 # Above the rounding of the formulas here, all of whose terms are nonnegative.
 UP = 1.0 + 2.0**-40
 # What is stored above what was found, so that another library finds it proved too.
@@ -64,7 +68,7 @@ def of_matrices(design: UioDesign, off: Mapping[str, FloatArray]) -> FloatArray:
     off: |exact - double| by the letters of the matrices
     """
     plant = design.plant
-    limits = Limits.of(plant)
+    limits = Limits.of(plant, design.precision)
     x, f = (np.abs(box).max(axis=1, initial=0.0) for box in (limits.x, limits.f))
     d, w = (np.abs(finite_box(plant, kind)).max(axis=1, initial=0.0) for kind in "dw")
     found, before = _through(design, off["C"] @ x + off["W2"] @ w)
@@ -74,29 +78,33 @@ def of_matrices(design: UioDesign, off: Mapping[str, FloatArray]) -> FloatArray:
     return np.concatenate([state, found[n:]]) * UP
 
 
-def of_step(design: UioDesign, precision: str = "double") -> FloatArray:
+def of_step(design: UioDesign) -> FloatArray:
     """Bound what one step as it runs adds to xi and to the returned estimates, (n + n_f,)."""
     plant, C, E = design.plant, design.C, design.E
-    limits, n = Limits.of(plant), len(design.A)
+    limits, n = Limits.of(plant, design.precision), len(design.A)
     shift = design.W2 @ design.w_centre
     X = limits.x
     w_radius = np.abs(design.W2) @ design.w_radius
     y = _product(C, X) + shift[:, None] + w_radius[:, None] * [-1.0, 1.0]
-    y = _outward(y)
+    known_to = WIDER[design.precision]
+    y = _outward(y, known_to)
     lo, hi = cut_box(X, CELLS)
-    shown = _outward(y - shift[:, None])[:, :, None]
+    shown = _outward(y - shift[:, None], known_to)[:, :, None]
     # one step of rounding may take the exact estimate out of a box that the computed one is in
-    cell = _outward(np.stack([lo, hi], axis=1))
-    z = _outward(cell + _product(E, shown))
-    nu = _outward(shown - _product(C, cell)[:, ::-1])
+    cell = _outward(np.stack([lo, hi], axis=1), known_to)
+    z = _outward(cell + _product(E, shown), known_to)
+    nu = _outward(shown - _product(C, cell)[:, ::-1], known_to)
     box = {"z": z, "fhat": limits.f[:, :, None], "u": limits.u[:, :, None], "y": y[:, :, None]}
-    known = {"xhat": cell, "innovation": nu}
+    known, precision = {"xhat": cell, "innovation": nu}, design.precision
     found = rounding_bound(
         _readings(design, shift),
         {name: (part[:, 0], part[:, 1]) for name, part in box.items()},
         precision,
         {name: (part[:, 0], part[:, 1]) for name, part in known.items()},
+        read=("y",),
     )
+    if np.any(found["xhat"].error > known_to * np.abs(cell).max(axis=(1, 2))):
+        return np.full(n + len(design.F), np.inf)
     # stored T for I + E C, W2 w_centre formed in doubles, what is left of the unknown input
     missing = ExactMatrix.of(np.eye(n)) + ExactMatrix.of(E) @ ExactMatrix.of(C)
     missing = missing - ExactMatrix.of(design.T)
@@ -127,9 +135,9 @@ def _product(matrix: FloatArray, box: FloatArray) -> FloatArray:
     return np.asarray(first + second[:, ::-1])
 
 
-def _outward(box: FloatArray) -> FloatArray:
-    """Widen a box, (rows, 2, ...), by more than forming it took."""
-    slack = 2.0**-40 * np.abs(box).max(axis=(1, *range(2, box.ndim)), initial=1e-300)
+def _outward(box: FloatArray, share: float) -> FloatArray:
+    """Widen a box, (rows, 2, ...), by more than forming it took and rounding of what is in it."""
+    slack = share * np.abs(box).max(axis=(1, *range(2, box.ndim)), initial=1e-300)
     slack = slack.reshape(-1, *[1] * (box.ndim - 2))
     return np.stack([box[:, 0] - slack, box[:, 1] + slack], axis=1)
 
@@ -143,7 +151,7 @@ def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
     """
     step = of_step(design)
     size = max(1.0, float(np.abs(finite_box(design.plant, "x")).max()))
-    if np.all(step <= USEFUL * size):
+    if np.all(step <= USEFUL * size) or design.precision == "single":
         return step, True
     return rounding_allowance(design.plant, decouple(design.C, design.D).residual), False
 
@@ -151,6 +159,11 @@ def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
 def settle(design: UioDesign, off: Mapping[str, FloatArray]) -> UioDesign:
     """Return a design with gains, its allowance that of the gains; see `of_matrices` for off."""
     needed = step_error(design)[0] + of_matrices(design, off)
+    if not np.isfinite(needed).all():
+        raise InfeasibleDesign(
+            "rounding of the step in single precision has no bound",
+            ["take precision='double', or narrower ranges"],
+        )
     return replace(design, rounding=needed * ROOM)
 
 

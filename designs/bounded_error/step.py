@@ -10,7 +10,8 @@ from obsynth.designs.core.boxes import Ends, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.running import SETTLED, UP, Running, all_around, settle
+from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.running import SETTLED, UP, Running, above, all_around, settle, shaken
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -32,8 +33,7 @@ def _component_map(design: UioDesign) -> list[int | None]:
 def running_bound(design: UioDesign) -> Running:
     """Return the recursion of eq. (36) for every component, rounding errors of the step included.
 
-    An error of at most `UioDesign.rounding` per step is at most rho in the norm
-    of P, so ``V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho + rho^2``.
+    An error of at most `UioDesign.rounding` per step is at most rho in the norm of P, see `shaken`.
     """
     bound, components = design.bound, _component_map(design)
     n, n_f = design.A.shape[0], design.rate.size
@@ -50,10 +50,9 @@ def running_bound(design: UioDesign) -> Running:
         kept = [j for j, c in enumerate(components) if c is not None]
         tau = design.rounding[kept]
         rho = float(np.sqrt(tau @ np.abs(P) @ tau)) * UP
-        decay[i] = (1.0 - gamma) * (1.0 + rho) * UP
-        offset[i] = (gamma * (1.0 + rho) + rho + rho**2) * UP
+        decay[i], offset[i] = shaken(gamma, rho)
         scale[i] = bound.inverse_diagonal[component] * UP
-    return Running(np.diag(decay), offset, np.diag(scale), add, True)
+    return Running(np.diag(decay), offset, np.diag(scale), add, True, design.precision)
 
 
 def check_range_of_T(design: UioDesign, z: FloatArray) -> None:
@@ -110,7 +109,7 @@ def equations(design: UioDesign) -> ca.Function:
     # enter nonlinearly. Inside, where the bound holds, clipping does nothing.
     box = np.where(curved_states(model)[:, None], model.box("x"), [-np.inf, np.inf])
     next_state = model.function()(
-        clip(xhat, box),
+        clip(xhat, box, design.precision),
         u,
         ca.DM.zeros(len(model.d)),
         fhat,
@@ -156,7 +155,8 @@ def shift(design: UioDesign, x: Ends) -> tuple[ca.SX, ca.SX]:
     T, size = ca.DM(design.T), ca.DM(np.abs(design.T))
     middle = 0.5 * x.lower + 0.5 * x.upper
     radius = ca.fmax(x.upper - middle, middle - x.lower)
-    return T @ middle, size @ (radius + 2.0**-44 * (ca.fabs(middle) + radius))
+    share = above(design.precision, len(design.T)) - 1.0
+    return T @ middle, size @ (radius + share * (ca.fabs(middle) + radius))
 
 
 def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
@@ -165,15 +165,15 @@ def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
     It is the delta of (48), of which ``reach' |P| reach`` is an upper bound.
     """
     middle, radius = shift(design, x)
-    z, fhat = kept["z"], kept["fhat"]
-    zeta = ca.fabs(middle - z) * UP + radius + 2.0**-44 * ca.fabs(z)
-    e_f = ca.fmax(f.upper - fhat, fhat - f.lower) * UP
-    bound = design.bound
+    z, fhat, bound = kept["z"], kept["fhat"], design.bound
+    up = above(design.precision, 4 * len(bound.P[0]))
+    zeta = ca.fabs(middle - z) * up + radius + (up - 1.0) * ca.fabs(z)
+    e_f = ca.fmax(f.upper - fhat, fhat - f.lower) * up
     if bound.error == "plain":
-        reach = ca.vertcat((zeta + ca.DM(noise_offset(design))) * UP, e_f)
+        reach = ca.vertcat((zeta + ca.DM(noise_offset(design))) * up, e_f)
     else:
         reach = ca.vertcat(*(zeta[i] for i in design.kept(bound.error)), e_f)
-    levels = [ca.dot(reach, ca.DM(np.abs(P)) @ reach) * UP for P in bound.P]
+    levels = [ca.dot(reach, ca.DM(np.abs(P)) @ reach) * up for P in bound.P]
     components = _component_map(design)
     return ca.vertcat(*(0.0 if c is None else levels[bound.shape_of(c)] for c in components))
 
@@ -187,7 +187,11 @@ def build_core(design: UioDesign) -> Core:
     bound, move = running_bound(design), equations(design)
     n, C, W2 = len(design.A), ca.DM(design.C), design.W2
     offset, noise = ca.DM(W2 @ design.w_centre), ca.DM(np.abs(W2) @ design.w_radius)
-    limits, curved = Limits.of(design.plant), curved_states(design.plant)
+    limits, curved, precision = (
+        Limits.of(design.plant, design.precision),
+        curved_states(design.plant),
+        design.precision,
+    )
 
     def pick(one: ca.SX, other: ca.SX) -> ca.SX:
         return ca.vertcat(*(one[i] if curved[i] else other[i] for i in range(n)))
@@ -199,12 +203,14 @@ def build_core(design: UioDesign) -> Core:
         half, moved = all_around([bound], s, ca.vertcat(xhat, fhat))
         x = Ends(xhat - half[:n], xhat + half[:n])
         f = Ends(fhat - half[n:], fhat + half[n:])
-        allowed = ca.fabs(C) @ half[:n] + noise
+        # what rounding takes of the innovation and of this sum
+        size = ca.fabs(y) + ca.fabs(offset) + ca.fabs(C) @ (ca.fabs(xhat) + half[:n]) + noise
+        allowed = ca.fabs(C) @ half[:n] + noise + (n + 8) * Rounding(precision).step * size
         empty = some(ca.fabs(innovation[i]) > allowed[i] for i in range(allowed.numel()))
         # a state on which a derivative depends is itself in its range by assumption
-        near = inside(pick(xhat, x.lower), pick(xhat, x.upper), limits.x)
-        sound = ca.logic_and(near, inside(fhat, fhat, limits.f))
-        sound = ca.logic_and(sound, inside(seen.u, seen.u, limits.u))
+        near = inside(pick(xhat, x.lower), pick(xhat, x.upper), limits.x, precision)
+        sound = ca.logic_and(near, inside(fhat, fhat, limits.f, precision))
+        sound = ca.logic_and(sound, inside(seen.u, seen.u, limits.u, precision))
         return Known(
             xhat,
             fhat,

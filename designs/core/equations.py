@@ -1,7 +1,7 @@
 """One step of a discrete plant over boxes: its image, and the faults that explain it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.designs.core.boxes import Ends, cut_box
-from obsynth.designs.core.lifted import FAR, Lifted, Rounding, combine, lift
+from obsynth.designs.core.lifted import FAR, Lifted, Rounding, clamped, combine, lift
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
@@ -251,7 +251,9 @@ class Equations:
             least[j] = most[j] = Lifted.point(middle, value.low, value.high)
             radius = rounding.up(ca.fmax(value.upper - middle, middle - value.lower))
             limit = float(np.abs(self.slopes[row, j]).max())
-            size = ca.fmin(slope.magnitude, limit) if limit < FAR else slope.magnitude
+            size = slope.magnitude
+            if limit < rounding.limits.largest:
+                size = ca.fmin(size, rounding.around(limit, limit)[1])
             part = combine(
                 "multiply",
                 Lifted.point(size, 0.0, min(limit, FAR)),
@@ -285,7 +287,7 @@ class Equations:
             )
             node = self.program.outputs[self.entries[row, j]]
             local = lift(self.program, [node], whole, rounding)[0]
-            slope = Lifted(ca.fmax(local.lower, low), ca.fmin(local.upper, high), low, high)
+            slope = clamped(replace(local, low=low, high=high), rounding)
         moved = combine("subtract", now, rest, rounding=rounding)
         return combine("divide", moved, slope, rounding=rounding)
 

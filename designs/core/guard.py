@@ -35,6 +35,7 @@ from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.record import Precision, precision_of
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.core.sweeps import Sweeps
@@ -45,6 +46,8 @@ HORIZON = 400
 """N where nothing else is said."""
 MOST_CALLS = 10**9
 """N of what is never given up."""
+MOST_COUNTED = 2**22
+"""N in single precision, whose whole numbers end at four times that."""
 _LATE = 2
 YOUNG = "_2"
 """What the names of the younger copy's parts of the memory end with."""
@@ -79,7 +82,8 @@ class Watch:
         named: Any = CUTS if cuts is None else cuts
         known = isinstance(named, list | tuple) and all(name in EVERY_CUT for name in named)
         counts = [n for n in (given, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
-        if not known or len(counts) < 2:
+        counted = MOST_CALLS if precision_of(options) == "double" else MOST_COUNTED
+        if not known or len(counts) < 2 or counts[0] > counted:
             raise CertificateError(
                 f"the stored design cannot be read: horizon {horizon!r}, recovery {recovery!r} and "
                 f"cuts {cuts!r} are no options of the guard"
@@ -222,13 +226,22 @@ def monitored(guarantee: Guarantee, guard: Guard, mean: bool) -> Guarantee:
     """
     plant, N = guard.plant, guard.horizon
     faults = "what is claimed of the faults" if mean else "the faults"
+    single = guard.precision == "single"
     claims = [
         f"the returned sets hold the state and {faults} at every instant k for which the "
         "assumptions held at all instants after the last void one (status bit 8), or from the "
         "first call on if there was none, up to k",
-        f"whatever happened up to an instant v, noticed or not: the returned sets hold them after "
-        f"v + {2 * N} calls if the assumptions hold after v",
     ]
+    if not single or N <= MOST_COUNTED:
+        claims.append(
+            f"whatever happened up to an instant v, noticed or not: the returned sets hold them "
+            f"after v + {2 * N} calls if the assumptions hold after v"
+        )
+    if single:
+        claims.append(
+            "all of this with every number and operation of the step rounded to IEEE single "
+            "precision, readings too: true ones that are rounded to it are read"
+        )
     loose = [s for s in plant.x if not s.bounded]
     assumptions = [
         "a violation of an assumption that contradicts neither the readings nor the sets is not "
@@ -237,6 +250,11 @@ def monitored(guarantee: Guarantee, guard: Guard, mean: bool) -> Guarantee:
         "ranges exclude, or an empty set, is void (bit 8): the declared ranges are returned, and "
         "sets begin anew from them",
     ]
+    if single:
+        assumptions.append(
+            "inputs and measured scheduling are numbers of single precision, and what the plant "
+            f"gets; signals without a declared range stay below {LIMITS['single'].far:.1e}"
+        )
     limits = guard.contractor.domain[:, 0].tolist()
     at_once = [s for s, low in zip(plant.x, limits, strict=True) if s.bounded and low == -np.inf]
     if at_once:

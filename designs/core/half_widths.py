@@ -11,11 +11,19 @@ from functools import cached_property
 
 import numpy as np
 
+from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.contractor import SWEEPS, Contractor
+from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.rounding import rounding_bound
+from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic.arrays import FloatArray
 
 MOST_PASSES = 200
 _UP = 1.0 + 2.0**-30
+# Of ranges: above what the few roundings of an end take.
+_ENDS = {"double": 2.0**-30, "single": 2.0**-18}
+# How often an end steps outwards by what rounding an operation takes, at most.
+_STEPS = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +52,22 @@ class HalfWidths:
         boxes = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
         half: FloatArray = 0.5 * np.diff(boxes, axis=1)[:, 0]
         return half
+
+    @cached_property
+    def lost(self) -> tuple[FloatArray, FloatArray]:
+        """What rounding adds to an image and a reading, (n,), (m,); in doubles too little."""
+        plant, precision = self.contractor.plant, self.contractor.precision
+        n, m = len(plant.x), len(plant.output_names)
+        if precision == "double":
+            return np.zeros(n), np.zeros(m)
+        function = plant.function()
+        kinds = zip(function.name_in(), ("x", "u", "d", "f", "w", "p", "rho"), strict=True)
+        boxes = {name: finite_box(plant, k, precision).reshape(-1, 2) for name, k in kinds}
+        ends = {name: (box[:, :1], box[:, 1:]) for name, box in boxes.items()}
+        ends["x"] = cut_box(boxes["x"], 64)
+        rows, shown = rounding_bound(function, ends, precision).values()
+        unit = Rounding(precision).step
+        return _STEPS * rows.error, _STEPS * (shown.error + unit * shown.size)
 
     @cached_property
     def ranges(self) -> FloatArray:
@@ -95,7 +119,8 @@ class HalfWidths:
                 break
             held, taken = after, taken + 1
         size = np.vstack([np.abs(plant.box("x")), np.abs(plant.box("f")).reshape(-1, 2)])
-        slack = 2.0**-30 * np.where(np.isfinite(size), size, 0.0).max(axis=1)
+        share = _ENDS[self.contractor.precision]
+        slack = share * np.where(np.isfinite(size), size, 0.0).max(axis=1)
         found: FloatArray = shown + slack
         return found, taken
 
@@ -106,13 +131,14 @@ class HalfWidths:
         fixed = 0.5 * np.diff(equations.box[held.size :], axis=1)[:, 0]
         x = self.ranges[:n].copy()
         for i in np.flatnonzero(equations.usable).tolist() if "image" in cuts else ():
-            x[i] = min(x[i], _times(slopes[i], np.append(held, fixed)) * _UP)
+            x[i] = min(x[i], _times(slopes[i], np.append(held, fixed)) * _UP + self.lost[0][i])
         x = np.minimum(self._strips(x), core[:n])
         late = held[n:].copy()
         for j, i in equations.invertible if "inversion" in cuts else ():
             rest = np.where(np.arange(slopes.shape[1]) == n + j, 0.0, slopes[i])
             halves = np.concatenate([held[:n], late, fixed])
-            told = self._divided(i, j, x[i] + _times(rest, halves), halves)
+            told = x[i] + _times(rest, halves) + self.lost[0][i]
+            told = self._divided(i, j, told, halves)
             late[j] = min(late[j], told * _UP)
         late = np.minimum(late, core[n:]) if self.delay else late
         now = np.minimum(
@@ -140,11 +166,15 @@ class HalfWidths:
     def _strips(self, x: FloatArray) -> FloatArray:
         """Cut states with what readings say of them."""
         x = x.copy()
-        strips = [s for s in self.contractor.strips if s is not None]
-        for strip in strips * SWEEPS if "strips" in self.contractor.cuts else ():
+        strips = [
+            (s, lost)
+            for s, lost in zip(self.contractor.strips, self.lost[1].tolist(), strict=True)
+            if s is not None
+        ]
+        for strip, lost in strips * SWEEPS if "strips" in self.contractor.cuts else ():
             for j in np.flatnonzero(strip.row).tolist():
                 others = np.where(np.arange(len(x)) == j, 0.0, np.abs(strip.row))
-                told = 0.5 * (strip.high - strip.low) + _times(others, x)
+                told = 0.5 * (strip.high - strip.low) + _times(others, x) + lost
                 x[j] = min(x[j], told / abs(strip.row[j]) * _UP)
         return x
 

@@ -409,11 +409,11 @@ class _Arithmetic:
 
 def clamped(a: Lifted, rounding: Rounding) -> Lifted:
     """Keep the ends between the numbers, where an operation is not defined beyond them."""
-    low, high = rounding.around(a.low, a.high)
+    (low, high), far = rounding.around(a.low, a.high), rounding.limits.largest
     if ca.SX(a.lower).is_constant() and ca.SX(a.upper).is_constant():
         return a
-    lower = ca.fmax(a.lower, low) if a.low > -FAR else a.lower
-    return Lifted(lower, ca.fmin(a.upper, high) if a.high < FAR else a.upper, a.low, a.high)
+    lower = ca.fmax(a.lower, low) if a.low > -far else a.lower
+    return Lifted(lower, ca.fmin(a.upper, high) if a.high < far else a.upper, a.low, a.high)
 
 
 def _ends(a: Lifted) -> tuple[ca.SX, ...]:

@@ -7,7 +7,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from inspect import signature
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
@@ -20,12 +20,13 @@ from obsynth.derive import JacobianBounds, split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT
 from obsynth.designs.core.core import Core
-from obsynth.designs.core.errors import CertificateError
+from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
-from obsynth.designs.core.guard import MOST_CALLS, YOUNG, Guard, Watch, monitored
+from obsynth.designs.core.guard import MOST_CALLS, MOST_COUNTED, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import Precision, plain
 from obsynth.designs.core.remainder import of_continuous, prove_remainder
+from obsynth.designs.core.signals import held_in_single
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
@@ -240,6 +241,12 @@ class Method:
             )
         if self.precision == "single" and not self.CONTRACT.single:
             raise ObsynthError(self.CONTRACT.refusal, option="precision")
+        if self.precision == "single" and (self.horizon or 1) > MOST_COUNTED:
+            raise ObsynthError(
+                f"horizon is {self.horizon}; precision='single' counts up to {MOST_COUNTED}: take "
+                "less, or precision='double'",
+                option="horizon",
+            )
         object.__setattr__(self, "cuts", None if self.cuts is None else named)
         self.check()
 
@@ -289,6 +296,8 @@ class Method:
         CertificateError
             If a claim cannot be proved, or for printed forms that do not prove what they claim.
         """
+        if self.precision == "single" and isinstance(model, Plant):
+            model = held_in_single(self.CLASS.check(model))
         if at is None:
             return self._design(model, bounds)
         if not self.SPLITS or not isinstance(model, Plant):
@@ -299,7 +308,36 @@ class Method:
     def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer."""
         found = self._checked(model, bounds)
-        return self._certified(self.solve(found), found)
+        observer = self._certified(self.solve(found), found)
+        if self.precision == "single" and observer.performance.get("core_half_widths") is not None:
+            self._refuse_vacuous(observer, found)
+        return observer
+
+    def _refuse_vacuous(self, observer: Observer, model: Any) -> None:
+        """Refuse half widths that are no less than what is declared, where those in doubles are."""
+        names = (*observer.model.names("x"), *observer.model.names("f"))
+        bare = observer.half_widths is None
+        if not (bare or observer.vacuous):
+            return
+        other = replace(self, precision="double")
+        double = other._certified(other.solve(model), model)
+        if double.half_widths is None:
+            return
+        vacuous = names if bare else observer.vacuous
+        lost = [name for name in vacuous if name not in double.vacuous]
+        if lost:
+            widths = observer.half_widths
+            told = [
+                f"{name}: +-{np.inf if widths is None else widths[names.index(name)]:.3g} in "
+                f"single precision, +-{double.half_widths[names.index(name)]:.3g} in doubles"
+                for name in lost
+            ]
+            raise InfeasibleDesign(
+                f"rounding in single precision leaves nothing to say of {', '.join(lost)}: take "
+                "precision='double'",
+                told,
+                option="precision",
+            )
 
     def analyse(
         self,
@@ -323,6 +361,8 @@ class Method:
         InfeasibleDesign
             If the gains are unstable, which is shown, or guarantee nothing.
         """
+        if self.precision == "single" and isinstance(model, Plant):
+            model = held_in_single(self.CLASS.check(model))
         found = self._checked(model, bounds)
         return self._certified(self.fix(found, gains), found)
 

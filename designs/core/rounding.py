@@ -28,7 +28,7 @@ a - b is exact where a and b are within a factor of two of each other (Sterbenz)
 The analysis itself rounds outwards.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import casadi as ca
@@ -74,16 +74,18 @@ def rounding_bound(
     box: Mapping[str, Interval],
     precision: str = "double",
     known: Mapping[str, Interval] | None = None,
+    read: Collection[str] = (),
 ) -> dict[str, Bound]:
     """Bound what rounding does to the outputs, by their names.
 
     Shapes: ends in `box` (entries, cells) by the names of all inputs; in `known` the same by names
-    of outputs, what the exact ones are known to lie in for the v in question.
+    of outputs, what the exact ones are known to lie in for the v in question. Inputs that are
+    `read` are any numbers, rounded to the precision before anything else.
     """
     if not function.is_a("SXFunction"):
         function = function.expand()
     with np.errstate(all="ignore"):
-        tape = _Tape(function, box, precision, known or {})
+        tape = _Tape(function, box, precision, known or {}, read)
         found = tape.run()
         while tape.open is not None and tape.branch():
             found = tape.run()
@@ -106,9 +108,11 @@ class _Tape:
         box: Mapping[str, Interval],
         precision: str,
         known: Mapping[str, Interval],
+        read: Collection[str],
     ) -> None:
         self.function, self.precision = function, precision
         self.unit = UNIT[precision]
+        self.read = {k for k, name in enumerate(function.name_in()) if name in read}
         ends = [box[name] for name in function.name_in()]
         cells = max(lo.shape[1] for lo, _ in ends)
         self.cells = (cells,)
@@ -188,9 +192,12 @@ class _Tape:
 
     def _input(self, number: int, entry: int) -> Node:
         lo, hi = (np.broadcast_to(end[entry], self.cells) for end in self.box[number])
-        return Node(
+        node = Node(
             np.stack([lo, lo]), np.stack([hi, hi]), np.zeros(self.cells), {(number, entry): 1}
         )
+        if number in self.read:
+            self._round(node, 1.0, np.zeros(self.cells, dtype=bool), sums=False)
+        return node
 
     def _constant(self, value: float) -> Node:
         stored = float(np.float32(value)) if self.precision == "single" else value

@@ -2,23 +2,78 @@
 
 from collections.abc import Iterable
 
+import casadi as ca
 import numpy as np
 
 from obsynth.derive.jacobian.family import AffineFamily
+from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.errors import ObsynthError
 
 LARGEST_SIGNAL = 1e6
-"""Magnitude up to which signals without a declared range are covered."""
+"""Magnitude up to which signals without a declared range are covered, in doubles."""
 DECLARED = "hold the declared disturbances and fault rates"
 NOTHING = np.zeros(0)
+IEEE = {"double": "IEEE doubles", "single": "IEEE single precision"}
 
 
-def finite_box(plant: Plant, kind: str) -> FloatArray:
-    """Return the declared box of signals, `LARGEST_SIGNAL` where there is none, shape (k, 2)."""
-    box = plant.box(kind)
-    return np.where(np.isfinite(box), box, np.sign(box) * LARGEST_SIGNAL)
+def finite_box(plant: Plant, kind: str, precision: str = "double") -> FloatArray:
+    """Return the declared box of signals, `LARGEST_SIGNAL` where there is none, shape (k, 2).
+
+    In single precision, whose rounding of such a number would be seen, what takes some state
+    through its range in one call, if that is less. Limits are watched, so any number will do.
+    """
+    box, largest = plant.box(kind), np.full(len(plant.names(kind)), LARGEST_SIGNAL)
+    if precision == "single" and not np.isfinite(box).all():
+        largest = np.minimum(largest, _pushes(plant, kind))
+    return np.where(np.isfinite(box), box, np.sign(box) * largest[:, None])
+
+
+def _pushes(plant: Plant, kind: str) -> FloatArray:
+    """Return what takes a state through its range in one call, about the middle, (k,)."""
+    names = ("x", "u", "d", "f", "w", "p", "rho")
+    symbols = [ca.SX.sym(name, len(plant.names(name))) for name in names]
+    k = names.index(kind)
+    slopes = ca.jacobian(plant.function()(*symbols)[0], symbols[k])
+    boxes = [plant.box(name).reshape(-1, 2) for name in names]
+    finite = [np.where(np.isfinite(b).all(axis=1, keepdims=True), b, 0.0) for b in boxes]
+    at = [b.mean(axis=1) for b in finite]
+    J = np.abs(np.array(ca.DM(ca.Function("slopes", symbols, [slopes])(*at))))
+    J = J.reshape(len(boxes[0]), len(boxes[k])) * (plant.Ts is not None)
+    if kind == "x":
+        np.fill_diagonal(J, 0.0)
+    with np.errstate(all="ignore"):
+        push = np.diff(boxes[0], axis=1) / J
+    found: FloatArray = np.where(push > 0.0, push, np.inf).min(axis=0, initial=np.inf)
+    return found
+
+
+def held_in_single(plant: Plant) -> Plant:
+    """Return a plant whose ranges single precision holds, or refuse it by name.
+
+    Ends of inputs and scheduling that are measured, which a step compares with, become numbers of
+    single precision outside of them.
+    """
+    limit = LIMITS["single"].huge
+    ends: dict[str, tuple[float, float]] = {}
+    for kind in ("x", "u", "d", "f", "w", "p", "rho"):
+        signals = getattr(plant, kind)
+        box = plant.box(kind).reshape(-1, 2)
+        for s, size in zip(signals, np.where(np.isfinite(box), np.abs(box), 0.0), strict=True):
+            if size.max() > limit:
+                raise ObsynthError(
+                    f"{s.name} is declared up to {size.max():.3g}, more than the {limit:.3g} that "
+                    "precision='single' has room for: take precision='double', or another unit",
+                    option="precision",
+                )
+        wide = outward(box, "single")
+        if kind == "u" or kind == "rho":
+            pairs = zip(signals, wide.tolist(), (wide != box).any(axis=1), strict=True)
+            ends |= {s.name: (a, b) for s, (a, b), moved in pairs if moved and s.measured}
+    return plant.with_ranges(ends) if ends else plant
 
 
 def wider(box: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from obsynth.designs.core.stepping import (
     all_finite,
     could_be_written,
     finite_or,
+    inside,
     make_step,
     status_word,
 )
@@ -99,7 +100,9 @@ class Step:
         matters = covered_inputs(plant).tolist()
         held = [(u[i], s) for i, s in enumerate(plant.u) if matters[i]]
         pairs = [(theta[i], s) for i, s in enumerate(measured)] + held
-        covered = every(ca.logic_and(value >= s.lower, value <= s.upper) for value, s in pairs)
+        boxes = np.array([(s.lower, s.upper) for _, s in pairs]).reshape(-1, 2)
+        values = column(value for value, _ in pairs)
+        covered = inside(values, values, boxes, self.precision)
         return u, theta, covered
 
     def _readings(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:

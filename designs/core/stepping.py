@@ -8,7 +8,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import column, every, select
+from obsynth.designs.core.lifted import LIMITS
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 
@@ -49,10 +51,10 @@ def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
     return float(levels.max()) + rounding
 
 
-def clip(value: ca.SX, box: FloatArray) -> ca.SX:
+def clip(value: ca.SX, box: FloatArray, precision: str = "double") -> ca.SX:
     """Return the nearest point of a box of shape (n, 2); infinite ends do not bind."""
     parts = []
-    for i, (low, high) in enumerate(box):
+    for i, (low, high) in enumerate(inward(box, precision)):
         entry = value[i]
         if np.isfinite(low):
             entry = ca.fmax(entry, low)
@@ -62,9 +64,9 @@ def clip(value: ca.SX, box: FloatArray) -> ca.SX:
     return ca.vertcat(*parts)
 
 
-def inside(lower: ca.SX, upper: ca.SX, box: FloatArray) -> ca.SX:
+def inside(lower: ca.SX, upper: ca.SX, box: FloatArray, precision: str = "double") -> ca.SX:
     """Return 1 where the interval [lower, upper] lies in a box of shape (n, 2), else 0."""
-    ends = enumerate(box)
+    ends = enumerate(inward(np.clip(box, -LIMITS[precision].far, LIMITS[precision].far), precision))
     return every(ca.logic_and(lower[i] >= a, upper[i] <= b) for i, (a, b) in ends)
 
 

@@ -10,7 +10,14 @@ from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import DECLARED, beyond, covers_jacobian, prove_boxes, within
+from obsynth.designs.core.signals import (
+    DECLARED,
+    IEEE,
+    beyond,
+    covers_jacobian,
+    prove_boxes,
+    within,
+)
 from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
@@ -186,10 +193,10 @@ def _on_rounding(design: GeneralDesign) -> str:
     """Say where the rounding of a step is bounded."""
     rounding = design.rounding
     largest = max(float(part.max(initial=0.0)) for part in (rounding.q, rounding.c, rounding.p))
-    plant, limits = design.extended.plant, Limits.of(design.extended.plant)
+    plant, limits = design.extended.plant, Limits.of(design.extended.plant, design.precision)
     listed = beyond((*plant.x, *plant.u), np.vstack([limits.x, limits.u]))
     where = f"estimates and inputs with {listed}: there " if listed else ""
     return (
         f"{where}the rounding errors of one step stay below {largest:.1e} in every component, "
-        "which is proved for IEEE doubles rounded to nearest"
+        f"which is proved for {IEEE[design.precision]} rounded to nearest"
     )

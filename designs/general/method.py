@@ -73,6 +73,7 @@ class GeneralUIO(Method):
         quiet=True,
         settle=settling,
         core=build_core,
+        single=True,
         shared=("prediction",),
         fault_delay=fault_delay,
     )
@@ -246,5 +247,5 @@ def peak_bounds(design: GeneralDesign) -> PeakBound:
             rho=rho,
         )
     b = small_gain_solution(sums.G, sums.n)
-    widest = np.diff(Limits.of(design.extended.plant).x, axis=1)[:, 0]
+    widest = np.diff(Limits.of(design.extended.plant, design.precision).x, axis=1)[:, 0]
     return PeakBound(b, fade(system, b, widest))

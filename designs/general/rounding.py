@@ -44,13 +44,13 @@ def _over(
         if name != "x":
             box = boxes[name].reshape(-1, 2)
             cells[name] = box[:, :1], box[:, 1:]
-    return rounding_bound(function, cells)
+    return rounding_bound(function, cells, design.precision, read=("y",))
 
 
 def needed(design: GeneralDesign) -> Rounding:
     """Bound what one step adds, rounded up."""
     plant = design.extended.plant
-    limits = Limits.of(plant)
+    limits = Limits.of(plant, design.precision)
     most = shown(design, limits)
     boxes = {"x": limits.x, "u": limits.u, "y": np.column_stack([-most, most])}
     first, second, third = stages(design)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import add_up
-from obsynth.designs.core.boxes import Ends, column
+from obsynth.designs.core.boxes import Ends, column, every
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import Start, read_vector
@@ -17,9 +17,11 @@ from obsynth.designs.core.running import (
     SETTLED,
     UP,
     Running,
+    above,
     all_around,
     all_steady,
     settle,
+    shaken,
 )
 from obsynth.designs.core.signals import finite_box, wider
 from obsynth.designs.core.stepping import clip, inside
@@ -42,9 +44,9 @@ class Limits:
     u: FloatArray
 
     @classmethod
-    def of(cls, plant: Plant) -> "Limits":
+    def of(cls, plant: Plant, precision: str = "double") -> "Limits":
         """Read the limits of an extended plant."""
-        x, u = (finite_box(plant, kind).reshape(-1, 2) for kind in "xu")
+        x, u = (finite_box(plant, kind, precision).reshape(-1, 2) for kind in "xu")
         return cls(wider(x), np.where(covered_inputs(plant)[:, None], u, wider(u)))
 
 
@@ -60,7 +62,7 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
     x, u, y, nu = (ca.SX.sym(name, size) for name, size in sizes.items())
     empty = ca.DM(0, 1)
     box = np.where(curved_states(plant, noise=True)[:, None], plant.box("x"), [-np.inf, np.inf])
-    inner = clip(x, box)
+    inner = clip(x, box, design.precision)
     middle = design.middle
     outside = x - inner
     rows, outputs = plant.function()(inner, u, empty, empty, ca.DM(design.v_centre), empty, empty)
@@ -91,20 +93,21 @@ def start_bound(design: GeneralDesign, x: Ends, f: Ends, prediction: ca.SX) -> c
         ca.vertcat(a, *(b[k] for k in design.places))
         for a, b in ((x.lower, f.lower), (x.upper, f.upper))
     )
-    apart = ca.fmax(high - prediction, prediction - low) * UP
+    apart = ca.fmax(high - prediction, prediction - low) * above(design.precision, 1)
     return ca.vertcat(*(_start(design, bound, apart) for bound in design.bounds))
 
 
 def _start(design: GeneralDesign, bound: PeakBound | EllipsoidBound, apart: ca.SX) -> ca.SX:
     """Return an s for first errors of at most `apart`."""
+    up = above(design.precision, 4 * design.size)
     if isinstance(bound, PeakBound):
-        return ca.sparsify(ca.DM(bound.fading.start * UP)) @ apart
+        return ca.sparsify(ca.DM(bound.fading.start * up)) @ apart
     M, other, added = start_of_ellipsoid(design, bound)
     # sqrt V of M e_p, and of what channels, disturbances and rounding add to it
-    rest = ca.DM(other) @ apart + added
+    rest = ca.DM(other) @ apart + ca.DM(added)
     size = np.abs(bound.P)
     parts = [ca.sqrt(ca.dot(a, ca.DM(W) @ a)) for a, W in ((apart, M), (rest, size))]
-    return (parts[0] + parts[1]) ** 2 * UP
+    return (parts[0] + parts[1]) ** 2 * up
 
 
 def running(design: GeneralDesign) -> tuple[Running, ...]:
@@ -115,20 +118,23 @@ def running(design: GeneralDesign) -> tuple[Running, ...]:
 def _running(design: GeneralDesign, bound: PeakBound | EllipsoidBound) -> Running:
     """Return the recursion of a bound; underflow is far below what `add` counts twice.
 
-    In the norm of P, rounding is at most rho: V+ <= ((1 - gamma) V + gamma) (1 + rho) + rho +
-    rho^2.
+    In the norm of P, rounding is at most rho, see `shaken`.
     """
     if isinstance(bound, PeakBound):
         add, fading = bound.b[design.size :] * ROUND_UP, bound.fading
-        return Running(fading.G * UP, np.zeros(len(fading.G)), fading.reach * UP, add, root=False)
+        still = np.zeros(len(fading.G))
+        G, reach = fading.G * UP, fading.reach * UP
+        return Running(G, still, reach, add, root=False, precision=design.precision)
     step, gamma = rounding_in(error_system(design), design.rounding), bound.gamma
     rho = float(np.sqrt(step @ np.abs(bound.P) @ step)) * UP
+    decay, offset = shaken(gamma, rho)
     return Running(
-        decay=np.array([[(1.0 - gamma) * (1.0 + rho) * UP]]),
-        offset=np.array([(gamma * (1.0 + rho) + rho + rho**2) * UP]),
+        decay=np.array([[decay]]),
+        offset=np.array([offset]),
         reach=bound.inverse_diagonal[:, None] * UP,
         add=np.zeros(design.size),
         root=True,
+        precision=design.precision,
     )
 
 
@@ -217,7 +223,8 @@ def build_core(design: GeneralDesign) -> Core:
     """
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
-    limits, far = Limits.of(plant), LIMITS[design.precision].far
+    limits, precision = Limits.of(plant, design.precision), design.precision
+    far = LIMITS[precision].far
     bounds = running(design)
     names, followed = design.plant.names("f"), design.extended.followed
     own = curved_states(plant, noise=True)[:n]
@@ -237,9 +244,8 @@ def build_core(design: GeneralDesign) -> Core:
         y = seen.readings(expected)
         q = first(prediction, u, y)
         c, nu = second(q, u, y)
-        sound = ca.logic_and(inside(prediction, prediction, limits.x), inside(q, q, limits.x))
-        sound = ca.logic_and(sound, inside(c, c, limits.x))
-        sound = ca.logic_and(sound, inside(u, u, limits.u))
+        checked = [(prediction, limits.x), (q, limits.x), (c, limits.x), (u, limits.u)]
+        sound = every(inside(value, value, box, precision) for value, box in checked)
         moved = {"prediction": third(c, u, nu)}
         if not bounds:
             return Known(c[:n], spread(c, 0.0), None, None, moved, sound=sound)

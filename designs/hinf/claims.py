@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.derive.rigour import ExactMatrix, is_positive_definite, prove_positive_definite
+from obsynth.derive.rigour import UNIT, ExactMatrix, is_positive_definite, prove_positive_definite
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import covered_inputs
 from obsynth.designs.core.method import Numbers
@@ -280,7 +280,8 @@ def guarantee(design: HinfDesign) -> Guarantee:
         *_inputs_assumed(design),
         "every reading arrives (status bit 32); one that is missing counts as a new initial error",
         f"{about} has finite energy over the horizon; no bound is used",
-        "rounding errors of the step, about 1e-16 of the signals, are not counted as disturbances",
+        f"rounding errors of the step, about {UNIT[design.precision]:.0e} of the signals, are not "
+        "counted as disturbances",
     ]
     if residual > 0.0:
         assumptions.append(

@@ -137,14 +137,6 @@ class IntervalObserver(Method):
         """Refuse options that do not fit each other."""
         object.__setattr__(self, "gains", _read_pair(self.gains))
         object.__setattr__(self, "prefer", _in_words(self.prefer))
-        if self.precision == "single" and self.cuts:
-            raise ObsynthError(
-                f"cuts is {self.cuts!r}; precision='single' takes none: only the method's own sets "
-                "are rounded outwards in single precision",
-                option="cuts",
-            )
-        if self.precision == "single":
-            object.__setattr__(self, "cuts", ())
         if self.centred and self.nominal is not None:
             raise ObsynthError(
                 "nominal is the A of centred=False; with centred=True it is the middle",

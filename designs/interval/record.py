@@ -67,8 +67,6 @@ class IntervalDesign(Design):
 
     def check(self) -> None:
         """Refuse numbers for which the observer is not defined."""
-        if self.precision == "single" and self.options.get("cuts") not in ((), []):
-            raise CertificateError("the stored design has cuts that single precision does not")
         try:
             _ = self.decoupled, self.S
         except ObsynthError as error:

@@ -17,10 +17,8 @@ from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.relaxation import Affine, relax
 from obsynth.designs.core.sweeps import Sweeps
-from obsynth.designs.set_membership.zonotope import STEP, TINY, Zonotope, moved
+from obsynth.designs.set_membership.zonotope import DOUBLE, Real, Zonotope, moved
 from obsynth.symbolic.arrays import IntArray
-
-_UP = 1.0 + 2.0**-40
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +58,11 @@ class Enclosures:
     def size(self) -> int:
         """N, of z."""
         return self.sweeps.n + len(self.followed)
+
+    @property
+    def real(self) -> Real:
+        """What rounding takes of sums over all variables."""
+        return Real(self.sweeps.rounding.precision, 2 * self.sweeps.equations.n_v)
 
     @cached_property
     def place(self) -> Mapping[int, int]:
@@ -107,15 +110,17 @@ class Enclosures:
         for slopes, middle, reach, own in self._forms(program, program.outputs, now):
             H.append(slopes)
             offset.append(middle)
-            sigma.append((reach + sum((ca.fabs(v) for v in own.values()), ca.SX(0))) * _UP)
+            sigma.append((reach + sum((ca.fabs(v) for v in own.values()), ca.SX(0))) * self.real.up)
         return Shown(ca.vertcat(*H), ca.vertcat(*offset), ca.vertcat(*sigma))
 
     def _forms(
         self, program: Program, nodes: Sequence[int], boxes: Before
     ) -> Iterator[tuple[ca.SX, ca.SX, ca.SX, dict[int, ca.SX]]]:
         """Yield the slopes of nodes by z, a row each, and what `_beside` says of them."""
-        variables = self.sweeps.equations.variables(boxes)
-        rest = {j: middle_of(variables[j].lower, variables[j].upper) for j in self.beside}
+        signal = self.sweeps.rounding.signal
+        variables = [signal(v) for v in self.sweeps.equations.variables(boxes)]
+        near = ((j, variables[j]) for j in self.beside)
+        rest = {j: middle_of(v.lower, v.upper, self.real) for j, v in near}
         for form in relax(program, nodes, variables, self.sweeps.rounding):
             slopes = ca.SX(1, self.size)
             for j, k in self.place.items():
@@ -145,13 +150,14 @@ class Enclosures:
                 own[j] = slope * radius
             else:
                 reach = reach + ca.fabs(slope * radius)
-        return middle, reach * _UP + (terms + 2) * STEP * size + TINY, own
+        real = self.real
+        return middle, reach * real.up + (terms + 2) * real.step * size + real.tiny, own
 
 
-def middle_of(lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, ca.SX]:
+def middle_of(lower: ca.SX, upper: ca.SX, real: Real = DOUBLE) -> tuple[ca.SX, ca.SX]:
     """Return a middle and a radius that hold an interval."""
     middle = 0.5 * lower + 0.5 * upper
-    return middle, ca.fmax(upper - middle, middle - lower) * _UP
+    return middle, ca.fmax(upper - middle, middle - lower) * real.up
 
 
 def told_by_rate(contractor: Contractor) -> IntArray:

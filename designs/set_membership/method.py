@@ -119,6 +119,7 @@ class SetMembershipObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
+        single=True,
         shared=shared,
         settle=settling,
         fault_delay=fault_delay,
@@ -152,7 +153,7 @@ class SetMembershipObserver(Method):
 
     @property
     def _general(self) -> GeneralUIO:
-        return GeneralUIO(weights=self.weights)
+        return GeneralUIO(weights=self.weights, precision=self.precision)
 
     def solve(self, model: SetMembershipModel) -> SetMembershipDesign:
         """Choose gain, coordinates and columns by what they predict."""

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design
 from obsynth.designs.general.record import GeneralDesign, PeakBound
-from obsynth.designs.set_membership.zonotope import Frame
+from obsynth.designs.set_membership.zonotope import Frame, Real
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
@@ -84,7 +84,7 @@ class SetMembershipDesign(Design):
     @cached_property
     def frame(self) -> Frame:
         """Coordinates of the reduction."""
-        return Frame(self.V, self.W, self.size, self.leak)
+        return Frame(self.V, self.W, self.size, self.leak, Real(self.precision, len(self.V)))
 
     @property
     def turns(self) -> list[int]:

@@ -27,6 +27,7 @@ from obsynth.designs.general.record import GeneralDesign
 from obsynth.designs.set_membership.enclosure import Enclosures, middle_of
 from obsynth.designs.set_membership.record import SetMembershipDesign
 from obsynth.designs.set_membership.zonotope import (
+    Real,
     Strips,
     Zonotope,
     corrected,
@@ -129,6 +130,11 @@ class Bank:
         """Return a box that holds everything."""
         return Ends.unbounded(n, self.design.precision)
 
+    @cached_property
+    def real(self) -> Real:
+        """What rounding takes of sums over the columns of a zonotope."""
+        return Real(self.design.precision, self.wide + len(self.design.plant.output_names))
+
     @property
     def names(self) -> list[int]:
         """Numbers of the zonotopes; the first is the one that is corrected."""
@@ -172,12 +178,12 @@ class Bank:
         found = {}
         for j in self.names:
             generators = ca.reshape(memory[f"G{j}"], N, memory[f"G{j}"].numel() // N)
-            found[j] = Zonotope(memory[f"c{j}"], generators, none)
+            found[j] = Zonotope(memory[f"c{j}"], generators, none, self.real)
         return found
 
     def begin(self, x: Ends, f: Ends, kept: Parts) -> Parts:
         """Begin every zonotope from a box."""
-        z = Zonotope.of(self.box(x, f), self.wide)
+        z = Zonotope.of(self.box(x, f), self.wide, self.real)
         found = self.parts(dict.fromkeys(self.names, z), ca.SX(0))
         if self.inner is None:
             return found
@@ -224,7 +230,7 @@ class Bank:
         """Return the image of the box that is left of the instant before."""
         assert seen.around is not None
         before = seen.around.before
-        z = Zonotope.of(self.box(before.states, before.faults), self.N)
+        z = Zonotope.of(self.box(before.states, before.faults), self.N, self.real)
         return self.enclosures.rows(before).applied(z)
 
     def run(self, seen: Seen) -> Known:
@@ -260,7 +266,8 @@ class Bank:
         kept = {0: reduced(after[0], keep, design.frame)}
         for j in self.names[1:]:
             again = ca.fabs(clock - float(design.turns[j - 1])) < 0.5
-            fresh, old = Zonotope.of(X, design.columns), reduced(found[j], keep, design.frame)
+            fresh = Zonotope.of(X, design.columns, self.real)
+            old = reduced(found[j], keep, design.frame)
             kept[j] = Zonotope(
                 select(again, fresh.centre, old.centre),
                 ca.reshape(
@@ -269,6 +276,7 @@ class Bank:
                     design.columns,
                 ),
                 old.slack,
+                self.real,
             )
         over = clock > design.restart - 0.5
         memory = {**self.parts(kept, ca.if_else(over, 0.0, clock)), **inner}
@@ -302,12 +310,12 @@ class Bank:
         fresh = seen.memory["clock"] > 0.5
         for k, j in enumerate(enclosures.free):
             faults = seen.around.before.faults
-            middle, radius = middle_of(faults.lower[j], faults.upper[j])
+            middle, radius = middle_of(faults.lower[j], faults.upper[j], self.real)
             told = Ends(faults.lower[j], faults.upper[j])
             for strip in strips.values():
                 row = ca.SX(1, strip.seen.shape[1])
                 row[0, k] = radius
-                own = Zonotope(middle, row, ca.SX(1, 1))
+                own = Zonotope(middle, row, ca.SX(1, 1), self.real)
                 told = told.meet(cut(own, strip, used))
             low[j] = ca.if_else(fresh, told.lower, -self.far)
             high[j] = ca.if_else(fresh, told.upper, self.far)

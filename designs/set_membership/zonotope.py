@@ -1,9 +1,9 @@
 """Zonotopes of code: ``c + G xi`` with |xi| <= 1, and what rounding adds, a box beside.
 
 Every operation returns numbers c, G and a slack s such that the set that real arithmetic gives lies
-in ``{c + G xi + eta, |eta| <= s}``. A sum of k products is off by at most ``k STEP`` times the sum
-of their absolute values, `STEP` two units of rounding, which covers the rounding of that bound as
-well; `TINY` is above what underflow takes of such a sum.
+in ``{c + G xi + eta, |eta| <= s}``. A sum of k products is off by at most ``k step`` times the sum
+of their absolute values, `Real.step` four units of rounding, which covers the rounding of that
+bound as well; `Real.tiny` is above what underflow takes of such a sum.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,40 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.lifted import Rounding
 from obsynth.symbolic.arrays import FloatArray
 
-STEP = 2.0**-51
-TINY = 1e-290
 FEW = 12
 """Generators that a coordinate shares with a strip, up to which every breakpoint is tried."""
+_TINY = {"double": 1e-290, "single": 2.0**-100}
 _UP = 1.0 + 2.0**-40
-"""Above the rounding of sums of up to a thousand terms."""
+"""Above the rounding of sums of up to a thousand terms, in doubles."""
+
+
+@dataclass(frozen=True)
+class Real:
+    """What rounding takes in a precision; terms: of the longest sum."""
+
+    precision: str = "double"
+    terms: int = 0
+
+    @property
+    def step(self) -> float:
+        """Four units of rounding."""
+        return 2.0 * Rounding(self.precision).step
+
+    @property
+    def tiny(self) -> float:
+        """Above what underflow takes of a sum."""
+        return _TINY[self.precision]
+
+    @property
+    def up(self) -> float:
+        """A factor above the rounding of sums of nonnegative terms."""
+        return max(_UP, 1.0 + (self.terms + 8) * Rounding(self.precision).step)
+
+
+DOUBLE = Real()
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,25 +56,26 @@ class Zonotope:
     centre: ca.SX
     generators: ca.SX
     slack: ca.SX
+    real: Real = DOUBLE
 
     @classmethod
-    def of(cls, box: Ends, columns: int) -> "Zonotope":
+    def of(cls, box: Ends, columns: int, real: Real = DOUBLE) -> "Zonotope":
         """Return a box with its generators first and zeros up to a number of columns."""
         N = box.lower.numel()
         centre = 0.5 * box.lower + 0.5 * box.upper
-        radius = ca.fmax(box.upper - centre, centre - box.lower) * _UP
+        radius = ca.fmax(box.upper - centre, centre - box.lower) * real.up
         filling = ca.SX(N, columns - N)
-        return cls(centre, ca.horzcat(ca.diag(radius), filling), ca.SX(N, 1))
+        return cls(centre, ca.horzcat(ca.diag(radius), filling), ca.SX(N, 1), real)
 
     @property
     def radius(self) -> ca.SX:
         """How far the set reaches from c, rounded up, (N,)."""
-        return row_sums(self.generators) * _UP + self.slack
+        return row_sums(self.generators) * self.real.up + self.slack
 
     @property
     def hull(self) -> Ends:
         """The box around the set."""
-        reach = self.radius * _UP + STEP * ca.fabs(self.centre)
+        reach = self.radius * self.real.up + self.real.step * ca.fabs(self.centre)
         return Ends(self.centre - reach, self.centre + reach)
 
 
@@ -60,6 +87,7 @@ class Strips:
     innovation: ca.SX
     seen: ca.SX
     sigma: ca.SX
+    real: Real = DOUBLE
 
     @classmethod
     def read(cls, z: Zonotope, H: ca.SX, rest: ca.SX, sigma: ca.SX, used: ca.SX) -> "Strips":
@@ -68,15 +96,16 @@ class Strips:
         rest: ``y - o``, (m,). Computed are ``b = rest - H c`` and ``a = H G``; sigma takes what
         rounding adds to either.
         """
-        N = H.shape[1]
+        N, real = H.shape[1], z.real
         size = ca.fabs(H) @ (ca.fabs(z.centre) + z.radius) + ca.fabs(rest)
-        wide = sigma * _UP + (N + 4) * STEP * size + ca.fabs(H) @ z.slack * _UP + TINY
-        return cls(H, used * (rest - H @ z.centre), H @ z.generators, wide)
+        wide = sigma * real.up + (N + 4) * real.step * size + ca.fabs(H) @ z.slack * real.up
+        wide = wide + real.tiny
+        return cls(H, used * (rest - H @ z.centre), H @ z.generators, wide, real)
 
     @property
     def against(self) -> ca.SX:
         """1 where a strip and the zonotope have nothing in common."""
-        reach = (row_sums(self.seen) + self.sigma) * _UP
+        reach = (row_sums(self.seen) + self.sigma) * self.real.up
         return ca.sum1(ca.fabs(self.innovation) > reach) > 0.5
 
 
@@ -84,22 +113,23 @@ def moved(
     z: Zonotope, J: ca.SX, offset: ca.SX, columns: Sequence[ca.SX], spread: ca.SX
 ) -> Zonotope:
     """Return ``J z + offset + columns xi + diag(spread) xi``, the slack within the spread."""
-    N = J.shape[0]
+    N, real = J.shape[0], z.real
     size = ca.fabs(J) @ (ca.fabs(z.centre) + z.radius) + ca.fabs(offset)
-    wide = spread * _UP + (N + 4) * STEP * size + ca.fabs(J) @ z.slack * _UP + TINY
+    wide = spread * real.up + (N + 4) * real.step * size + ca.fabs(J) @ z.slack * real.up
+    wide = wide + real.tiny
     generators = ca.horzcat(*columns, ca.diag(wide), J @ z.generators)
-    return Zonotope(J @ z.centre + offset, generators, ca.SX(N, 1))
+    return Zonotope(J @ z.centre + offset, generators, ca.SX(N, 1), real)
 
 
 def corrected(z: Zonotope, L: ca.SX, strips: Strips, used: ca.SX) -> Zonotope:
     """Return ``z + L (y - H z - o - eta)``, which holds the state whatever L is, (N, m)."""
-    m = L.shape[1]
+    m, real = L.shape[1], z.real
     gain = L @ ca.diag(used)
     b, a, sigma = strips.innovation, strips.seen, strips.sigma
     size = ca.fabs(gain) @ (ca.fabs(b) + row_sums(a) + sigma)
-    slack = (m + 4) * STEP * (ca.fabs(z.centre) + z.radius + size) + z.slack * _UP + TINY
+    slack = (m + 4) * real.step * (ca.fabs(z.centre) + z.radius + size) + z.slack * real.up
     generators = ca.horzcat(gain @ ca.diag(sigma), z.generators - gain @ a)
-    return Zonotope(z.centre + gain @ b, generators, slack)
+    return Zonotope(z.centre + gain @ b, generators, slack + real.tiny, real)
 
 
 def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
@@ -110,12 +140,13 @@ def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
     ``lam = g_i a' / (a a' + sigma^2)`` in any case. Where a strip and the set have a point in
     common, neither |lam b| nor ``|lam| sum_j |a_j|`` is above ``sum_j |g_ij|`` and the reach.
     """
-    hull = z.hull
+    hull, real = z.hull, z.real
     lower, upper = ca.SX(hull.lower), ca.SX(hull.upper)
-    rooms = 8.0 * STEP * (row_sums(z.generators) + ca.fabs(z.centre)) + z.slack * _UP + TINY
+    rooms = 8.0 * real.step * (row_sums(z.generators) + ca.fabs(z.centre)) + z.slack * real.up
+    rooms = rooms + real.tiny
     for q in range(strips.H.shape[0]):
         a, sigma, b = strips.seen[q, :], strips.sigma[q], strips.innovation[q]
-        size = ca.sum2(a * a) + sigma * sigma + TINY
+        size = ca.sum2(a * a) + sigma * sigma + real.tiny
         for i in range(z.centre.numel()):
             g = z.generators[i, :]
             common = [j for _, j in zip(*(g * a).sparsity().get_triplet(), strict=True)]
@@ -123,11 +154,11 @@ def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
                 continue
             gains = [ca.sum2(g * a) / size]
             if len(common) <= FEW:
-                gains += [ca.if_else(ca.fabs(a[j]) > TINY, g[j] / a[j], 0.0) for j in common]
+                gains += [ca.if_else(ca.fabs(a[j]) > real.tiny, g[j] / a[j], 0.0) for j in common]
             for gain in gains:
                 lam = used[q] * gain
                 reach = ca.sum2(ca.fabs(g - lam * a)) + ca.fabs(lam) * sigma
-                reach, middle = reach * _UP + rooms[i], z.centre[i] + lam * b
+                reach, middle = reach * real.up + rooms[i], z.centre[i] + lam * b
                 lower[i] = ca.if_else(middle - reach > lower[i], middle - reach, lower[i])
                 upper[i] = ca.if_else(middle + reach < upper[i], middle + reach, upper[i])
     return Ends(lower, upper)
@@ -145,11 +176,12 @@ class Frame:
     W: FloatArray
     size: FloatArray
     leak: FloatArray
+    real: Real = DOUBLE
 
     @property
     def rounding(self) -> FloatArray:
         """Eight times what rounding V changes, in its own coordinates; 4 N times it is below 1."""
-        return np.asarray(2.0 * STEP * (self.size @ np.abs(self.V)))
+        return np.asarray(2.0 * self.real.step * (self.size @ np.abs(self.V)))
 
     @property
     def again(self) -> FloatArray:
@@ -163,15 +195,15 @@ def reduced(z: Zonotope, keep: int, frame: Frame) -> Zonotope:
 
     ``D xi = V (W D xi) + (I - V W) D xi``, and whatever vector r is left, ``|V^-1 r| <= size |r|``.
     """
-    N = len(frame.V)
+    N, real = len(frame.V), z.real
     kept, dropped = z.generators[:, :keep], z.generators[:, keep:]
-    W, wide = _sparse(frame.W), row_sums(dropped) * _UP
-    rounding = (N + 4) * STEP * np.abs(frame.W)
-    reach = row_sums(W @ dropped) * _UP + _sparse(frame.leak + rounding) @ wide * _UP
-    reach = reach + _sparse(frame.size) @ z.slack * _UP + TINY
-    reach = _sparse(frame.again) @ reach * _UP
+    W, wide = _sparse(frame.W), row_sums(dropped) * real.up
+    rounding = (N + 4) * real.step * np.abs(frame.W)
+    reach = row_sums(W @ dropped) * real.up + _sparse(frame.leak + rounding) @ wide * real.up
+    reach = reach + _sparse(frame.size) @ z.slack * real.up + real.tiny
+    reach = _sparse(frame.again) @ reach * real.up
     box = _sparse(frame.V) @ ca.diag(reach)
-    return Zonotope(z.centre, ca.horzcat(box, kept), ca.SX(N, 1))
+    return Zonotope(z.centre, ca.horzcat(box, kept), ca.SX(N, 1), real)
 
 
 def row_sums(matrix: ca.SX) -> ca.SX:

@@ -18,11 +18,11 @@ def claims(design: LuenbergerDesign) -> Iterator[Claim]:
     """Prove N and n for the stored gain, and the peak bound for N and n."""
     room = np.inf
     for stored, L in ((design.closed, design.L), (design.missing, np.zeros_like(design.L))):
-        fresh = compare(design.model, L)
+        fresh = compare(design.model, L, design.precision)
         room = min(room, float((stored.N - fresh.N).min()), float((stored.n - fresh.n).min()))
     yield Claim(
         "comparison",
-        "|e+| <= N |e| + n for every Jacobian of the family and every declared disturbance",
+        "|e+| <= N |e| + n for every Jacobian, every declared disturbance and rounding",
         room >= 0.0,
         room,
         "enclosures, rounded upwards",

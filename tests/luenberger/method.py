@@ -39,6 +39,7 @@ class Luenberger(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
+        single=True,
         shared=("prediction",),
         settle=settling,
     )

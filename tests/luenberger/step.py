@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from luenberger.record import LuenbergerDesign
+from luenberger.synthesis import prediction
 from obsynth.designs.core.boxes import Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.stepping import clip
+from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.running import UP, above
+from obsynth.designs.core.signals import finite_box
+from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray
 
-UP = 1.0 + 2.0**-40
-"""Above the relative rounding errors of the sums of one step."""
 SETTLED = 1.01
 MOST_CALLS = 100_000
 
@@ -41,37 +43,42 @@ def settling(
     The multiple of b that the first bound is below falls from call to call, as N b + n <= b.
     """
     N, n, b, k = design.closed.N, design.closed.n, design.b, 0
+    up = UP * above(design.precision, len(b)) ** 2
     s = float(((2.0 * box + SETTLED * b) / b).max()) * UP * b
     while k < (MOST_CALLS if calls is None else min(calls, MOST_CALLS)):
         if calls is None and np.all(s <= SETTLED * b):
             break
-        s, k = np.minimum(s, (N @ s + n) * UP**3), k + 1
+        s, k = np.minimum(s, (N @ s + n) * up**3), k + 1
     return k, s
 
 
 def build_core(design: LuenbergerDesign) -> Core:
     """Build the observer; the estimate is clipped to the box, which brings it nearer to x."""
-    model, plant = design.model, design.plant
-    box, C = plant.box("x"), ca.DM(model.C)
+    model, plant, precision = design.model, design.plant, design.precision
+    box, limits = plant.box("x"), finite_box(plant, "u")
+    moved, up = prediction(model, design.L), above(precision, len(design.L))
+    blind = prediction(model, 0.0 * design.L)
+    ulps = 4.0 * Rounding(precision).step
 
     def run(seen: Seen) -> Known:
-        xhat, s = clip(seen.memory["prediction"], box), seen.memory["bound"]
-        half = s * UP + 2.0**-40 * ca.fabs(xhat)
-        expected = C @ xhat + ca.DM(model.W2 @ model.w_centre)
-        innovation = select(seen.all_used, seen.y - expected, 0.0 * expected)
-        quiet = [ca.DM.zeros(0)] * 2 + [ca.DM(model.w_centre)] + [ca.DM.zeros(0)] * 2
-        moved = plant.function()(xhat, seen.u, *quiet)[0] + ca.DM(design.L) @ innovation
+        xhat, s = clip(seen.memory["prediction"], box, precision), seen.memory["bound"]
+        half = s * up + ulps * ca.fabs(xhat)
 
         def grown(comparison: Any) -> ca.SX:
-            return (ca.DM(comparison.N) @ half + ca.DM(comparison.n)) * UP
+            return (ca.DM(comparison.N) @ half + ca.DM(comparison.n)) * up
 
-        after = select(seen.all_used, grown(design.closed), grown(design.missing))
-        memory = {"prediction": moved, "bound": after}
-        return Known(xhat, ca.SX(0, 1), Ends(xhat - half, xhat + half), None, memory)
+        y, used = seen.y, seen.all_used
+        memory = {
+            "prediction": select(used, moved(xhat, seen.u, y), blind(xhat, seen.u, 0.0 * y)),
+            "bound": select(used, grown(design.closed), grown(design.missing)),
+        }
+        sound = inside(seen.u, seen.u, limits, precision)
+        sets = Ends(xhat - half, xhat + half)
+        return Known(xhat, ca.SX(0, 1), sets, None, memory, sound=sound)
 
     def begin(x: Ends, f: Ends, kept: Parts) -> Parts:
-        xhat = clip(kept["prediction"], box)
-        return {"bound": ca.fmax(x.upper - xhat, xhat - x.lower) * UP + 2.0**-40 * ca.fabs(xhat)}
+        xhat = clip(kept["prediction"], box, precision)
+        return {"bound": ca.fmax(x.upper - xhat, xhat - x.lower) * up + ulps * ca.fabs(xhat)}
 
     own = {"domain": box, "bridges": True, "nonnegative": ("bound",)}
     return Core(run, begin, lambda x, f, kept: kept, **own)
