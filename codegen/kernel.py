@@ -121,10 +121,13 @@ class Real:
     type: type[np.floating[Any]]
 
     def rounded(self, value: float) -> float:
-        """Return the number of the type that is next to a constant, or refuse the constant."""
+        """Return the number of the type next to a constant; refuse one that would be infinite.
+
+        What underflow takes of a constant is counted by the design, as all rounding is.
+        """
         with np.errstate(over="ignore"):
             near = float(self.type(value))
-        if math.isinf(near) > math.isinf(value) or (near == 0.0) > (value == 0.0):
+        if math.isinf(near) and not math.isinf(value):
             raise CodegenError(
                 f"the step holds the number {value!r}, which {self.precision} precision takes for"
                 f" {near!r}: design and generate the observer with precision='double'",

@@ -170,5 +170,5 @@ def test_every_method_in_closed_loop_in_single_precision(name: str, tmp_path: Pa
     except ObsynthError as refusal:
         pytest.skip(str(refusal))
     builds = [(COMPILERS[0], "-O2"), (COMPILERS[-1], "-O3", "-march=native")]
-    seen = compare(observer, tmp_path / "p", 200, 500, builds)
+    seen = compare(observer, tmp_path / "p", 500, 200, builds)
     assert sum(seen.values()) == 100_000

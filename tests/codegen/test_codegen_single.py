@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from obsynth.codegen import CodegenError, ComparisonError, build_and_compare, generate_c
+from obsynth.codegen.kernel import SINGLE
 from obsynth.codegen.single import SingleMachine
 
 WARNINGS = ("-Wconversion", "-Wdouble-promotion", "-Wfloat-conversion", "-Wshadow")
@@ -134,6 +135,13 @@ def test_a_design_for_single_precision_can_be_written_in_double(
     project = generate_c(make_single(), tmp_path / "p", vectors=100, precision="double")
     assert "typedef double" in (project.folder / "include/two_tanks.h").read_text()
     assert json.loads((project.folder / "manifest.json").read_text())["backend"] == "casadi"
+
+
+def test_a_constant_below_single_precision_is_zero() -> None:
+    """In C and machine alike; designs count it. A design of bounds has coefficients of 1e-295."""
+    x = ca.SX.sym("x")
+    assert SINGLE.literal(SINGLE.rounded(1e-295), "r") == "0.0f"
+    assert SingleMachine(ca.Function("f", [x], [1e-295 * x]))(np.ones(1))[0] == 0.0
 
 
 def test_the_machine_computes_in_single_precision() -> None:
