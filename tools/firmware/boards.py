@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.codegen.description import describe
-from obsynth.codegen.drive import Drive
-from obsynth.codegen.single import machine_of
-from obsynth.designs.core.observer import STEP_OUTPUTS
+from obsynth.codegen.vectors import record
 
 HERE = Path(__file__).parent
 FLAGS = ("-Wall", "-Wextra", "-Werror", "-O2")
@@ -25,8 +23,8 @@ CORES: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 TICK, TURNS = 40, 100_000
 """Instructions a tick of SysTick (25 MHz, one instruction a nanosecond), turns of the loop."""
-RECORDS, TIMED, SPOILT = 256, 64, 4
-"""Steps, how many of them are counted, and every which of the others has a number spoilt."""
+RECORDS, TIMED = 256, 64
+"""Steps, and over how many of them, the first ones, instructions are counted."""
 _NOTHING = 2
 _REPORT = 6
 
@@ -136,28 +134,13 @@ def apart(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 
 def recorded(observer: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return states with inputs, and what CasADi's machine (NumPy's float32) makes of them.
+    """Return states with inputs, and what a step makes of them: as vectors are, healthy ones first.
 
-    Along trajectories of the plant; behind the timed ones a number of one in `SPOILT` is extreme.
+    On CasADi's machine, or on NumPy's float32.
     """
-    description, rng = describe(observer), np.random.default_rng(0)
-    real = description.real.type
-    step, drive = machine_of(observer.step, description.real), Drive(description, rng)
-    largest, least = np.finfo(real).max, np.finfo(real).smallest_subnormal
-    extremes = np.array([np.nan, np.inf, -np.inf, largest, -largest, least, -0.0, 0.0], real)
-    status = STEP_OUTPUTS.index("status")
-    given, made = [], []
-    for k in range(RECORDS):
-        if k % TIMED == 0:
-            begun = drive.begin(TIMED)
-            memory = description.start if begun is None else begun
-        parts = [memory, *drive.sample(k % TIMED)]
-        row = np.concatenate(parts).astype(real)
-        if k >= TIMED and k % SPOILT == 0:
-            first = memory.size if k % (2 * SPOILT) else 0
-            row[rng.integers(first, row.size)] = rng.choice(extremes)
-        results = step(*np.split(row, np.cumsum([part.size for part in parts[:-1]])))
-        memory, reported = results[0], results.pop(status)
-        given.append(row)
-        made.append(np.concatenate([*results[1:], reported, memory]))
-    return np.array(given), np.array(made, real)
+    description = describe(observer)
+    steps = record(description, RECORDS, 0)[0].steps
+    steps.sort(key=lambda step: step.status != 0)
+    given = [np.concatenate([step.before, step.inputs]) for step in steps]
+    made = [np.concatenate([step.results, [step.status], step.after]) for step in steps]
+    return np.array(given, description.real.type), np.array(made, description.real.type)
