@@ -37,10 +37,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(page_html: str, **_: Any) -> str:
-    """Write formulas as MathML, wide ones and tables in boxes that scroll by themselves."""
-    page_html = FORMULA.sub(formula, page_html)
-    page_html = page_html.replace("<table>", '<div class="wide"><table>')
-    return page_html.replace("</table>", "</table></div>")
+    """Write formulas as MathML."""
+    return FORMULA.sub(formula, page_html)
 
 
 def errata(_: re.Match[str]) -> str:
@@ -56,8 +54,10 @@ def errata(_: re.Match[str]) -> str:
 
 
 def formula(found: re.Match[str]) -> str:
-    """Return the MathML of a formula that arithmatex marked."""
-    shown = convert(html.unescape(found[3]), display="block" if found[2] == "[" else "inline")
+    """Return the MathML of a formula; one that is displayed stands in a box that scrolls."""
+    text = html.unescape(found[3]).replace("{aligned}", "{align*}")  # which the converter knows
+    shown = convert(text, display="block" if found[2] == "[" else "inline")
+    shown = shown.replace(r"\_", "_")
     return f'<div class="wide">{shown}</div>' if found[2] == "[" else shown
 
 
@@ -65,10 +65,7 @@ def gallery(paths: Any) -> str:
     """Return the page of all plants that are text files: signals, equations, sources."""
     told = {path.stem: tomllib.loads(path.read_text("utf-8")) for path in sorted(paths)}
     parts = [GALLERY]
-    parts += [
-        f"| [{name}](#{name}) | {plant['name']} | {_counts(plant)} |"
-        for name, plant in told.items()
-    ]
+    parts += [f"| [{name}](#{name}) | {_counts(plant)} |" for name, plant in told.items()]
     for name, plant in told.items():
         parts += ["", f"## {name}", "", *_plant(name, plant)]
     return "\n".join(parts) + "\n"
@@ -82,8 +79,8 @@ Plants of `ob.plants`, generated from their text files (`symbolic/plants/*.toml`
 `hinf_example`, `leaking_tanks`, `planar_arm`, `planar_arm_bias`, `planar_arm_terms`,
 `tanks_in_a_row`, `van_der_pol`; `help(ob.plants.NAME)` tells of them.
 
-| plant | | states | inputs | faults | outputs |
-|---|---|---|---|---|---|"""
+| plant | states | inputs | faults | outputs |
+|---|---|---|---|---|"""
 
 
 def _counts(plant: dict[str, Any]) -> str:
@@ -112,10 +109,9 @@ def _plant(name: str, plant: dict[str, Any]) -> list[str]:
     equations = [f"{key} = {_said(value)}" for key, value in plant.get("definitions", {}).items()]
     equations += [f"{key}{after} = {_said(value)}" for key, value in plant["dynamics"].items()]
     equations += [f"{key} = {_said(value)}" for key, value in plant["outputs"].items()]
-    told = [noun[0].upper() + noun[1:].strip(), "", "```text", *equations, "```", ""]
+    told = [(noun[0].upper() + noun[1:]).strip(), "", "```text", *equations, "```", ""]
     rows = [(table, plant[table]) for table in (*SHOWN, "parameters") if plant.get(table)]
-    told += ["| | |", "|---|---|"]
-    told += [f"| {table.replace('_', ' ')} | {_signals(entries)} |" for table, entries in rows]
+    told += [f"- {table.replace('_', ' ')}: {_signals(entries)}" for table, entries in rows]
     if sources:
         told += ["", "Source: " + " ".join(sources.split())]
     return told
@@ -128,13 +124,13 @@ def _said(value: Any) -> str:
 
 
 def _signals(entries: dict[str, Any]) -> str:
-    """Return signals with what is said of each, as a text of a cell."""
-    cells = []
+    """Return signals with what is said of each."""
+    parts = []
     for name, told in entries.items():
         said = told if isinstance(told, dict) else {"value": told}
         facts = ", ".join(f"{key} {_plain(value)}" for key, value in said.items())
-        cells.append(f"`{name}`" + (f": {facts}" if facts else ""))
-    return "; ".join(cells).replace("|", "\\|")
+        parts.append(f"`{name}`" + (f": {facts}" if facts else ""))
+    return "; ".join(parts)
 
 
 def _plain(value: Any) -> str:
