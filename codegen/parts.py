@@ -29,8 +29,8 @@ def in_parts(
             born[found["name"]], kind[found["name"]] = k, found["kind"]
         read.append(dict.fromkeys(name for line in part for name in _NAME.findall(line)))
     last = {name: k for k, names in enumerate(read) for name in names}
-    free: dict[str, list[int]] = {real: [], "int": []}
-    size = {real: 0, "int": 0}
+    free: dict[str, list[int]] = {real: [], "_Bool": []}
+    size = {real: 0, "_Bool": 0}
     place: dict[str, str] = {}
     texts: list[list[str]] = []
     for k, part in enumerate(parts):
@@ -51,7 +51,7 @@ def in_parts(
                 place[name] = f"{'w' if of == real else 'b'}[{free[of].pop()}]"
                 kept.append(f"{place[name]} = {name};")
         texts.append([*taken, *part, *kept])
-    arrays = f"{real} w[{max(size[real], 1)}]", f"int b[{max(size['int'], 1)}]"
+    arrays = f"{real} w[{max(size[real], 1)}]", f"_Bool b[{max(size['_Bool'], 1)}]"
     functions, calls = [], []
     for k, text in enumerate(texts[1:-1]):
         unused = [f"(void){a};" for a in "wb" if not any(f"{a}[" in line for line in text)]

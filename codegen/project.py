@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from obsynth.codegen.box import input_box
 from obsynth.codegen.build import FLAGS, Build, Comparison, build_and_compare, find_compiler
 from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
@@ -291,6 +292,7 @@ def _manifest(
             field.name: [field.start, field.start + field.size] for field in description.fields
         },
         "signals": {kind: _signals(getattr(description, kind)) for kind in kinds},
+        "input_box": input_box(description),
         "guarantee": {
             "claims": list(observer.guarantee.claims),
             "assumptions": list(observer.guarantee.assumptions),

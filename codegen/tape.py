@@ -7,7 +7,7 @@ What runs is what CasADi's virtual machine runs, to the last bit but for which N
 - `fmax` and `fmin` of the mathematics library drop a NaN for the other operand, and return the
   first of two that are equal. Comparisons do the same if they ask for a NaN of the first operand;
   they need not where one of the two is never a NaN.
-- Comparisons are int; as factors of positive constants they choose the constant or zero.
+- Comparisons are _Bool; as factors of positive constants they choose the constant or zero.
 - All inputs are read before a result is written, so that states and structs may overlap.
 - Beyond some thousand statements there are several functions, see `parts`.
 - In single precision constants are rounded to the nearest, literals and functions are those of
@@ -234,20 +234,23 @@ class _Writer:
 
     def result(self, value: _Value) -> str:
         """Return a value as a number that is assigned."""
-        return f"({self.real}){self.atom(value)}" if value.truth else value.text
+        return self._chosen(value) if value.truth else value.text
 
     def atom(self, value: _Value) -> str:
         """Return a value as an operand."""
         return value.text if value.simple else f"({value.text})"
 
     def _name(self, value: _Value, text: str) -> None:
-        kind = "int" if value.truth else self.real
+        kind = "_Bool" if value.truth else self.real
         value.text, value.simple, value.product = f"t{self.count}", True, False
         self.count += 1
         self.lines.append(f"const {kind} {value.text} = {text};")
 
     def _number(self, value: _Value) -> str:
-        return f"({self.real}){self.atom(value)}" if value.truth else self.atom(value)
+        return f"({self._chosen(value)})" if value.truth else self.atom(value)
+
+    def _chosen(self, value: _Value) -> str:
+        return f"{self.atom(value)} ? {self.literal(1.0)} : {self.literal(0.0)}"
 
     def _condition(self, value: _Value) -> str:
         if value.truth:

@@ -68,7 +68,7 @@ MUTANTS = {
         r"(init_default\((?s:.*?))two_tanks_set_memory\(state, memory\);",
         r"\1(void)state; (void)memory;",
     ),
-    "not initialised forgotten": (SOURCE, r"= \{0\.0\};", "= {0.0, 1.0};"),
+    "not initialised forgotten": (SOURCE, r"= \{0\};", "= {0.0, 1.0};"),
     "last bit of a constant": (KERNEL, r"=0\.9;", "=0.90000000000000013;"),
     "check that lets NaN through": (KERNEL, r"=\((a\d+)<=(a\d+)\);", r"=!(\1>\2);"),
     "infinity made finite": (KERNEL, r"INFINITY", "1.7976931348623157e308"),
