@@ -3,9 +3,9 @@
 import numpy as np
 
 from obsynth.codegen.description import Description
+from obsynth.codegen.drive import Drive
 from obsynth.codegen.kernel import STEP_INPUTS
 from obsynth.codegen.single import machine_of
-from obsynth.codegen.vectors import Drive
 
 _SEQUENCES, _LENGTH = 4, 50
 
