@@ -24,7 +24,7 @@ from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.equations import Before, Equations
 from obsynth.designs.core.lifted import Lifted, Rounding, combine
 from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
-from obsynth.designs.core.stepping import counter, slices
+from obsynth.designs.core.stepping import counter, inside, slices
 from obsynth.designs.detection.relations import relations
 from obsynth.symbolic.arrays import FloatArray
 
@@ -76,9 +76,8 @@ class Window:
             r, q = Rounding(self.precision), len(found)
             row += [equations.image(i, then, r) for i in range(2 * q)]
             now = [equations.image(q + i, Before(X, F, known), r) for i in range(q)]
-            for i, (low, high) in enumerate(equations.known_box.tolist()):
-                inside = ca.logic_and(known[i] >= low, known[i] <= high)
-                usable = ca.logic_and(usable, inside)
+            covered = inside(known, known, equations.known_box, self.precision)
+            usable = ca.logic_and(usable, covered)
         newest = ca.vertcat(*(e.lower for e in row), *(e.upper for e in row))
         parts = ca.vertcat(newest, part["parts"])
         going = ca.logic_and(good, part["ready"] > 0.5)
