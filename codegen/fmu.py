@@ -24,6 +24,7 @@ from obsynth.codegen.start import Start, Variable, start_of
 from obsynth.designs.core.files import replaced
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.symbolic.taking import takes
 
 _PLATFORMS = {("linux", "x86_64"): ("linux64", "so"), ("darwin", "x86_64"): ("darwin64", "dylib")}
 _FLAGS = ("-O2", "-fPIC", "-fvisibility=hidden")
@@ -84,6 +85,7 @@ class Fmu:
         return "\n".join([f"FMU {self.name}: {self.path}", *lines])
 
 
+@takes(observer="Observer FaultDetector")
 def generate_fmu(
     observer: Observer | FaultDetector,
     path: str | PathLike[str],

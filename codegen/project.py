@@ -25,6 +25,7 @@ from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.display import html_table
+from obsynth.symbolic.taking import takes
 
 PRECISIONS = tuple(REALS)
 """Precisions that a project can be generated for."""
@@ -105,6 +106,7 @@ class CProject:
         return html_table((), self._rows(), f"C project {self.name}")
 
 
+@takes(observer="Observer FaultDetector")
 def generate_c(
     observer: Observer | FaultDetector,
     folder: str | os.PathLike[str],

@@ -5,8 +5,10 @@ from typing import Any
 
 from obsynth.evaluate.run import Run, covered
 from obsynth.evaluate.table import Table
+from obsynth.symbolic.taking import takes
 
 
+@takes(runs="dict")
 def coverage_table(runs: Mapping[str, Sequence[Run]]) -> Table:
     """Tabulate the coverage of all signals for every scenario, design and seed.
 

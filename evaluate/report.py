@@ -19,6 +19,7 @@ from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.svg import constants_html, equations_html, figure_svg, signals_table
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
+from obsynth.symbolic.taking import takes
 
 if TYPE_CHECKING:
     from obsynth.evaluate.data.estimated import Estimate
@@ -38,6 +39,7 @@ class _Section:
         self.parts += [part for part in parts if part]
 
 
+@takes(observer="Observer FaultDetector ExtendedKalman dict")
 def report(
     path: str | os.PathLike[str],
     observer: "Observer | Mapping[str, Observer]",

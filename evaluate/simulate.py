@@ -25,8 +25,10 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Call, Truth, dense
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import takes
 
 
+@takes(model="Plant", observer="Observer FaultDetector ExtendedKalman", scenario="Scenario")
 def simulate(
     model: Plant,
     observer: Observer | FaultDetector,

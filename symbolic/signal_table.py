@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import KINDS, Role, Signal, exact_number, expand_names, make_signals
+from obsynth.symbolic.taking import Symbols
 
 
 class SignalTable:
@@ -68,7 +69,7 @@ class SignalTable:
         """Make signals from the arguments of a declaration and add them."""
         signals = make_signals(role, names, **keywords)
         self.add(signals, taken)
-        return tuple(signal.symbol for signal in signals)
+        return Symbols(signal.symbol for signal in signals)
 
     def declare_faults(
         self, role: Role, names: Any, of: Any, outputs: Mapping[str, str], **keywords: Any

@@ -24,6 +24,7 @@ from obsynth.designs.core.stepping import counter
 from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import check_kind
 
 SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "recovering")
 """Bits of the status at which a sample never counts; at a void one all counters return to 0."""
@@ -116,6 +117,7 @@ class FaultDetector:
     window: int | None = None
 
     def __post_init__(self) -> None:
+        check_kind("FaultDetector", "observer", "Observer", self.observer)
         model, method = self.observer.model, self.observer.method
         names = model.names("f")
         if not names:

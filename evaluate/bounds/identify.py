@@ -17,6 +17,7 @@ from obsynth.evaluate.errors import BoundsError
 from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import takes
 
 MOST_CUTS = 12
 """Times that the intervals are cut at most."""
@@ -90,6 +91,7 @@ class Identified:
         return self.table()._repr_html_()
 
 
+@takes(plant="Plant", record="Record")
 def identify(
     plant: Plant,
     record: Record,

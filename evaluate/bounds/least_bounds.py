@@ -16,6 +16,7 @@ from obsynth.evaluate.errors import BoundsError
 from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import takes
 
 SAFETY = 1.2
 """About beta^(-1/n) for beta = 5 % and 18 windows: see `LeastBounds.validate`."""
@@ -263,6 +264,7 @@ class LeastBounds:
         return self.table()._repr_html_()
 
 
+@takes(plant="Plant", record="Record")
 def least_bounds(
     plant: Plant,
     record: Record,

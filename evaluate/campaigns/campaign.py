@@ -19,6 +19,7 @@ from obsynth.evaluate.run import percent
 from obsynth.evaluate.table import Table
 from obsynth.evaluate.truth import dense
 from obsynth.symbolic import Plant, Scenario
+from obsynth.symbolic.taking import takes
 
 _TOGETHER = 200_000
 """Instants of the runs that are one piece of work."""
@@ -127,6 +128,7 @@ def interval(successes: int, trials: int) -> tuple[float, float]:
     return low, high
 
 
+@takes(designs="Observer FaultDetector dict")
 def campaign(
     designs: Designs,
     scenarios: Scenario | Sequence[Scenario],

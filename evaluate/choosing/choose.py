@@ -18,8 +18,10 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.simulate import simulate
 from obsynth.symbolic import Plant, Record, Scenario
 from obsynth.symbolic.scenarios import gentle
+from obsynth.symbolic.taking import takes
 
 
+@takes(model="Plant", record="Record", scenario="Scenario")
 def choose(
     model: Plant,
     record: Record | None = None,

@@ -17,6 +17,7 @@ from obsynth.evaluate.truth import Call, dense, sample_time
 from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.scenarios import gentle
+from obsynth.symbolic.taking import takes
 
 JITTER = 0.05
 """Share of the sample time by which two instants of a record may be too far from each other."""
@@ -24,6 +25,7 @@ BLOCK = 4096
 """Instants from one memory that is kept to the next."""
 
 
+@takes(observer="Observer FaultDetector ExtendedKalman", record="Record")
 def estimate(
     observer: Observer | FaultDetector,
     record: Any,

@@ -12,6 +12,7 @@ from obsynth.designs.detection.comparison import RECOVERING, VOID
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.layout import BARS, ESTIMATE, INK, SOFT, new_figure, style
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import takes
 
 if TYPE_CHECKING:
     from obsynth.evaluate.run import Run
@@ -98,6 +99,7 @@ def _draw(
 BoolArray = NDArray[np.bool_]
 
 
+@takes(run="Run Estimate")
 def plot_alarms(
     run: Run, alarm: BoolArray | None = None, ax: Any = None, threshold: float = 0.0
 ) -> Any:

@@ -27,6 +27,7 @@ from obsynth.evaluate.plotting.layout import (
 )
 from obsynth.evaluate.trace import Trace
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.taking import takes
 
 if TYPE_CHECKING:
     from obsynth.evaluate.data.estimated import Estimate
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 Window = tuple[float, float]
 
 
+@takes(run="Run Estimate")
 def plot_signal(
     run: "Run | Estimate",
     name: str,
@@ -119,6 +121,7 @@ def plot_signal(
         return np.array(axes)
 
 
+@takes(run="Run Estimate")
 def plot_run(
     run: "Run | Estimate",
     signals: Sequence[str] | None = None,
@@ -156,6 +159,7 @@ def plot_run(
         return flat
 
 
+@takes(runs="Run dict")
 def plot_errors(
     runs: "Run | Mapping[str, Run]",
     signals: Sequence[str] | None = None,

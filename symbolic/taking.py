@@ -1,0 +1,86 @@
+"""Front doors say what they take: arguments of another kind are refused by name."""
+
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from typing import Any, ParamSpec, TypeVar
+
+from obsynth.symbolic.errors import ObsynthError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_MADE = {
+    "Plant": "made by ob.Plant(name) or ob.read_plant(path)",
+    "Observer": "what a method's design(plant) returns",
+    "FaultDetector": "made by ob.FaultDetector(observer)",
+    "Scenario": "made by ob.Scenario(...), or one of ob.scenarios",
+    "Record": "what ob.read_record returns",
+    "Run": "what ob.simulate returns",
+    "Estimate": "what ob.estimate returns",
+    "dict": "by label",
+}
+_SHOWN = {"dict": "mapping"}
+
+
+def takes(**kinds: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Refuse arguments that are of none of the classes named, separated by spaces.
+
+    Classes are told by their names, so that nothing has to be loaded for it; None passes.
+    """
+
+    def decorated(function: Callable[P, T]) -> Callable[P, T]:
+        names = list(signature(function).parameters)
+
+        @wraps(function)
+        def call(*args: P.args, **keywords: P.kwargs) -> T:
+            given: dict[str, Any] = {**dict(zip(names, args, strict=False)), **keywords}
+            for name, known in kinds.items():
+                check_kind(function.__name__, name, known, given.get(name))
+            return function(*args, **keywords)
+
+        return call
+
+    return decorated
+
+
+def check_kind(where: str, name: str, known: str, value: Any) -> None:
+    """Refuse an argument that is of none of the classes named; None passes."""
+    own = {kind.__name__ for kind in type(value).__mro__}
+    if value is None or own & set(known.split()):
+        return
+    shown = [kind for kind in known.split() if kind in _MADE]
+    wanted = " or ".join(f"{_an(_SHOWN.get(kind, kind))} ({_MADE[kind]})" for kind in shown)
+    kind = _an(type(value).__name__)
+    if isinstance(value, list | tuple) and value:
+        kind += f" of {type(value[0]).__name__}"
+    raise ObsynthError(f"{where} takes {name} as {wanted}; it was given {kind}", argument=name)
+
+
+def _an(kind: str) -> str:
+    return f"{'an' if kind[0] in 'AEIOUaeiou' else 'a'} {kind}"
+
+
+class Symbols(tuple[Any, ...]):
+    """The symbols of a declaration, to be taken apart: ``(h,) = plant.states("h")``."""
+
+    __slots__ = ()
+
+    def _refuse(self, *_: Any) -> Any:
+        names = ", ".join(map(str, self))
+        left = f"({names},)" if len(self) == 1 else names
+        raise ObsynthError(
+            f"a tuple of symbols ({names}) stands in an expression: take it apart where it is"
+            f" declared, {left} = plant...(...), or name its entries by index"
+        )
+
+    __neg__ = __pos__ = __abs__ = __sub__ = __rsub__ = __truediv__ = __rtruediv__ = _refuse
+    __pow__ = __rpow__ = __mul__ = __rmul__ = _refuse
+
+    def __add__(self, other: Any) -> Any:
+        """Return both together; a sum is none."""
+        return tuple(self) + tuple(other) if isinstance(other, tuple) else self._refuse()
+
+    def __radd__(self, other: Any) -> Any:
+        """Return a sum, which is none."""
+        return self._refuse()
