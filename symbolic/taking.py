@@ -20,13 +20,15 @@ _MADE = {
     "Estimate": "what ob.estimate returns",
     "dict": "by label",
 }
+_OTHERS = {*_MADE, "Method", "list", "tuple", "str", "int", "float", "ndarray", "DataFrame"}
 _SHOWN = {"dict": "mapping"}
 
 
 def takes(**kinds: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Refuse arguments that are of none of the classes named, separated by spaces.
+    """Refuse arguments of another kind than the classes named, separated by spaces.
 
-    Classes are told by their names, so that nothing has to be loaded for it; None passes.
+    Classes are told by their names, so that nothing has to be loaded for it. What quacks like one
+    of them passes: a plant in place of a run is meant, or a list in place of a mapping.
     """
 
     def decorated(function: Callable[P, T]) -> Callable[P, T]:
@@ -45,9 +47,9 @@ def takes(**kinds: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
 
 def check_kind(where: str, name: str, known: str, value: Any) -> None:
-    """Refuse an argument that is of none of the classes named; None passes."""
+    """Refuse an argument of another kind than the classes named; a stranger's class passes."""
     own = {kind.__name__ for kind in type(value).__mro__}
-    if value is None or own & set(known.split()):
+    if own & set(known.split()) or not own & _OTHERS:
         return
     shown = [kind for kind in known.split() if kind in _MADE]
     wanted = " or ".join(f"{_an(_SHOWN.get(kind, kind))} ({_MADE[kind]})" for kind in shown)
