@@ -25,7 +25,7 @@ BLOCK = 4096
 """Instants from one memory that is kept to the next."""
 
 
-@takes(observer="Observer FaultDetector ExtendedKalman", record="Record")
+@takes(observer="Observer FaultDetector ExtendedKalman")
 def estimate(
     observer: Observer | FaultDetector,
     record: Any,
