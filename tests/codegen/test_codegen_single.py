@@ -14,7 +14,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from obsynth.codegen import CodegenError, ComparisonError, build_and_compare, generate_c
+from obsynth.codegen import (
+    CodegenError,
+    ComparisonError,
+    build_and_compare,
+    generate_c,
+    generate_fmu,
+)
 from obsynth.codegen.kernel import SINGLE
 from obsynth.codegen.single import SingleMachine
 
@@ -159,3 +165,15 @@ def test_the_machine_computes_in_single_precision() -> None:
     rows = np.random.default_rng(0).standard_normal((2, 9))
     lanes = machine(rows)[0]
     np.testing.assert_array_equal(lanes, np.transpose([machine(row)[0] for row in rows.T]))
+
+
+def test_a_unit_without_parameters_builds(
+    make_single: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As rounding outwards makes it of first ranges. Mutant: a number is asked to be below 0u."""
+    monkeypatch.setattr("obsynth.codegen.fmu._FLAGS", ("-O0", "-fPIC", "-fvisibility=hidden"))
+    toy = make_single()
+    toy.memory0 = lambda guess, *more, **options: np.array([0.0, 1.0, 10.0, 0.0, 9.0, 8.0])
+    unit = generate_fmu(toy, tmp_path / "x.fmu", vectors=100)
+    assert unit.comparison is not None
+    assert unit.parameters == ()
