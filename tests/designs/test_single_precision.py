@@ -6,10 +6,11 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+import sympy as sp
 from singles import constants, follow, mean_widths, numpy_step, outside, truth
 
 import obsynth as ob
-from methods import METHODS, observer_of
+from methods import METHODS, observer_of, two_tanks
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import Ends, cut_box
@@ -23,6 +24,16 @@ from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.rounding import settle, shown
 from obsynth.designs.general.step import Limits, build_core, memory_sizes, stages
+from obsynth.designs.set_membership.synthesis import frame
+from obsynth.designs.set_membership.zonotope import (
+    Frame,
+    Real,
+    Strips,
+    Zonotope,
+    corrected,
+    moved,
+    reduced,
+)
 
 LANES, STEPS = 12, 40
 # What single precision may add to the mean half widths, relative to those in doubles.
@@ -86,7 +97,7 @@ def test_the_allowances_are_those_of_the_precision():
 
     Mutants: `rounding_bound` of doubles; the reading taken for a number of single precision.
     """
-    design = observer_of("general_uio").certificate.design
+    design = GeneralUIO().design(two_tanks()).certificate.design
     single = settle(design.changed(options={**design.options, "precision": "single"}))
     _, second, _ = stages(single)
     rng, count = np.random.default_rng(3), 4000
@@ -195,7 +206,7 @@ def test_half_widths_count_what_rounding_adds_to_a_reading():
 
 
 def test_what_single_precision_has_no_room_for_is_refused_by_name():
-    """Mutants: no limit of ranges; no comparison with doubles; no limit of counted calls."""
+    """Mutants: no limit of ranges; none of counted calls; limits of inputs that are not widened."""
     with pytest.raises(ob.ObsynthError, match=r"horizon is 5000000.*4194304.*precision='double'"):
         ob.IntervalObserver(precision="single", horizon=5_000_000)
 
@@ -217,6 +228,75 @@ def test_what_single_precision_has_no_room_for_is_refused_by_name():
     assert float(np.float32(0.1)) == upper > 0.1
     assert any("rounded to IEEE single" in claim for claim in observer.guarantee.claims)
     assert "true ones that are rounded" in str(observer.guarantee)
+
+
+def test_a_design_of_which_rounding_leaves_nothing_is_refused_with_both_half_widths():
+    """A level that moves by 1 about 10^6. Mutant: no comparison with doubles."""
+
+    def level(low):
+        plant = ob.Plant("tank")
+        (h,) = plant.states("h", range=(low, low + 1))
+        (w,) = plant.disturbances("w", bound=0.01)
+        plant.dynamics([h / 2 + sp.Integer(low) / 2 + sp.Rational(1, 4) + w], Ts=1)
+        plant.outputs([h + 3 * w])
+        return plant
+
+    told = r"nothing to say of h: take precision='double'\n  h: \+-4.* \+-0.016 in doubles"
+    with pytest.raises(ob.InfeasibleDesign, match=told):
+        GeneralUIO(precision="single").design(level(10**6))
+    wide = GeneralUIO(precision="single").design(level(1000)).half_widths
+    assert 0.015 < wide[0] < 0.02
+
+
+def test_sets_of_zonotopes_hold_the_real_ones_in_single_precision():
+    """Strips, corrections, images, hulls and reductions. Mutants: steps or factors of doubles."""
+    rng, N, m, M, count = np.random.default_rng(11), 3, 2, 30, 300
+    real = Real("single", M + N + m)
+    shapes = [(N, 1), (N, M), (N, 1), (m, N), (m, 1), (m, 1), (N, m), (N, N), (N, 1)]
+    c, G, s, H, rest, sigma, L, J, offset = symbols = [ca.SX.sym("s", *shape) for shape in shapes]
+    z, used = Zonotope(c, G, s, real), ca.SX.ones(m)
+    strips = Strips.read(z, H, rest, sigma, used)
+    after, image = corrected(z, L, strips, used), moved(z, J, offset, [], s)
+    V = np.linalg.qr(rng.normal(size=(N, N)))[0] @ np.diag([1.0, 3.0, 0.2])
+    held = frame(V)
+    small = reduced(z, M // 2, Frame(held.V, held.W, held.size, held.leak, real))
+    outputs = [strips.innovation, strips.seen, strips.sigma, z.hull.lower, z.hull.upper]
+    for found in (after, image, small):
+        outputs += [found.centre, found.generators, found.slack]
+    function = ca.Function("z", symbols, [ca.vec(ca.densify(part)) for part in outputs])
+    given = [rng.uniform(-1.0, 1.0, (a * b, count)).astype(np.float32) for a, b in shapes]
+    for k, size in ((0, 3.0), (1, 0.2), (2, 1e-6), (5, 0.1)):
+        given[k] = np.float32(size) * (np.abs(given[k]) if k in (2, 5) else given[k])
+    given = [part.astype(float) for part in given]
+    told = numpy_step(function, "single")(*given)
+    directions = rng.normal(size=(N, 20))
+    for k in range(count):
+        c, G, s, H, rest, sigma, L, J, offset = (
+            part[:, k].reshape(shape, order="F") for part, shape in zip(given, shapes, strict=True)
+        )
+        found = [
+            part[:, k].reshape(out.shape, order="F")
+            for part, out in zip(told, outputs, strict=True)
+        ]
+        b, seen, wide, low, high = found[:5]
+        lost = np.abs(rest - H @ c - b) + total(H @ G - seen) + np.abs(H) @ s + sigma
+        assert (lost <= wide).all()
+        reach = total(G) + s
+        assert (low <= c - reach).all() and (c + reach <= high).all()
+        centre, columns, slack = found[5:8]
+        lost = np.abs(c + L @ b - centre) + total(G - L @ seen - columns[:, m:]) + s
+        assert (lost + total(L @ np.diag(wide[:, 0]) - columns[:, :m]) <= slack).all()
+        centre, columns, slack = found[8:11]
+        lost = np.abs(J @ c + offset - centre) + total(J @ G - columns[:, N:]) + np.abs(J) @ s + s
+        assert (lost <= np.diag(columns[:, :N])[:, None]).all() and not slack.any()
+        # supports of the set and of what is put in its place
+        _, columns, slack = found[11:]
+        d = directions.T
+        assert (total(d @ G) + np.abs(d) @ s <= total(d @ columns) + np.abs(d) @ slack).all()
+
+
+def total(matrix):
+    return np.abs(matrix).sum(axis=1, keepdims=True)
 
 
 @pytest.mark.long
