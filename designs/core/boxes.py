@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.rigour import Interval, outward
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.symbolic.arrays import FloatArray
 
 _NUMBER = 2.0**120

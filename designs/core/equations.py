@@ -9,7 +9,8 @@ import numpy as np
 
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.designs.core.boxes import Ends, cut_box
-from obsynth.designs.core.lifted import FAR, Lifted, Rounding, clamped, combine, lift
+from obsynth.designs.core.lifted import Lifted, Rounding, clamped, combine, lift
+from obsynth.designs.core.limits import FAR
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 

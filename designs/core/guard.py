@@ -35,7 +35,7 @@ from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.record import Precision, precision_of
 from obsynth.designs.core.stepping import slices
 from obsynth.designs.core.sweeps import Sweeps

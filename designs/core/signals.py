@@ -8,7 +8,7 @@ import numpy as np
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Claim
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import column, every, select
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
 from obsynth.symbolic.arrays import FloatArray
 

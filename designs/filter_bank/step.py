@@ -11,7 +11,7 @@ from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends, column, every, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray

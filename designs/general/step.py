@@ -11,7 +11,7 @@ from obsynth.designs.core.boxes import Ends, column, every
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.running import (
     ROUND_UP,
     SETTLED,

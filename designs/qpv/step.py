@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.boxes import Ends, cut_box, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices

@@ -20,7 +20,7 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.guard import Watch
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.general import step as general
 from obsynth.designs.general.record import GeneralDesign

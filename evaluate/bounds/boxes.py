@@ -6,7 +6,8 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.backward import contract
-from obsynth.designs.core.lifted import FAR, Lifted, Rounding, lift
+from obsynth.designs.core.lifted import Lifted, Rounding, lift
+from obsynth.designs.core.limits import FAR
 from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.truth import Call, dense
 from obsynth.symbolic.arrays import FloatArray

@@ -5,7 +5,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.lifted import LIMITS
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.stepping import clip, make_step
 from obsynth.evaluate.truth import parameters
 from obsynth.symbolic import Plant

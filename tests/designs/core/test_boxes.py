@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from obsynth.designs.core.boxes import Ends
-from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.limits import FAR
 
 NAN, INF = np.nan, np.inf
 

@@ -12,7 +12,7 @@ import obsynth as ob
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.core import Core, Known
 from obsynth.designs.core.guard import YOUNG, Guard, Watch
-from obsynth.designs.core.lifted import FAR
+from obsynth.designs.core.limits import FAR
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import all_finite, clip, extended, fill, largest_level
 
