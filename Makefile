@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-long mutants firmware notebook docs lint format lock benchmarks clean
+.PHONY: help run test test-long mutants firmware prove prove-long notebook docs lint format lock benchmarks clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,6 +35,14 @@ mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print 
 firmware: $(VENV)/.installed ## the C of every method on emulated Cortex-M3, M4F and M7
 	sh tools/firmware/install.sh
 	$(BIN)/python tools/firmware --workers $(WORKERS)
+
+prove: $(VENV)/.installed ## prove and search the C of every method: Eva, MISRA, compilers, libFuzzer
+	sh tools/prove/install.sh
+	$(BIN)/python tools/prove --workers $(WORKERS)
+
+prove-long: $(VENV)/.installed ## the same with the fuzzer on everything, for a minute each
+	sh tools/prove/install.sh
+	$(BIN)/python tools/prove --workers $(WORKERS) --long --fuzz 60
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
