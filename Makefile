@@ -57,7 +57,7 @@ notebook: $(VENV)/.installed ## open JupyterLab on the notebooks
 	$(BIN)/jupyter lab notebooks
 
 docs: $(VENV)/.installed ## build the documentation as a site, into site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 benchmarks: $(VENV)/.installed ## measure against peers, tables on the terminal
 	for script in benchmarks/[a-z]*.py; do $(BIN)/python $$script || exit 1; done

@@ -67,10 +67,10 @@ def test_examples_of_a_page_run(page, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory):
-    """Build the site once; warnings are errors."""
+    """Build the site once; warnings are errors, which ``--quiet`` would hide from ``--strict``."""
     pytest.importorskip("mkdocs")
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)]
     told = subprocess.run(
         command,
         cwd=ROOT,
@@ -84,8 +84,8 @@ def site(tmp_path_factory):
 
 @pytest.mark.long
 def test_the_site_needs_no_other_host_and_every_formula_is_known(site):
-    """Mutants: a link to a page that is not there (the fixture); ``font: false`` left out; a
-    formula left with ``{aligned}``, which the converter does not know and shows as it stands."""
+    """Mutants: a link to a page or heading that is not there (the fixture); ``font: false`` left
+    out; a formula left with ``{aligned}``, which the converter does not know and shows as it stands."""
     pages = {page: page.read_text() for page in site.rglob("*.html")}
     assert len(pages) > 20
     for page, text in pages.items():
