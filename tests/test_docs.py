@@ -85,7 +85,7 @@ def site(tmp_path_factory):
 @pytest.mark.long
 def test_the_site_needs_no_other_host_and_every_formula_is_known(site):
     """Mutants: a link to a page or heading that is not there (the fixture); ``font: false`` left
-    out; a formula left with ``{aligned}``, which the converter does not know and shows as it stands."""
+    out; a formula left with ``{aligned}``, which the converter does not know and shows."""
     pages = {page: page.read_text() for page in site.rglob("*.html")}
     assert len(pages) > 20
     for page, text in pages.items():
