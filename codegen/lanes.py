@@ -14,6 +14,8 @@ from obsynth.codegen.tape import read_tape
 _FIRST = 64
 """Lanes on which a change is followed before it is followed on all."""
 
+_NEAR = 0.01
+
 Operation = tuple[str, tuple[int | float, ...]]
 """What is computed in place of a value: its name, operands by their places (int) or numbers."""
 
@@ -22,6 +24,26 @@ def differ(a: Any, b: Any) -> Any:
     """Return where arrays differ in a bit, any NaN being like any other."""
     unlike = (a != b) & ((a == a) | (b == b))
     return unlike | ((a == 0) & (b == 0) & (np.signbit(a) != np.signbit(b)))
+
+
+def _passed(name: str, operands: list[Any]) -> list[Any]:
+    """Return for operands (lanes,) where a small change of them changes what is made of them."""
+    first, *others = operands
+    if name == "choose":
+        return [differ(*others), first != 0, first == 0]
+    if name == "if_else_zero":
+        return [others[0] != 0, first != 0]
+    if name in {"fmax", "fmin"}:
+        taken = (others[0] <= first) if name == "fmax" else (first <= others[0])
+        return [taken, ~taken]
+    if name in {"mul", "and"}:
+        return [others[0] != 0, first != 0]
+    if name == "or":
+        return [others[0] == 0, first == 0]
+    if name in {"lt", "le", "eq", "ne"}:
+        near = np.abs(first - others[0]) <= _NEAR * np.maximum(np.abs(first), np.abs(others[0]))
+        return [near, near]
+    return [np.True_ for _ in operands]
 
 
 class Lanes:
@@ -76,6 +98,25 @@ class Lanes:
                     entered.add(place)
                     waiting.append(place)
         return sorted(entered)
+
+    def matter(self, found: Sequence[Any]) -> list[Any]:
+        """Return (lanes,) for all values, whether a small change of each reaches a result.
+
+        Of a choice the branch that is taken, and the test where the branches differ; of a
+        comparison what is near to its limit.
+        """
+        lanes = found[0].shape
+        told: list[Any] = [np.zeros(lanes, bool) for _ in self.values]
+        for k in self._told:
+            told[k] |= True
+        with np.errstate(all="ignore"):
+            for k in range(len(self.values) - 1, -1, -1):
+                places, seen = self.places[k], told[k]
+                if places and seen.any():
+                    passed = _passed(self.values[k].name, [found[p] for p in places])
+                    for place, through in zip(places, passed, strict=True):
+                        told[place] |= seen & through
+        return told
 
     def instead(self, found: Sequence[Any], change: Operation) -> Any:
         """Return (lanes,) what another operation makes of values that were found."""

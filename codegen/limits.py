@@ -61,12 +61,17 @@ class Limits:
         }
         self.several = {k: depends[k] for k in compared if depends[k].bit_count() > 1}
 
-    def turns(self, ports: Sequence[Any]) -> Any:
-        """Return (lanes, comparisons) what the comparisons of steps (n_i, lanes) say."""
+    def met(self, ports: Sequence[Any]) -> Any:
+        """Return (lanes, features) which answers and values of steps (n_i, lanes) matter."""
         told = []
         for start in range(0, ports[0].shape[1], _LANES):
             found = self.lanes.run([port[:, start : start + _LANES] for port in ports])
-            told.append([self._answers(found, k) != 0 for k in (*self.single, *self.several)])
+            matter = self.lanes.matter(found)
+            rows = list(matter)
+            for k in (*self.single, *self.several):
+                answer = self._answers(found, k) != 0
+                rows += [matter[k] & answer, matter[k] & ~answer]
+            told.append(rows)
         return np.concatenate(told, axis=1).T
 
     def _answers(self, found: Sequence[Any], k: int) -> Any:

@@ -1,18 +1,28 @@
 """How many wrong steps the vectors tell from the right one: the mutant score.
 
+    python -m obsynth.codegen.mutants design.json
+
 A mutant is one value of the tape's C computed otherwise: a constant by a unit in its last place,
 by 1 % or with the other sign, another comparison or operator, the branches of a choice exchanged.
-It is caught if a result or a memory of any recorded step differs. One that no step of many times
-as many others tells from the right one changes nothing that matters and does not count.
+It is caught if a result or a memory of any recorded step differs. One that no step of three times
+as many others tells from the right one counts as equivalent: it changes nothing that was found.
 """
 
+import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from obsynth.codegen.description import describe
 from obsynth.codegen.lanes import Lanes, Operation
+from obsynth.codegen.vectors import COUNT, as_ports, record
+from obsynth.designs.core.loading import load
+from obsynth.designs.core.observer import Observer
+from obsynth.designs.detection.detector import FaultDetector
 
 _EXCHANGED = (
     ("lt", "le", "eq", "ne"),
@@ -22,8 +32,8 @@ _EXCHANGED = (
     ("sq", "twice"),
 )
 _COMPARED = _EXCHANGED[0]
-LANES = 2000
-"""Steps that are evaluated at a time."""
+_LANES = 2000
+_MORE = 3
 
 
 @dataclass(frozen=True)
@@ -63,7 +73,8 @@ def mutants(lanes: Lanes) -> Iterator[Mutant]:
 def _numbers(lanes: Lanes, number: float) -> Iterator[tuple[str, float]]:
     real = lanes.real.type
     for end in (-np.inf, np.inf):
-        yield "one ulp", float(np.nextafter(real(number), real(end)))
+        with np.errstate(over="ignore"):
+            yield "one ulp", float(np.nextafter(real(number), real(end)))
     if number:
         yield "one per cent", float(real(number * 1.01))
         yield "sign", -number
@@ -84,9 +95,67 @@ def sample(lanes: Lanes, each: int, rng: np.random.Generator) -> list[Mutant]:
 def caught(lanes: Lanes, tried: list[Mutant], ports: list[Any]) -> list[bool]:
     """Return which mutants steps with these inputs (n, steps) tell from the right one."""
     told = [False] * len(tried)
-    for start in range(0, ports[0].shape[1], LANES):
-        found = lanes.run([port[:, start : start + LANES] for port in ports])
+    for start in range(0, ports[0].shape[1], _LANES):
+        found = lanes.run([port[:, start : start + _LANES] for port in ports])
         for j, mutant in enumerate(tried):
             if not told[j]:
                 told[j] = lanes.seen(found, mutant.k, lanes.instead(found, mutant.change))
     return told
+
+
+@dataclass(frozen=True)
+class Score:
+    """What became of mutants.
+
+    caught: by the vectors
+    missed: by the vectors, and told from the right step by others
+    equivalent: told from the right step by none
+    """
+
+    name: str
+    caught: tuple[Mutant, ...]
+    missed: tuple[Mutant, ...]
+    equivalent: tuple[Mutant, ...]
+
+    @property
+    def share(self) -> float:
+        """Share of those caught among those that are not equivalent."""
+        return len(self.caught) / max(len(self.caught) + len(self.missed), 1)
+
+    def __str__(self) -> str:
+        missed = Counter(mutant.kind for mutant in self.missed)
+        kinds = ", ".join(f"{times} of {kind}" for kind, times in sorted(missed.items()))
+        apart = len(self.caught) + len(self.missed)
+        return (
+            f"{self.name}: {len(self.caught)} of {apart} mutants caught"
+            f" ({100 * self.share:.1f} %){f', missed {kinds}' if kinds else ''};"
+            f" {len(self.equivalent)} more change nothing that was found"
+        )
+
+
+def score(
+    observer: Observer | FaultDetector, count: int = COUNT, each: int = 60, seed: int = 0
+) -> Score:
+    """Plant mutants, at most so many of each kind, and compare them on the vectors of a step."""
+    description = describe(observer)
+    lanes = Lanes(observer.step, description.real)
+
+    def seen(tried: list[Mutant], count: int, seed: int) -> list[bool]:
+        steps = record(description, count, seed)[0].steps
+        return caught(lanes, tried, as_ports(description, [(s.before, s.inputs) for s in steps]))
+
+    tried = sample(lanes, each, np.random.default_rng(seed))
+    told = seen(tried, count, seed)
+    left = [mutant for mutant, found in zip(tried, told, strict=True) if not found]
+    apart = seen(left, _MORE * count, seed + 1) if left else []
+    return Score(
+        f"{observer.method} of {observer.model.name}",
+        tuple(mutant for mutant, found in zip(tried, told, strict=True) if found),
+        tuple(mutant for mutant, found in zip(left, apart, strict=True) if found),
+        tuple(mutant for mutant, found in zip(left, apart, strict=True) if not found),
+    )
+
+
+if __name__ == "__main__":
+    for path in sys.argv[1:]:
+        print(score(load(Path(path))))

@@ -25,11 +25,11 @@ COUNT = 3000
 """How many there are by default: files stay below a megabyte."""
 
 SHARES: Mapping[str, float] = {
-    "closed loop": 0.32,
+    "closed loop": 0.31,
     "closed loop with failing signals": 0.08,
     "limits": 0.38,
-    "random": 0.14,
-    "extreme": 0.06,
+    "random": 0.13,
+    "extreme": 0.08,
     "not initialised": 0.02,
 }
 """Share of every kind of vectors; what limits do not need goes to the closed loop."""
@@ -38,6 +38,7 @@ _SEQUENCE = 120
 _STRETCH = 10
 _BASES = 8
 _EACH = 6
+_TRIED = 6
 _VALUES = 2_000_000
 _EXTREMES: Mapping[str, FloatArray] = {
     real.precision: np.array(
@@ -83,29 +84,33 @@ def record(
     sound, failing = (_driven(description, machine, drive, kinds, kind) for kind in list(kinds)[:2])
     healthy = [step for step in sound if step.status == 0] or sound
     bases = [steps[i] for steps in (healthy, failing) for i in rng.permutation(len(steps))[:_BASES]]
+    bases += [sound[0]] * (_BASES // 4)  # where everything begins
     limits = Limits(Lanes(description.observer.step, description.real))
     alone = limits.alone()
     rng.shuffle(alone)
     alone = alone[: kinds["limits"]]
-    ports = _ports(description, [(base.before, base.inputs) for base in bases])
+    ports = as_ports(description, [(base.before, base.inputs) for base in bases])
     pairs = min(2 * (kinds["limits"] - len(alone)) // 3, _VALUES // len(limits.lanes.values))
     around = limits.around([port[:, :_BASES] for port in ports], pairs, rng)
-    kinds["limits"] = min(kinds["limits"], len(alone) + len(around))
+    left = max(kinds["limits"] - len(alone) - len(around), 0)
+    kinds["limits"] -= left
+    # where nearly all is healthy, what limits do not need goes to random steps, too
+    kinds["random"] += int(left * max(len(healthy) / len(sound) - 0.4, 0.0))
     tried = _beside(description, bases, [*alone, *around])
     tried += _changed(description, drive, bases, _scale([step.before for step in sound]), kinds)
-    turns = limits.turns(_ports(description, [(c.memory, np.concatenate(c.inputs)) for c in tried]))
+    met = limits.met(as_ports(description, [(c.memory, np.concatenate(c.inputs)) for c in tried]))
     most = sum(kinds[kind] for kind in ("limits", "random", "extreme"))
     # both sides of one limit of every comparison, where there is room for them
-    first = len(alone) + min(len(around), 3 * (kinds["limits"] - len(alone)) // 8 * 2)
-    chosen = [tried[i] for i in _rare(turns, range(first), most, rng)]
+    first = len(alone) + min(len(around), (kinds["limits"] - len(alone)) // 4 * 2)
+    chosen = [tried[i] for i in _rare(met, range(first), most, rng)]
     kinds |= {kind: sum(c.kind == kind for c in chosen) for kind in ("limits", "random", "extreme")}
     kinds["closed loop"] += count - sum(kinds.values())
 
     recorder = Recorder(description, machine)
     recorder.default()
     for steps, kind in ((sound, "closed loop"), (failing, "closed loop with failing signals")):
-        turns = limits.turns(_ports(description, [(step.before, step.inputs) for step in steps]))
-        rare = _rare(turns, [0], kinds[kind] // _STRETCH // 4, rng)
+        met = limits.met(as_ports(description, [(step.before, step.inputs) for step in steps]))
+        rare = _rare(met, [0], kinds[kind] // _STRETCH // 3, rng)
         for step in _stretches(steps, kinds[kind], rare, rng):
             _repeat(recorder, step.before, description.split(step.inputs))
     # memories that have much in common behind one another: what they have is stored once
@@ -128,7 +133,7 @@ class _Case:
     inputs: list[FloatArray]
 
 
-def _ports(
+def as_ports(
     description: Description, steps: list[tuple[FloatArray, FloatArray]]
 ) -> list[FloatArray]:
     """Return memories and inputs (n_i, steps), as `Lanes` takes them."""
@@ -186,21 +191,20 @@ def _stretches(
 
 
 def _rare(
-    turns: NDArray[np.bool_], start: Iterable[int], most: int, rng: np.random.Generator
+    met: NDArray[np.bool_], start: Iterable[int], most: int, rng: np.random.Generator
 ) -> list[int]:
-    """Return the first steps and others: of every answer of every comparison some, rare ones first.
+    """Return the first steps and others: of every feature some, rare ones first.
 
-    Shapes: turns (steps, comparisons).
+    Shapes: met (steps, features).
     """
-    both = np.hstack([turns, ~turns])
     chosen = dict.fromkeys(start)
-    met = both[list(chosen)].sum(axis=0)
-    for c in np.argsort(both.sum(axis=0), kind="stable").tolist():
-        for i in rng.permutation(np.flatnonzero(both[:, c])).tolist() if met[c] < _EACH else ():
-            if i not in chosen and met[c] < _EACH and len(chosen) < most:
+    times = met[list(chosen)].sum(axis=0)
+    for c in np.argsort(met.sum(axis=0), kind="stable").tolist():
+        for i in rng.permutation(np.flatnonzero(met[:, c])).tolist() if times[c] < _EACH else ():
+            if i not in chosen and times[c] < _EACH and len(chosen) < most:
                 chosen[i] = None
-                met += both[i]
-    others = [i for i in rng.permutation(len(both)).tolist() if i not in chosen]
+                times += met[i]
+    others = [i for i in rng.permutation(len(met)).tolist() if i not in chosen]
     return sorted([*chosen, *others[: max(most - len(chosen), 0)]])
 
 
@@ -222,10 +226,10 @@ def _changed(
     scale: FloatArray,
     kinds: Mapping[str, int],
 ) -> list[_Case]:
-    """Return three times as many steps as are needed with random, extreme or no finite numbers."""
+    """Return more steps than are needed with random, extreme or no finite numbers."""
     found, rng = [], drive.rng
     for kind in ("random", "extreme"):
-        for i in range(3 * kinds[kind]):
+        for i in range(_TRIED * kinds[kind]):
             of = i % len(bases)
             memory, inputs = bases[of].before.astype(float), description.split(bases[of].inputs)
             if i % 4 < 2:
