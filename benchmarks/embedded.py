@@ -11,10 +11,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import casadi as ca
 import numpy as np
@@ -22,12 +20,14 @@ import sympy as sp
 
 import obsynth as ob
 from obsynth.codegen.casadi_text import generate_kernel
-from obsynth.codegen.kernel import DOUBLE, RESULTS, Kernel, Real
+from obsynth.codegen.kernel import DOUBLE, REALS, RESULTS, Kernel, Real
 from obsynth.codegen.single import machine_of
 from obsynth.codegen.tape import write_tape
-from obsynth.designs.core import running as widths
+from obsynth.derive.rigour import inward
 from obsynth.designs.core.core import Seen
+from obsynth.designs.core.lifted import Rounding
 from obsynth.designs.core.observer import STEP_OUTPUTS
+from obsynth.designs.core.running import ROUND_UP, ULPS
 from obsynth.designs.general.step import Limits, build_core, memory_sizes, running
 from obsynth.evaluate import Table
 
@@ -56,27 +56,13 @@ OUTPUTS = ("xhat", "fhat", "x_lower", "f_lower", "x_upper", "f_upper")
 """Results of the core in the order of by_hand/core.h."""
 
 
-@dataclass(frozen=True)
-class Loose(Real):
-    """Numbers that are too small for the type are zero: the core is not proved in it."""
-
-    def rounded(self, value: float) -> float:
-        """Return the nearest number of the type."""
-        return float(self.type(value))
-
-
-REALS = {"double": DOUBLE, "single": Loose("single", "float", 32, "f", np.float32)}
-OUTWARD = {"double": 2.0**-50, "single": 2.0**-21}
-"""What stands for `ROUND_UP - 1` and `ULPS`."""
-
-
-def four_tanks() -> ob.Observer:
+def four_tanks(precision: Any) -> ob.Observer:
     """Design the observer with peak bounds."""
     plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)
-    return ob.BoundedErrorUIO(bounds="peak").design(plant)
+    return ob.BoundedErrorUIO(bounds="peak", precision=precision).design(plant)
 
 
-def core_of(observer: ob.Observer, precision: str = "double") -> ca.Function:
+def core_of(observer: ob.Observer) -> ca.Function:
     """Return the core's own step, all readings used, with inputs and outputs of a step."""
     design: Any = observer.certificate.design
     sizes = memory_sizes(design)
@@ -84,9 +70,7 @@ def core_of(observer: ob.Observer, precision: str = "double") -> ca.Function:
     u, y = (ca.SX.sym(name, observer.step.numel_in(name)) for name in "uy")
     parts = ca.vertsplit(memory, np.cumsum([0, *sizes.values()]).tolist())
     given = dict(zip(sizes, parts, strict=True))
-    up = OUTWARD[precision]
-    with patch.multiple(widths, ROUND_UP=1.0 + up, ULPS=up):
-        known = build_core(design).run(Seen(given, u, ca.SX(0, 1), y, [ca.SX(1)] * y.numel()))
+    known = build_core(design).run(Seen(given, u, ca.SX(0, 1), y, [ca.SX(1)] * y.numel()))
     assert known.x is not None
     assert known.f is not None
     outputs = [ca.vertcat(*(known.moved[name] for name in sizes)), known.xhat, known.fhat]
@@ -96,15 +80,15 @@ def core_of(observer: ob.Observer, precision: str = "double") -> ca.Function:
     return ca.Function("core", [memory, u, y], together, ["memory", "u", "y"], [*RESULTS[:8]])
 
 
-def numbers(observer: ob.Observer, precision: str = "double") -> str:
+def numbers(observer: ob.Observer) -> str:
     """Return the numbers of `by_hand/core.c` as a header."""
     design: Any = observer.certificate.design
-    dtype, suffix = (np.float64, "") if precision == "double" else (np.float32, "F")
+    real, precision = REALS[observer.precision], observer.precision
 
     def text(value: Any) -> str:
         if isinstance(value, (Sequence, np.ndarray)):
             return "{" + ", ".join(text(entry) for entry in value) + "}"
-        return np.format_float_scientific(dtype(value), unique=True, trim="0") + suffix
+        return np.format_float_scientific(real.type(value), unique=True, trim="0") + real.suffix
 
     def array(name: str, value: Any) -> str:
         size = "".join(f"[{n}]" for n in np.shape(value))
@@ -113,7 +97,7 @@ def numbers(observer: ob.Observer, precision: str = "double") -> str:
     # what the third reading corrects is nothing, and K is zero
     assert not design.Z[:, 2].any()
     assert not design.K.any()
-    limits, (bound,) = Limits.of(design.extended.plant), running(design)
+    limits, (bound,) = Limits.of(design.extended.plant, precision), running(design)
     value = {sp.Symbol(s.name): s.value for s in design.plant.constants}
     a, A = sp.symbols("a1:5"), sp.symbols("A1:5")
     outflow = [sp.sqrt(2 * sp.Symbol("g")) * a[i] / A[i] for i in range(4)]
@@ -123,27 +107,27 @@ def numbers(observer: ob.Observer, precision: str = "double") -> str:
         "PUMP2_H2": g2 * k2 / A[1],
         "PUMP1_H4": (1 - g1) * k1 / A[3],
     }
-    middle, up = design.middle, OUTWARD[precision]
+    middle = design.middle
     scalars = {
         **{name: float(sp.N(row.subs(value), 40)) for name, row in pumps.items()},
         "SLOPE_13": middle[0, 2],
         "SLOPE_24": middle[1, 3],
-        "ROUND_UP": 1.0 + up,
-        "ULPS": up,
+        "ROUND_UP": ROUND_UP,
+        "ULPS": ULPS * Rounding(precision).step / Rounding().step,
         "ZERO": 0.0,
     }
     arrays = {
-        "LIMITS": limits.x,
-        "U_LIMITS": limits.u,
-        "BOX": design.plant.box("x"),
+        "LIMITS": inward(limits.x, precision),
+        "U_LIMITS": inward(limits.u, precision),
+        "BOX": inward(design.plant.box("x"), precision),
         "Z": design.Z[:, :2],
-        "REACH": bound.reach,
-        "ADD": bound.add,
-        "DECAY": bound.decay,
+        "REACH": bound.reach * bound.more,
+        "ADD": bound.add * bound.more,
+        "DECAY": bound.decay * bound.more,
         "OUTFLOW": [float(sp.N(row.subs(value), 40)) for row in outflow],
         "SLOPE": middle.diagonal()[:4],
     }
-    mathematics = [f"#define {name.upper()} {name}{suffix.lower()}" for name in ("fabs", "sqrt")]
+    mathematics = [f"#define {name.upper()} {name}{real.suffix}" for name in ("fabs", "sqrt")]
     lines = ["#include <math.h>", *mathematics]
     lines += [f"#define {name} {text(number)}" for name, number in scalars.items()]
     return "\n".join(lines + [array(name, values) for name, values in arrays.items()]) + "\n"
@@ -229,7 +213,7 @@ def by_hand(observer: ob.Observer, folder: Path, real: Real) -> None:
     """Write the step by hand with its numbers, under the names of the others."""
     single = "#define SINGLE\n" if real.precision == "single" else ""
     types = "typedef real by_hand_real_t;\ntypedef by_hand_memory_t by_hand_state_t;\n"
-    (folder / "numbers.h").write_text(numbers(observer, real.precision))
+    (folder / "numbers.h").write_text(numbers(observer))
     (folder / "by_hand.h").write_text(f'{single}#include "core.h"\n{types}')
     (folder / "by_hand.c").write_text(f'{single}#include "core.c"\n')
 
@@ -258,52 +242,46 @@ def row(
     return here, *(one.instructions for one in ran), differ
 
 
-def cores(observer: ob.Observer) -> Iterator[tuple[str, str, Told]]:
-    """Measure the core, written in every way, in both precisions."""
-    for precision, real in REALS.items():
-        core = core_of(observer, precision)
-        with patch("obsynth.codegen.single.SINGLE", real):
-            machine = machine_of(core, real)
-        records = records_of(observer, core).astype(real.type)
-        made = results_of(core, records, machine).astype(real.type)
-        for name in WRITERS:
-            if name == "casadi" and real is not DOUBLE:
-                continue
-            with tempfile.TemporaryDirectory() as place:
-                folder = Path(place)
-                if name == "by_hand":
-                    by_hand(observer, folder, real)
-                else:
-                    (folder / f"{name}.h").write_text(header(core, name, real))
-                    (folder / f"{name}.c").write_text(step_text(core, name, real))
-                told = row(name, folder / f"{name}.c", [folder, HAND], records, made)
-            yield precision, WRITERS[name], told
+def cores(observer: ob.Observer, real: Real) -> Iterator[tuple[str, str, Told]]:
+    """Measure the core, written in every way."""
+    core = core_of(observer)
+    records = records_of(observer, core).astype(real.type)
+    made = results_of(core, records, machine_of(core, real)).astype(real.type)
+    for name in WRITERS:
+        if name == "casadi" and real is not DOUBLE:
+            continue
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            if name == "by_hand":
+                by_hand(observer, folder, real)
+            else:
+                (folder / f"{name}.h").write_text(header(core, name, real))
+                (folder / f"{name}.c").write_text(step_text(core, name, real))
+            told = row(name, folder / f"{name}.c", [folder, HAND], records, made)
+        yield real.precision, WRITERS[name], told
 
 
-def whole(observer: ob.Observer) -> Iterator[tuple[str, str, Told]]:
+def whole(observer: ob.Observer, real: Real) -> Iterator[tuple[str, str, Told]]:
     """Measure the whole step, contractor and guard included."""
     records, made = recorded(observer)
-    for backend in ("tape", "casadi"):
+    for backend in ("tape", "casadi") if real is DOUBLE else ("tape",):
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / "project"
             name = ob.generate_c(observer, folder, backend=backend, vectors=100).name
             source, include = folder / "src" / f"{name}.c", [folder / "include"]
-            yield (
-                "double",
-                f"whole step, {WRITERS[backend]}",
-                row(name, source, include, records, made),
-            )
+            told = row(name, source, include, records, made)
+        yield real.precision, f"whole step, {WRITERS[backend]}", told
 
 
 def main() -> int:
     """Print the table; return 1 where a result differs or a ratio is missed."""
     subprocess.run(["sh", str(FIRMWARE / "install.sh")], check=True)
-    observer = four_tanks()
     print(f"{compiler()}; {emulator()}; -std=c99 -O2")
-    rows = [
-        [precision, name, f"{told[0]:.1f}", *map(round, told[1:])]
-        for precision, name, told in (*cores(observer), *whole(observer))
-    ]
+    rows = []
+    for real in REALS.values():
+        observer = four_tanks(real.precision)
+        for precision, name, told in (*cores(observer, real), *whole(observer, real)):
+            rows.append([precision, name, f"{told[0]:.1f}", *map(round, told[1:])])
     heads = ["", "four tanks, peak", "x86 ns", *(f"{core} instr." for core in CORES), "differ"]
     print(Table(f"One step; which of {RECORDS} records differ from CasADi's machine", heads, rows))
     missed = sum(line[-1] > 0 for line in rows)
