@@ -177,3 +177,15 @@ def test_a_unit_without_parameters_builds(
     unit = generate_fmu(toy, tmp_path / "x.fmu", vectors=100)
     assert unit.comparison is not None
     assert unit.parameters == ()
+
+
+def test_the_machine_where_there_is_no_number_no_form_and_one_lane_among_many() -> None:
+    """Mutants: a remainder of infinity; erf looked for; as many lanes as the fewest."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    machine = SingleMachine(ca.Function("f", [x, y], [ca.remainder(x, y)]))
+    assert np.isnan(machine(np.array([np.inf]), np.array([2.0]))[0][0])
+    assert np.isnan(machine(np.array([1.0]), np.array([0.0]))[0][0])
+    lanes = machine(np.array([[5.0, 6.5]]), np.array([2.0]))[0]
+    assert lanes.tolist() == [[1.0, 0.5]]
+    with pytest.raises(CodegenError, match="no form of 'erf'"):
+        SingleMachine(ca.Function("f", [x], [ca.erf(x)]))(np.ones(1))
