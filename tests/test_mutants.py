@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOOL = ROOT / "tools" / "mutants.py"
 sys.path.insert(0, str(TOOL.parent))
 
+import pytest
 from mutants import Job  # noqa: E402
 from mutation import changes, pick  # noqa: E402
 
@@ -148,6 +149,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long
 def test_mistakes_are_planted_caught_and_told(tmp_path):
     """A flipped sign, a change of nothing, and one with a reason."""
     (tmp_path / "list.toml").write_text(QUICK)

@@ -377,7 +377,8 @@ class Method:
 
     def settling(self, seconds: float, Ts: float) -> Mapping[str, Any]:
         """Return the options with a default horizon of so many seconds."""
-        calls = min(math.ceil(seconds / Ts), MOST_CALLS) if self.horizon is None else self.horizon
+        most = MOST_CALLS if self.precision == "double" else MOST_COUNTED
+        calls = min(math.ceil(seconds / Ts), most) if self.horizon is None else self.horizon
         return {**self.options(), "horizon": calls}
 
     def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:

@@ -463,6 +463,8 @@ def test_a_detector_stands_on_it_or_says_why_not(entry, name, observer):
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_its_c_is_equal_to_the_last_bit(observer, tmp_path):
-    project = ob.generate_c(observer, tmp_path / "project", vectors=300)
+    # of long steps the tape's C, which compiles in half the time, has the same bits
+    writer = "tape" if observer.step.n_instructions() > 5_000 else "casadi"
+    project = ob.generate_c(observer, tmp_path / "project", backend=writer, vectors=300)
     assert project.comparison is not None
     assert project.comparison.vectors == 300

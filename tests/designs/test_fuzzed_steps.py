@@ -172,7 +172,13 @@ def fuzz(name, steps, seed):
     return counts
 
 
-@pytest.mark.parametrize("name", METHODS)
+LARGE = {"set_membership", "set_adaptive_observer", "filter_bank", "bounded_error_uio"}
+"""Steps that take long to compile."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] if n in LARGE else []) for n in METHODS]
+)
 def test_no_measurement_spoils_a_bound(name):
     """Mutant: `finite_or` that hands on what it was given."""
     assert STEP_OUTPUTS[1:7] == ("xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper")

@@ -104,6 +104,7 @@ def test_a_coefficient_that_varies_is_refused_at_once(watched):
     assert len(str(told.value)) < 1000
 
 
+@pytest.mark.long
 def test_forms_with_long_quotients_end(watched):
     """Mutant: `simplify` up to 600 operations (a quarter of a minute for the second row)."""
     plant = Plant("long quotients")

@@ -66,6 +66,7 @@ def test_a_delay_of_the_bounds_that_is_forgotten_shows(interval):
     assert ob.FaultDetector(interval).detect(replace(run, fault_delay=1)).lingering == {"f": 0}
 
 
+@pytest.mark.long
 def test_interval_detector_in_c(interval, tmp_path):
     project = ob.generate_c(ob.FaultDetector(interval, 2, window=4), tmp_path / "p", vectors=2000)
     assert project.statuses[0] > 500

@@ -527,7 +527,11 @@ def test_a_rate_is_an_assumption_where_it_cuts():
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(
-    "options", [{}, pytest.param({"bound": "paper", "precision": "single"}, marks=pytest.mark.long)]
+    "options",
+    [
+        pytest.param(options, marks=pytest.mark.long)
+        for options in ({}, {"bound": "paper", "precision": "single"})
+    ],
 )
 def test_the_c_code_is_the_step(options, example, tmp_path):
     observer = ob.IntervalObserver(gains=(np.diag([1.0, -1]), [0.4, -1]), **options).design(example)

@@ -115,6 +115,7 @@ def test_the_second_phase_states_the_vertices_of_the_first_at_once(monkeypatch):
     assert np.array_equal(second[0], first[-1])
 
 
+@pytest.mark.long
 def test_what_the_solver_cannot_reach_is_told():
     problem, _, _ = design()
     with pytest.raises(SolverTrouble, match="wider margin") as caught:

@@ -79,7 +79,7 @@ def test_smallest_mu_of_the_corrected_conditions(name, mu, designed):
 @pytest.mark.parametrize(
     ("Cz", "gamma"),
     [
-        (np.eye(6)[[5]], 0.0030294),
+        pytest.param(np.eye(6)[[5]], 0.0030294, marks=pytest.mark.long),
         pytest.param(FAULTS, 0.0034213, marks=pytest.mark.long),
         pytest.param(ALL, 0.0040344, marks=pytest.mark.long),
     ],

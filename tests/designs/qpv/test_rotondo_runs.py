@@ -33,15 +33,11 @@ def together(observer, *arguments, **options):
     return ob.simulate(observer.model, observer, scenario, engine="joint")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "times", "fhat"),
     [
-        pytest.param(
-            "first",
-            (0.499, 0.606, 0.704),
-            (-0.009575, -0.015586, 0.021739),
-            marks=pytest.mark.long,
-        ),
+        ("first", (0.499, 0.606, 0.704), (-0.009575, -0.015586, 0.021739)),
         ("H2", (0.412, 0.340, 0.623), (0.004722, 0.003115, -0.029540)),
     ],
 )

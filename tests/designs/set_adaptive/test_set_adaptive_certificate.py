@@ -170,7 +170,7 @@ LONG = pytest.mark.long
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param("adaptive", marks=LONG), pytest.param("bank", marks=LONG), "printed"]
+    "kind", [pytest.param(kind, marks=LONG) for kind in ("adaptive", "bank", "printed")]
 )
 def test_generated_c_equals_the_step(cooperative, bank, printed, tmp_path, kind):
     observer = {"adaptive": cooperative, "bank": bank, "printed": printed}[kind]

@@ -117,9 +117,10 @@ def test_a_measured_leak_is_followed(scale, half, voids):
     assert set(void) == ({84, 99, 183} if voids else set())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scenario", "most"),
-    [("FS1", 2.24), pytest.param("FS2", 2.30, marks=pytest.mark.long)],
+    [("FS1", 2.24), ("FS2", 2.30)],
 )
 def test_four_tanks_are_known_better_than_any_bound_in_advance_says(scenario, most):
     """Summed half widths: 2.415 for the prototype, 3.274 guaranteed by the paper's peak bounds."""

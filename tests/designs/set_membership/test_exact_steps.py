@@ -203,6 +203,7 @@ def test_a_zonotope_begins_anew_from_what_is_left():
     assert reach == pytest.approx(left, rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("exactly", [tank, learnt])
 def test_c_is_equal_to_the_last_bit(exactly, tmp_path):
