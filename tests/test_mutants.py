@@ -5,11 +5,12 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 TOOL = ROOT / "tools" / "mutants.py"
 sys.path.insert(0, str(TOOL.parent))
 
-import pytest
 from mutants import Job  # noqa: E402
 from mutation import changes, pick  # noqa: E402
 
