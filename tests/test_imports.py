@@ -114,6 +114,7 @@ def test_what_type_checkers_alone_read_makes_no_circle():
     assert circles(imports(texts)) == set()
 
 
+@pytest.mark.long
 def test_a_circle_put_into_the_package_is_found():
     texts = sources()
     texts["obsynth.symbolic.errors"] += "\ndef late():\n    import obsynth.evaluate.run\n"

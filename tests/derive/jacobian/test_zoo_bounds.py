@@ -280,7 +280,13 @@ def test_no_entry_is_left_loose(name):
         assert set(done.ravel()) <= {Status.EXACT, Status.CONVERGED}
 
 
-@pytest.mark.parametrize("name", ZOO)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.long] * (name in ("planar_arm 3R", "bicycle")))
+        for name in ZOO
+    ],
+)
 def test_constant_entries_are_known_to_the_last_place(name):
     effort = "fast" if name in HEAVY else "normal"
     for wrt in targets(name):

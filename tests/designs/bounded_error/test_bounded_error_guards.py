@@ -213,6 +213,7 @@ def test_leaving_the_domain_is_flagged_and_survived(base):
     assert np.all(np.isfinite(out["memory"]))
 
 
+@pytest.mark.long
 def test_bounds_return_after_a_missing_measurement(alone):
     plant = ob.Plant("tank")
     (h,) = plant.states("h", range=(10, 100))

@@ -137,6 +137,7 @@ def test_types_of_options_are_checked(method, options):
         method(**options)
 
 
+@pytest.mark.long
 def test_a_point_is_taken_where_a_plant_is_split_and_refused_elsewhere():
     """Mutant: the nominal point in place of the given one."""
     plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)

@@ -393,6 +393,7 @@ def test_quadruple_tank(settled_peak, tank, name, persistence):
             assert level <= smallest[event.fault] + 0.05 * (persistence + 1)
 
 
+@pytest.mark.long
 def test_quadruple_tank_detector_in_c(peak, tmp_path):
     project = ob.generate_c(ob.FaultDetector(peak, persistence=2), tmp_path / "p", vectors=2000)
     header = (project.folder / "include/quadruple_tank.h").read_text()

@@ -188,6 +188,7 @@ def test_units_do_not_matter(factor):
             assert two == pytest.approx(one, rel=most)
 
 
+@pytest.mark.long
 def test_four_tanks_are_bounded_more_closely_than_by_a_prediction_alone():
     """2.940 by an independent search, 3.26 for the observer that predicts first."""
     plant = ob.plants.quadruple_tank().discretise("euler", Ts=1.0)

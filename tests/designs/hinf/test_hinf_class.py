@@ -163,6 +163,7 @@ def many(n=14):
     return plant
 
 
+@pytest.mark.long
 def test_more_vertices_than_can_be_used():
     plant = many()
     with pytest.raises(ob.InfeasibleDesign, match="8192 vertices") as caught:

@@ -124,6 +124,7 @@ def test_every_feasible_set_is_contained(name, observers, hulls):
     assert np.all(hulls[:, :, 1] <= found[:, :, 1] + 1e-9)
 
 
+@pytest.mark.long
 def test_narrower_than_the_zonotopic_kalman_filter(observers):
     found = sets(observers["default"], MEASUREMENTS)[-1]
     assert np.all(found[:, 0] >= ZONOTOPIC_KALMAN[:, 0])

@@ -151,6 +151,7 @@ def test_widths_and_inclusion_over_100_seeds(case, hundred):
     assert set(np.unique(run.status[1:])) == {0.0}
 
 
+@pytest.mark.long
 def test_the_default_is_the_vertex_form_with_contraction(example, run_many, feedback, seeds_100):
     observer = ob.IntervalObserver(cuts=(), horizon=10**9).design(example)
     run = run_many(observer, *seeds_100, feedback, BOX)

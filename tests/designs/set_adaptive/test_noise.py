@@ -79,6 +79,7 @@ def test_false_alarms_of_the_printed_indicators(noisy, numbers, Gamma):
             assert flags[part, i].sum() == pytest.approx(wanted, rel=0.01, abs=2), (name, i)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("Gamma", [0.003, 0.01, 0.03])
 def test_delays_of_the_printed_indicators(noisy, numbers, Gamma):
     expected = numbers["noise_splitmix64"][f"{Gamma:g}"]["d"]
