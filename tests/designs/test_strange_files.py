@@ -105,8 +105,9 @@ def test_a_tampered_file_is_refused_or_means_what_it_meant(name, tmp_path):
 
 @pytest.mark.long
 def test_thousands_of_tampered_files(name, tmp_path):
-    found = meanings(name, tmp_path, range(1000, 1800))
-    assert found.count("refused") > 300
+    """Of all methods together; at least three of eight are refused."""
+    found = meanings(name, tmp_path, range(1000, 1300))
+    assert found.count("refused") > 112
 
 
 # -- one by one --------------------------------------------------------------------------------
