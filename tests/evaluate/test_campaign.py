@@ -57,7 +57,7 @@ def test_rows_are_those_of_runs(car, observer, scenario):
 
 
 def test_a_truth_that_breaks_the_promise_is_seen(car, observer, scenario):
-    """Counting runs with a miss as held would leave 100 %."""
+    """Its runs do not keep the assumptions, and are counted apart."""
     wild = car.with_ranges({"w1": (-2, 2)})
     drawn = replace(scenario, disturbances=None)  # from the ranges of the truth
     found = ob.campaign(observer, drawn, 3, truth={"own": car, "wild": wild}, workers=1)
@@ -65,6 +65,18 @@ def test_a_truth_that_breaks_the_promise_is_seen(car, observer, scenario):
     assert own[4:6] == [3, "100 %"] and other[4] == 0 and other[5] == "n/a"
     missed = [row["v: missed"] + row["f: missed"] + row["void"] for row in found.rows[3:]]
     assert min(missed) > 0
+
+
+def test_a_miss_and_a_false_alarm_are_counted(car, observer, scenario):
+    """Mutants: every kept run held; alarms before the fault not counted."""
+    found = ob.campaign(ob.FaultDetector(observer), scenario, 2, workers=1)
+    first, second = found.rows
+    spoilt = replace(found, rows=({**first, "f: missed": 1, "f: false alarms": 2}, second))
+    assert spoilt.table().rows[0][4:6] == [2, "50.00 %"]
+    assert spoilt.alarms().rows[0][5] == 1
+    run = ob.simulate(car, ob.FaultDetector(observer), scenario)
+    alarm = np.ones_like(run.alarm)
+    assert facts(replace(run, alarm=alarm))["f: false alarms"] == 51
 
 
 def test_intervals_of_clopper_and_pearson():
