@@ -3,6 +3,7 @@
 import ast
 import importlib
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -109,3 +110,23 @@ def test_no_module_is_left_that_nothing_documents():
         name for name in all_modules() if not (importlib.import_module(name).__doc__ or "").strip()
     ]
     assert undocumented == []
+
+
+def test_hosted_checks_call_what_there_is():
+    workflow = (ROOT / ".github/workflows/ci.yml").read_text()
+    targets = set(re.findall(r"\bmake ([a-z-]+)", workflow))
+    assert (
+        {"run", "test", "test-long"}
+        <= targets
+        <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    )
+    scripts = re.findall(r"\bsh (tools/\S+)", workflow)
+    assert scripts and all((ROOT / name).is_file() for name in scripts)
+
+
+def test_one_version_is_told():
+    import obsynth
+
+    files = "\n".join((ROOT / name).read_text() for name in ("pyproject.toml", "CITATION.cff"))
+    told = re.findall(r"^version(?: = \"|: )(\d[\d.]*)", files, re.MULTILINE)
+    assert told == [obsynth.__version__] * 2
