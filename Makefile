@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-long mutants firmware prove prove-long notebook docs lint format lock benchmarks clean
+.PHONY: help run test test-long mutants firmware prove prove-long notebook notebooks docs lint format lock benchmarks clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -55,6 +55,9 @@ format: $(VENV)/.installed ## rewrite the sources in the house's format
 
 notebook: $(VENV)/.installed ## open JupyterLab on the notebooks
 	$(BIN)/jupyter lab notebooks
+
+notebooks: $(VENV)/.installed ## execute the notebooks and store what they show, where it has changed
+	$(BIN)/python tools/notebooks.py
 
 docs: $(VENV)/.installed ## build the documentation as a site, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -1,20 +1,28 @@
 """Notebooks, run from top to bottom with questions asked in their kernel afterwards."""
 
+import copy
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "notebooks"
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "notebooks"
+sys.path.insert(0, str(ROOT / "tools"))
 
 
 class Executed:
     """A notebook with its outputs, and what the question printed as JSON."""
 
-    def __init__(self, notebook):
-        self.cells = notebook.cells
-        (output,) = [o for o in notebook.cells[-1].outputs if o.output_type == "stream"]
+    def __init__(self, stored, notebook):
+        from notebooks import differences
+
+        probe = notebook.cells.pop()
+        (output,) = [o for o in probe.outputs if o.output_type == "stream"]
         self.answers = json.loads(output.text)
+        self.cells = notebook.cells
+        self.stale = differences(stored, notebook)
 
     @property
     def pictures(self):
@@ -37,20 +45,15 @@ def execute(tmp_path_factory):
 
     # Half of what collecting all tests takes, if it stood above.
     import nbformat
-    from nbclient import NotebookClient
+
+    from notebooks import execute
 
     def run(name, question):
-        notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+        stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+        notebook = copy.deepcopy(stored)
         probe = f"import json\n\nprint(json.dumps({question.strip()}))"
         notebook.cells.append(nbformat.v4.new_code_cell(probe))
-        folder = tmp_path_factory.mktemp(name)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("OMP_NUM_THREADS", "1")
-            patch.setenv("TMPDIR", str(folder))
-            resources = {"metadata": {"path": folder}}
-            NotebookClient(
-                notebook, timeout=600, kernel_name="python3", resources=resources
-            ).execute()
-        return Executed(notebook)
+        execute(notebook, tmp_path_factory.mktemp(name))
+        return Executed(stored, notebook)
 
     return run

@@ -31,6 +31,10 @@ def found(executed):
     return executed.answers
 
 
+def test_the_stored_outputs_are_current(executed):
+    assert executed.stale == []
+
+
 def test_plant_and_derived_forms(found, reference):
     assert found["equilibrium"] == pytest.approx(reference["model"]["xeq"], rel=1e-9)
     low, high = reference["model"]["Jmin"][0][2], reference["model"]["Jmax"][0][2]

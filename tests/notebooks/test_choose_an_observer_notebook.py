@@ -24,6 +24,10 @@ def notebook(execute):
     return execute("choose_an_observer", QUESTION)
 
 
+def test_the_stored_outputs_are_current(notebook):
+    assert notebook.stale == []
+
+
 def test_the_recommended_one_is_at_most_5_per_cent_wider_than_any_other(notebook):
     for name, tries in notebook.answers["scores"].items():
         scores = {method: score for method, score, missed in tries if not missed}

@@ -32,6 +32,10 @@ def notebook(execute):
     return execute("hinf_uio", QUESTION)
 
 
+def test_the_stored_outputs_are_current(notebook):
+    assert notebook.stale == []
+
+
 def test_the_printed_g_is_not_the_one_of_51(notebook):
     assert "cos(12 x1): (51) is its Jacobian: False" in notebook.page
     assert "cos(12 x2): (51) is its Jacobian: True" in notebook.page

@@ -31,6 +31,10 @@ def executed(execute):
     return execute("interval_observer", QUESTION)
 
 
+def test_the_stored_outputs_are_current(executed):
+    assert executed.stale == []
+
+
 def test_the_printed_example_diverges(executed):
     found = executed.answers
     assert found["radius"] == pytest.approx(8.272158, rel=1e-6)

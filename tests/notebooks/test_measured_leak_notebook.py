@@ -26,6 +26,10 @@ def notebook(execute):
     return execute("measured_leak", QUESTION)
 
 
+def test_the_stored_outputs_are_current(notebook):
+    assert notebook.stale == []
+
+
 def test_every_number_of_the_record(notebook):
     found = notebook.answers
     assert abs(found["upper"] - 0.008563) < 1e-5

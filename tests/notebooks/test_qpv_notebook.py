@@ -25,6 +25,10 @@ def executed(execute):
     return execute("qpv", QUESTION)
 
 
+def test_the_stored_outputs_are_current(executed):
+    assert executed.stale == []
+
+
 def test_the_printed_and_the_corrected_optimum(executed):
     mu, error_set = executed.answers["printed"]
     assert mu == pytest.approx(2.40004, rel=1e-3) and error_set > 10

@@ -31,6 +31,10 @@ def found(executed):
     return executed.answers
 
 
+def test_the_stored_outputs_are_current(executed):
+    assert executed.stale == []
+
+
 def test_bounds_and_gain(found):
     assert found["broken"] == pytest.approx(0.115, abs=0.03)
     assert found["alpha"] == pytest.approx(0.0298909, abs=1e-7)

@@ -31,6 +31,10 @@ def found(executed):
     return executed.answers
 
 
+def test_the_stored_outputs_are_current(executed):
+    assert executed.stale == []
+
+
 def test_four_tanks_are_inside_and_narrower_than_peak_bounds(found):
     assert found["coverage"] == [1.0, 1.0]
     assert found["clean"] == [True, True]

@@ -18,6 +18,10 @@ def tour(execute):
     return execute("tour", QUESTION)
 
 
+def test_the_stored_outputs_are_current(tour):
+    assert tour.stale == []
+
+
 def test_bounds_are_those_of_the_cosine(tour):
     """The entry is -6 Ts cos(phi), over |phi| <= 2.5."""
     assert tour.answers["m21"] == pytest.approx([-0.06, 0.06 * 0.8011436155469337], rel=1e-9)
