@@ -8,8 +8,8 @@ from setuptools import find_packages, setup
 
 ROOMS = ("symbolic", "derive", "designs", "codegen", "evaluate")
 
-packages = ["obsynth"]
-package_dir = {"obsynth": "src/obsynth"}
+packages = ["obsynth", "obsynth.commands"]
+package_dir = {"obsynth": "src/obsynth", "obsynth.commands": "src/obsynth/commands"}
 for room in ROOMS:
     packages.append(f"obsynth.{room}")
     packages += [f"obsynth.{room}.{sub}" for sub in find_packages(room)]

@@ -58,7 +58,7 @@ def _tabulated(
             label,
             group[0].seed if apart else len(group),
             *(covered(group, name) for name in names),
-            all(run.domain.ok and not run.outside for run in group),
+            all(run.kept for run in group),
         ]
         for (scenario, label, _), group in sorted(
             groups.items(), key=lambda g: order.index(g[0][0])

@@ -62,6 +62,11 @@ class Domain:
         """Both truth and estimate stayed inside the box at every instant."""
         return bool(self.x_inside.all() and self.xhat_inside.all())
 
+    @property
+    def refuted(self) -> bool:
+        """Whether the observer was void at an instant, which no kept assumption allows."""
+        return any(count.bit == VOID for count in self.status)
+
     @classmethod
     def of(
         cls,

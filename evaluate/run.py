@@ -207,6 +207,14 @@ class Run:
         """Whether truth and estimate stayed inside the box, and the status bits in words."""
         return Domain.of(self.x, self.xhat, self.box, self.status, self.names["x"])
 
+    @property
+    def kept(self) -> bool:
+        """Whether the run kept the assumptions of the guarantee, as far as is known.
+
+        Nothing left its range or broke a declared bound, and the observer was never void.
+        """
+        return self.domain.ok and not self.outside and not self.domain.refuted
+
     def summary(self, from_step: int = 0) -> Table:
         """Coverage, rms error and half widths of every estimated signal; first alarms.
 

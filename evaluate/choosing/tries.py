@@ -40,6 +40,9 @@ METHODS: tuple[Method, ...] = (
 )
 """What is tried by default; a further method is a further line."""
 
+CLASSES = {type(method).__name__: method.CLASS for method in METHODS}
+"""The class of plants of every method, as data."""
+
 
 @dataclass(frozen=True, eq=False)
 class Try:

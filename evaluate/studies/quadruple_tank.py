@@ -11,25 +11,24 @@ import numpy as np
 from obsynth.codegen import CProject, generate_c
 from obsynth.codegen.folder import complete_folder
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
-from obsynth.designs import BoundedErrorUIO, InfeasibleDesign, Observer
+from obsynth.designs import BoundedErrorUIO, Observer
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.papers.buciakowski import Refusals, ask, claims_of, tank
+from obsynth.evaluate.papers.claim import claims_table
 from obsynth.evaluate.report import report
 from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.simulate import simulate
 from obsynth.evaluate.studies.printed import (
-    PRINTED_GAMMA,
-    Refusals,
     bounds_table,
     code_table,
-    errata_table,
     half_widths,
     refusal_table,
     vertices_table,
     width_table,
 )
 from obsynth.evaluate.table import Table
-from obsynth.symbolic import Plant, Scenario, plants, scenarios
+from obsynth.symbolic import Plant, Scenario, scenarios
 
 # The largest round value that leaves room below the largest feasible gamma of all forms.
 GAMMA = 0.005
@@ -126,11 +125,11 @@ def quadruple_tank(
     say = _stages(progress)
     with complete_folder(folder, RUN) as place:
         say(0)
-        model = plants.quadruple_tank().discretise("euler", Ts=1.0)
+        model = tank()
         parts = split(model)
         bounds = jacobian_bounds(parts)
         say(1)
-        refusals = _refusals(parts, bounds)
+        refusals = ask(parts, bounds)
         designs = {}
         methods = {
             BEFORE: BoundedErrorUIO(form="repaired", gamma=GAMMA, objective="trace", **OWN),
@@ -174,19 +173,6 @@ def _stages(progress: Progress | None) -> Callable[[int], None]:
     return say
 
 
-def _refusals(parts: "Split", bounds: "JacobianBounds") -> Refusals:
-    found = []
-    for form in ("printed", "corrected"):
-        method = BoundedErrorUIO(form=form, gamma=PRINTED_GAMMA)
-        try:
-            method.design(parts, bounds)
-        except InfeasibleDesign as error:
-            found.append(error)
-        else:
-            raise InfeasibleDesign(f"form={form!r} was expected to be infeasible and is not")
-    return found[0], found[1]
-
-
 def _runs(observer: Observer, cases: Sequence[Scenario], seeds: int) -> tuple[Run, ...]:
     return tuple(
         simulate(observer.model, observer, scenario, seed=seed)
@@ -210,8 +196,8 @@ def shortened(name: str, steps: int) -> Scenario:
 
 
 def _write(study: QuadrupleTank, path: Path) -> None:
-    run = study.runs[ELLIPSOID][0]
-    errata = errata_table(study.split, study.bounds, study.refusals, run)
+    claims = list(claims_of(study.split, study.bounds, study.refusals))
+    errata = claims_table("What the paper prints, and what holds", claims)
     report(
         path,
         {label: study.designs[label] for label in (ELLIPSOID, PEAK)},

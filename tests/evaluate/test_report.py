@@ -1,12 +1,13 @@
 """The page stands alone, parses, shows the tables, and replaces a file only when complete."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from obsynth.evaluate import ReportError, Table, report
+from obsynth.evaluate import ReportError, Table, coverage_table, report
 from obsynth.evaluate import report as report_function
 from obsynth.evaluate.svg import equations_html
 from obsynth.symbolic import Plant
@@ -170,6 +171,14 @@ def test_a_write_that_fails_leaves_no_piece(toy, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk"):
         report(tmp_path / "report.html", toy.observer(toy.plant))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_void_instants_and_kept_assumptions_do_not_contradict_each_other(toy_run):
+    status = toy_run.status.copy()
+    status[7] |= 8
+    void = replace(toy_run, status=status)
+    for run, kept in ((toy_run, True), (void, False)):
+        assert coverage_table({"toy": [run]}).rows[0][-1] is kept
 
 
 def test_refusals(toy, tmp_path):

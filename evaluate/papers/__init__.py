@@ -1,0 +1,1 @@
+"""Which printed claims of the five papers hold: computed, not recited."""

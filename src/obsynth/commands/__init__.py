@@ -1,0 +1,1 @@
+"""The commands of ``obsynth``, a file per question; ``told`` prints for all of them."""
