@@ -150,15 +150,15 @@ def derive_bounds(form: QuasiLPV) -> EndBounds:
     exact = (*plant.u, *(s for s in plant.rho if s.measured))
     way = form.ranging
     blocks = {name: substitute_all(way.matrix[form.layout.place(name)], plant) for name in BLOCKS}
-    known = [Known(s.symbol, end_symbols(s)[0], end_symbols(s), s.lower, s.upper) for s in states]
-    known += [Known(s.symbol, s.symbol, (s.symbol, s.symbol), s.lower, s.upper) for s in exact]
+    known = [Known(s.symbol, end_symbols(s)) for s in states]
+    known += [Known(s.symbol, (s.symbol, s.symbol)) for s in exact]
     more = [lift.signal for lift in way.lifts]
     lower, upper = {}, {}
     for name, block in blocks.items():
         places = {(i, j): block[i, j] for i in range(block.rows) for j in range(block.cols)}
         found = bound_elements(places, plant, known, more)
-        lower[name] = sp.ImmutableMatrix(*block.shape, list(found.lower.values()))
-        upper[name] = sp.ImmutableMatrix(*block.shape, list(found.upper.values()))
+        lower[name] = sp.ImmutableMatrix(*block.shape, [low for low, _ in found.values()])
+        upper[name] = sp.ImmutableMatrix(*block.shape, [high for _, high in found.values()])
     used = {s for side in (lower, upper) for m in side.values() for s in m.free_symbols}
     return EndBounds(states, tuple(s for s in exact if s.symbol in used), lower, upper)
 

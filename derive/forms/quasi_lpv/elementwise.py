@@ -1,4 +1,4 @@
-"""Elementwise bounds A_lower <= A(rho) <= A_upper, constant or as functions of what is measured.
+"""Elementwise bounds A_lower <= A(rho) <= A_upper as functions of what is measured.
 
 An entry that is monotone in every unknown signal over the box takes its extremes where the unknown
 signals are at an end. Where a whole entry is not monotone, its terms are bounded one by one: by
@@ -6,7 +6,6 @@ monotonicity, as a known factor times an unknown one, or by a constant range.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import sympy as sp
@@ -25,27 +24,13 @@ _RTOL = 1e-2
 _EFFORT = "fast"
 
 
-@dataclass(frozen=True, eq=False)
-class ElementBounds:
-    """Bounds of entries as functions of what is known.
-
-    lower, upper: in the arguments of the known signals only
-    how: ``"known"``, ``"monotone"``, ``"termwise"``, or ``"range"`` where a constant range of an
-        unknown factor was needed
-    """
-
-    lower: dict[Entry, sp.Expr]
-    upper: dict[Entry, sp.Expr]
-    how: dict[Entry, str]
-
-
 def bound_elements(
     entries: Mapping[Entry, sp.Expr],
     model: Plant,
     known: Sequence[Known],
     more: Sequence[Signal] = (),
-) -> ElementBounds:
-    """Bound entries over the unknown signals, pointwise in the known ones."""
+) -> dict[Entry, Ends]:
+    """Bound entries over the unknown signals, as functions of the ends of the known ones."""
     return _Bounder(model, known, more).bound(entries)
 
 
@@ -61,32 +46,27 @@ class _Bounder:
                 self.ends[symbol] = pair
         self.ends.update({k.signal: k.ends for k in known if not k.exact})
 
-    def bound(self, entries: Mapping[Entry, sp.Expr]) -> ElementBounds:
-        lower: dict[Entry, sp.Expr] = {}
-        upper: dict[Entry, sp.Expr] = {}
-        how: dict[Entry, str] = {}
+    def bound(self, entries: Mapping[Entry, sp.Expr]) -> dict[Entry, Ends]:
+        found: dict[Entry, Ends] = dict.fromkeys(entries, (sp.nan, sp.nan))
         whole = self._monotone(list(entries.values()))
         hard: dict[Entry, list[sp.Expr]] = {}
         for (place, entry), signs in zip(entries.items(), whole, strict=True):
             if signs is None:
                 hard[place] = expand_terms(entry)
                 continue
-            lower[place], upper[place] = self._at_ends(entry, signs)
-            how[place] = "monotone" if signs else "known"
+            found[place] = self._at_ends(entry, signs)
         terms = list(dict.fromkeys(t for listed in hard.values() for t in listed))
         by_term = dict(zip(terms, self._terms(terms), strict=True))
         for place, listed in hard.items():
             parts = [by_term[term] for term in listed]
-            lower[place] = sp.Add(*[low for low, _, _ in parts])
-            upper[place] = sp.Add(*[high for _, high, _ in parts])
-            how[place] = "range" if any(ranged for _, _, ranged in parts) else "termwise"
-        order = list(entries)
-        return ElementBounds(
-            {p: lower[p] for p in order}, {p: upper[p] for p in order}, {p: how[p] for p in order}
-        )
+            found[place] = (
+                sp.Add(*[low for low, _ in parts]),
+                sp.Add(*[high for _, high in parts]),
+            )
+        return found
 
-    def _terms(self, terms: list[sp.Expr]) -> list[tuple[sp.Expr, sp.Expr, bool]]:
-        """Bounds of terms, and whether a constant range of an unknown factor was needed."""
+    def _terms(self, terms: list[sp.Expr]) -> list[Ends]:
+        """Bounds of terms: by monotonicity, else as a known factor times an unknown one."""
         split = [term.as_independent(*self.ends, as_Add=False) for term in terms]
         signs = self._monotone(terms)
         factor_signs = self._monotone([unknown for _, unknown in split])
@@ -101,11 +81,11 @@ class _Bounder:
             terms, split, signs, factor_signs, strict=True
         ):
             if term_sign is not None:
-                result.append((*self._at_ends(term, term_sign), False))
+                result.append(self._at_ends(term, term_sign))
                 continue
             low, high = ranges[unknown] if sign is None else self._at_ends(unknown, sign)
             known = factor.xreplace(self.exact)
-            result.append((*_times(known, low, high), sign is None))
+            result.append(_times(known, low, high))
         return result
 
     def _at_ends(self, entry: sp.Expr, signs: Mapping[sp.Symbol, int]) -> Ends:

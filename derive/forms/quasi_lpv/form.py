@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from typing import Any
 
 import casadi as ca
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from obsynth.derive.forms.measured import read_measured
 from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, Ranging, make_interval_form
 from obsynth.derive.forms.quasi_lpv.polytopic import (
     CentredForm,
@@ -145,31 +143,18 @@ class QuasiLPV(VaryingForm):
         """
         return centre_form(self.vertices(), nominal)
 
-    def interval(self, measured: Any = None, margin: float = 0.0) -> IntervalForm:
-        """Elementwise bounds of A, B and the offset.
-
-        Parameters
-        ----------
-        measured : None, "outputs" or sequence of names
-            None: constant bounds. ``"outputs"``: functions of what the outputs show (noise
-            included), the inputs and the measured scheduling variables, as far as they schedule.
-            Names of states, inputs, scheduling variables (known exactly) or outputs (with their
-            noise).
-        margin : float
-            How far the arguments may be off beyond their noise, for instance what they move
-            between two samples.
+    def interval(self) -> IntervalForm:
+        """Constant elementwise bounds of A, B and the offset.
 
         Returns
         -------
         IntervalForm
-            Constant bounds, or bounds as functions of the arguments with their domain.
+            Guaranteed over the box.
 
         Raises
         ------
         UnboundedError
             An entry has no finite bound.
-        DerivationError
-            ``measured`` is not understood.
 
         Examples
         --------
@@ -179,14 +164,9 @@ class QuasiLPV(VaryingForm):
         >>> bounds.A_min[0, 0].round(6), bounds.A_max[0, 0].round(6)
         (np.float64(-0.0145), np.float64(-0.006712))
         """
-        way = self.ranging
-        blocks = {name: way.matrix[self.layout.place(name)] for name in ("A", "B", "offset")}
-        known = read_measured(self.model, measured, margin)
-        if isinstance(measured, str) and measured == "outputs":
-            used = {s for block in blocks.values() for s in block.free_symbols}
-            used |= {s for lift in way.lifts for s in lift.meaning.free_symbols}
-            known = tuple(k for k in known if k.signal in used)
-        return make_interval_form(blocks, self.model, known, way)
+        matrix = self.ranging.matrix
+        blocks = {name: matrix[self.layout.place(name)] for name in ("A", "B", "offset")}
+        return make_interval_form(blocks, self.model, self.ranging)
 
     def function(self) -> ca.Function:
         """Return the matrices as a CasADi function.

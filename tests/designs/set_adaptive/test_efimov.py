@@ -14,6 +14,8 @@ from obsynth.designs.set_adaptive.indicators import fault_indicators, monitors
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 from obsynth.designs.set_adaptive.printed import solve_printed
 
+# flows between tanks and out of the second over the section of a tank
+FLOWS = np.array([1.329e-4, 1.329e-4, 1.772e-4]) / 0.0154
 TABLE = {
     50: {"x": (0.49802839, 0.10644992, 0.30089414)},
     199: {
@@ -42,6 +44,55 @@ REFERENCE = {
 
 
 # -- the forms and the gain ----------------------------------------------------------
+
+
+def printed_bounds(y1, y2):
+    """A_m and A_M as the paper prints them, below (20)."""
+    first, second, out = FLOWS
+
+    def matrix(low, high):
+        # x3 is at ``low`` or ``high`` where the entry is least; the other way round where largest
+        near, far = abs(y1 - high) ** -0.5, abs(low - y2) ** -0.5
+        other, away = abs(y1 - low) ** -0.5, abs(high - y2) ** -0.5
+        return np.array(
+            [
+                [-first * near, 0, first * other],
+                [0, -second * far - out * abs(y2) ** -0.5, second * away],
+                [first * other, second * away, -second * far - first * near],
+            ]
+        )
+
+    return matrix(0.24, 0.36), matrix(0.36, 0.24)
+
+
+def test_the_eighteen_printed_entries(structure):
+    function = structure.bounds.function()
+    for y in np.random.default_rng(3).uniform((0.44, 0.04), (0.56, 0.16), (200, 2)):
+        for found, expected in zip(function(y, y, [])[:2], printed_bounds(*y), strict=True):
+            assert np.array(found) == pytest.approx(expected, rel=1e-12, abs=1e-16)
+
+
+def true_matrix(x):
+    """A(x) of the three tanks."""
+    gaps = np.abs([x[0] - x[2], x[2] - x[1], x[1]]) ** -0.5
+    a, b, c = FLOWS * gaps
+    return np.array([[-a, 0, a], [0, -b - c, b], [a, b, -a - b]])
+
+
+def test_noise_breaks_the_printed_bounds_and_not_the_widened_ones(structure):
+    function, rng, broken = structure.bounds.function(), np.random.default_rng(11), 0
+    box = structure.plant.box("x")
+    x, v = rng.uniform(*box.T, (2000, 3)), rng.uniform(-4.5e-3, 4.5e-3, (2000, 2))
+    for state, noise in zip(x, v, strict=True):
+        true, y = true_matrix(state), state[:2] + noise
+        shown = np.clip(y, *box[:2].T)
+        low, high = (np.array(end) for end in function(shown, shown, [])[:2])
+        broken += bool((true < low - 1e-15).any() or (true > high + 1e-15).any())
+        ends = (np.clip(y + side, *box[:2].T) for side in (-4.5e-3, 4.5e-3))
+        low, high = (np.array(end) for end in function(*ends, [])[:2])
+        assert (low - 1e-15 <= true).all()
+        assert (high + 1e-15 >= true).all()
+    assert broken / len(x) == pytest.approx(0.115, abs=0.02)
 
 
 def test_eigenvalues_with_the_paper_gain(structure, paper_gain, numbers):
