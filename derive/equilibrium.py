@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 _STARTS = 32
 _ITERATIONS = 60
@@ -123,6 +124,7 @@ def _newton(
     return x, float(np.abs(value).max(initial=0.0)), count
 
 
+@takes(model="Plant")
 def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
     """Find the state that given inputs hold.
 

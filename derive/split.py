@@ -19,6 +19,7 @@ from obsynth.derive.rigour import rational, round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 LinearForm = Literal["frozen", "terms", "jacobian"]
 _FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
@@ -153,6 +154,7 @@ def _check_outputs(model: Plant) -> None:
             )
 
 
+@takes(model="Plant")
 def split(
     model: Plant,
     at: Any = None,

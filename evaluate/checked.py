@@ -172,7 +172,7 @@ def step_function(observer: Observer | FaultDetector, model: Plant) -> ca.Functi
     """Return the observer's step once its inputs and outputs are known to fit the model."""
     step: ca.Function = observer.step
     scheduling_columns(step, model, "step")
-    # CasADi accepts one name on both sides only on request, so the first output is left free.
+    # what follows the memory is what is read; the memory itself only goes back into the step
     if tuple(step.name_out())[1:] not in [(*STEP_OUTPUTS[1:], *more) for more in FURTHER_OUTPUTS]:
         raise SimulationError(
             f"the observer's step returns ({', '.join(step.name_out())}); "

@@ -39,7 +39,7 @@ class _Section:
         self.parts += [part for part in parts if part]
 
 
-@takes(observer="Observer FaultDetector ExtendedKalman dict")
+@takes(path="Path str", observer="Observer FaultDetector ExtendedKalman dict")
 def report(
     path: str | os.PathLike[str],
     observer: "Observer | Mapping[str, Observer]",

@@ -23,6 +23,7 @@ from obsynth.symbolic.signals import (
     output_ranges,
     per_symbol,
 )
+from obsynth.symbolic.taking import Symbols, SymbolTuple, Together
 from obsynth.symbolic.text import TextError, read_text, undeclared
 
 _PLAIN = (
@@ -61,7 +62,8 @@ def read_dynamics(
     found = read_rows(rows, symbols, "dynamics")
     if len(found) != len(states):
         raise PlantError(
-            f"dynamics has {len(found)} rows for {len(states)} states ({', '.join(states)})",
+            f"dynamics has {len(found)} rows for {len(states)} states ({', '.join(states)}): give "
+            "one for each, in this order",
             rows=len(found),
             states=tuple(states),
         )
@@ -159,14 +161,20 @@ def _read(row: Any, symbols: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
             row = read_text(row, symbols)
         except TextError as error:
             raise TextError(f"{where}: {error}", **error.facts | {"where": where}) from None
-    if isinstance(row, bool) or not isinstance(row, int | float | sp.Basic):
-        raise PlantError(f"{where}: {row!r} is not an expression", where=where)
+    if isinstance(row, bool) or not isinstance(row, int | float | sp.Basic | Symbols):
+        raise PlantError(
+            f"{where}: {row!r} is not an expression of the plant's symbols: give text or SymPy's, "
+            "one scalar to a row",
+            where=where,
+        )
     expression = sp.sympify(row)
     # SymPy's Symbol is itself a Boolean, so only relations and connectives are asked for.
     if isinstance(expression, Relational | BooleanFunction | BooleanTrue | BooleanFalse):
         raise PlantError(
             f"{where}: {expression} is a condition; give the right-hand side alone", where=where
         )
+    for together in expression.atoms(SymbolTuple):
+        raise Together(together, where)
     if not isinstance(expression, sp.Expr):
         raise PlantError(f"{where}: {expression} is not a scalar expression", where=where)
     replace = {}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import KINDS, Role, Signal, exact_number, expand_names, make_signals
 from obsynth.symbolic.taking import Symbols
+from obsynth.symbolic.ufuncs import allow
 
 
 class SignalTable:
@@ -67,6 +68,7 @@ class SignalTable:
         self, role: Role, names: Any, taken: Sequence[str] = (), **keywords: Any
     ) -> tuple[sp.Symbol, ...]:
         """Make signals from the arguments of a declaration and add them."""
+        allow()
         signals = make_signals(role, names, **keywords)
         self.add(signals, taken)
         return Symbols(signal.symbol for signal in signals)

@@ -1,9 +1,12 @@
 """Front doors say what they take: arguments of another kind are refused by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import signature
 from typing import Any, ParamSpec, TypeVar
+
+import sympy as sp
+from sympy.core.sympify import converter
 
 from obsynth.symbolic.errors import ObsynthError
 
@@ -12,12 +15,14 @@ T = TypeVar("T")
 
 _MADE = {
     "Plant": "made by ob.Plant(name) or ob.read_plant(path)",
+    "Split": "what ob.split returns",
     "Observer": "what a method's design(plant) returns",
     "FaultDetector": "made by ob.FaultDetector(observer)",
     "Scenario": "made by ob.Scenario(...), or one of ob.scenarios",
     "Record": "what ob.read_record returns",
     "Run": "what ob.simulate returns",
     "Estimate": "what ob.estimate returns",
+    "Path": "the name of a file",
     "dict": "by label",
 }
 _OTHERS = {*_MADE, "Method", "list", "tuple", "str", "int", "float", "ndarray", "DataFrame"}
@@ -63,21 +68,37 @@ def _an(kind: str) -> str:
     return f"{'an' if kind[0] in 'AEIOUaeiou' else 'a'} {kind}"
 
 
+class Together(ObsynthError, AttributeError):
+    """A tuple of symbols where an expression is needed; SymPy asks it for what expressions have."""
+
+    def __init__(self, symbols: Iterable[Any], where: str = "") -> None:
+        names = ", ".join(map(str, symbols))
+        left = names if "," in names else f"({names},)"
+        super().__init__(
+            f"{where and where + ': '}a tuple of symbols ({names}) stands in an expression: take it"
+            f" apart where it is declared, {left} = plant...(...), or name its entries by index"
+        )
+
+
+class SymbolTuple(sp.Tuple):  # type: ignore[misc]
+    """What SymPy makes of `Symbols`: a tuple that says so where it should be an expression."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise Together(self)
+
+
 class Symbols(tuple[Any, ...]):
     """The symbols of a declaration, to be taken apart: ``(h,) = plant.states("h")``."""
 
     __slots__ = ()
 
-    def _refuse(self, *_: Any) -> Any:
-        names = ", ".join(map(str, self))
-        left = f"({names},)" if len(self) == 1 else names
-        raise ObsynthError(
-            f"a tuple of symbols ({names}) stands in an expression: take it apart where it is"
-            f" declared, {left} = plant...(...), or name its entries by index"
-        )
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise Together(self)
 
     __neg__ = __pos__ = __abs__ = __sub__ = __rsub__ = __truediv__ = __rtruediv__ = _refuse
-    __pow__ = __rpow__ = __mul__ = __rmul__ = _refuse
+    __pow__ = __rpow__ = __mul__ = __rmul__ = __array_ufunc__ = _refuse
 
     def __add__(self, other: Any) -> Any:
         """Return both together; a sum is none."""
@@ -86,3 +107,6 @@ class Symbols(tuple[Any, ...]):
     def __radd__(self, other: Any) -> Any:
         """Return a sum, which is none."""
         return self._refuse()
+
+
+converter[Symbols] = lambda symbols: SymbolTuple(*symbols)

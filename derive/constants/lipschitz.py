@@ -16,6 +16,7 @@ from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
 from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 _MOST_VERTICES = 4096
 
@@ -84,6 +85,7 @@ class LipschitzConstants:
         return html_table(heads, rows, f"Constants of {self.what}, over the box")
 
 
+@takes(split_or_model="Plant Split")
 def lipschitz(
     split_or_model: Split | Plant,
     gamma: float | None = None,

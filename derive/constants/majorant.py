@@ -24,6 +24,7 @@ from obsynth.derive.rigour import up
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.display import html_table
+from obsynth.symbolic.taking import takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +97,7 @@ class Majorant:
         return html_table((), self._lines(), f"Majorant of g of {self.split.model.name}")
 
 
+@takes(split="Split")
 def majorant(
     split: Split,
     fixed: Mapping[str, float] | None = None,

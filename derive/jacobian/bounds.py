@@ -36,6 +36,7 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.discretise import runge_kutta
 from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 _STEPS = (sp.floor, sp.ceiling, sp.Mod)
@@ -284,6 +285,7 @@ class JacobianBounds:
         return f"{table}<p>{self.counted}</p><ul>{reasons}</ul>"
 
 
+@takes(split_or_model="Plant Split")
 def jacobian_bounds(
     split_or_model: Split | Plant,
     wrt: Literal["states", "inputs", "joint"] = "states",

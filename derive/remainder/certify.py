@@ -17,10 +17,12 @@ from obsynth.derive.rigour.interval import add, multiply
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import Step, sampling_time, step_formula
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 _RANDOM = 32
 
 
+@takes(plant="Plant")
 def discretisation_remainder(
     plant: Plant,
     method: Literal["euler", "rk4", "taylor"] = "euler",

@@ -13,6 +13,7 @@ from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 _MOST_POINTS = 6
 
@@ -110,6 +111,7 @@ class Excitation:
         return f"<p>{escape(self.condition)}</p><ul>{items}</ul>"
 
 
+@takes(model="Plant")
 def excitation(model: Plant) -> Excitation:
     """Derive the conditions under which faults can be identified.
 

@@ -10,6 +10,7 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.structure.frozen import freeze, original, precision, rank, transfer
 from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 # Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
 _FREQUENCIES = (1.3717, -0.8391, 2.1173)
@@ -130,6 +131,7 @@ class FaultIsolability:
         return html_table(("fault", "seen", *self.faults), rows, str(self))
 
 
+@takes(model="Plant")
 def fault_isolability(model: Plant) -> FaultIsolability:
     """Tell which single faults can be seen and which can be told apart.
 

@@ -27,6 +27,7 @@ from obsynth.derive.structure.zeros import (
 from obsynth.symbolic.display import html_table
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 T = TypeVar("T")
 _MOST_VERTICES = 512
@@ -140,6 +141,7 @@ class _Notes:
         self.checks.append(Check(title, None, text))
 
 
+@takes(model_or_split="Plant Split")
 def analyse(model_or_split: Plant | Split) -> StructureReport:
     """Report on the structure of a plant; what fails is a line of the report, not an error.
 

@@ -8,9 +8,10 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import partial
 from inspect import signature
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -32,6 +33,7 @@ from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.taking import takes
 
 D = TypeVar("D")
 
@@ -261,10 +263,23 @@ class Method:
         """Find a design for what was read, or refuse it."""
         raise NotImplementedError
 
+    def __new__(cls, *_: Any, **options: Any) -> Self:
+        """Refuse options that the method does not have, by name."""
+        known = [field.name for field in fields(cls) if field.init]
+        for name in options.keys() - known:
+            near = get_close_matches(name, known, 1)
+            raise ObsynthError(
+                f"{cls.__name__} has no option {name!r}"
+                + (f"; {near[0]!r} is meant" if near else f"; options are {', '.join(known)}"),
+                option=name,
+            )
+        return super().__new__(cls)
+
     def fix(self, model: Any, gains: Mapping[str, ArrayLike]) -> Any:
         """Complete a design with given gains, or refuse them."""
         raise NotImplementedError
 
+    @takes(model="Plant Split")
     def design(self, model: Any, bounds: JacobianBounds | None = None, at: Any = None) -> Observer:
         """Design, prove and return the observer.
 
@@ -339,6 +354,7 @@ class Method:
                 option="precision",
             )
 
+    @takes(model="Plant Split", gains="dict")
     def analyse(
         self,
         model: Any,

@@ -31,7 +31,7 @@ STATUS: Mapping[str, int] = {
 """Bits of the status that a step returns."""
 
 STEP_OUTPUTS = (
-    "memory",
+    "memory_next",
     "xhat",
     "fhat",
     "x_lower",
@@ -63,7 +63,7 @@ class Observer:
     model : Plant
         The discrete plant that the guarantee speaks of.
     step : casadi.Function
-        ``(memory, u, y) -> (memory, xhat, fhat, x_lower, x_upper, f_lower,
+        ``(memory, u, y) -> (memory_next, xhat, fhat, x_lower, x_upper, f_lower,
         f_upper, status)``. Called at instant k with u_k and y_k it returns what
         is known about x_k and f_{k - fault_delay}, and the memory for k + 1.
     memory_layout : mapping of str to slice

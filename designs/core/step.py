@@ -256,7 +256,7 @@ class Step:
         xhat = select(old.told, old.known.xhat, X.middle(self.precision))
         fhat = select(old.told, old.known.fhat, F.middle(self.precision))
         outputs = {
-            "memory": select(initialised, memory, self.memory),
+            "memory_next": select(initialised, memory, self.memory),
             # estimates of a core without sets are promised for states and faults of any size
             "xhat": old.known.xhat if old.known.x is None else X.nearest(xhat),
             "fhat": old.known.fhat if old.known.f is None else F.nearest(fhat),
@@ -266,7 +266,7 @@ class Step:
             "f_upper": self._shown(F.upper, 1.0),
             "status": self._status(initialised, void, have, F, old.known),
         }
-        return make_step(inputs, outputs)
+        return make_step(self.plant, inputs, outputs)
 
     def _returned(self, box: Ends, kind: int, void: ca.SX, initialised: ca.SX) -> Ends:
         """Return a set, the declared ranges where it is void, everything before the first call."""

@@ -12,6 +12,8 @@ from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import column, every, select
 from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
+from obsynth.designs.core.stepped import StepFunction, named_step
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
 MOST_CORNERS = 14
@@ -144,17 +146,14 @@ def status_word(bits: Mapping[str, ca.SX]) -> ca.SX:
     return word
 
 
-def make_step(inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) -> ca.Function:
+def make_step(
+    plant: Plant, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]
+) -> StepFunction:
     """Return `Observer.step` with its inputs (memory, u, y[, theta]) and outputs in their order."""
     names = [name for name in ("memory", "u", "y", "theta") if name in inputs]
     # what the two copies have in common is evaluated once
     sizes = np.cumsum([0, *(outputs[name].numel() for name in STEP_OUTPUTS)])
     together = ca.cse(ca.vertcat(*(ca.densify(outputs[name]) for name in STEP_OUTPUTS)))
-    return ca.Function(
-        "step",
-        [inputs[name] for name in names],
-        [together[a:b] for a, b in itertools.pairwise(sizes.tolist())],
-        names,
-        list(STEP_OUTPUTS),
-        {"allow_duplicate_io_names": True},
-    )
+    results = [together[a:b] for a, b in itertools.pairwise(sizes.tolist())]
+    given = [inputs[name] for name in names]
+    return named_step(ca.Function("step", given, results, names, list(STEP_OUTPUTS)), plant)

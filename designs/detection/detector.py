@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,6 +21,7 @@ from obsynth.designs.core.observer import (
     STEP_OUTPUTS,
     Observer,
 )
+from obsynth.designs.core.stepped import StepFunction, named_step
 from obsynth.designs.core.stepping import counter
 from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.window import Window
@@ -241,10 +243,10 @@ class FaultDetector:
         )
 
     @cached_property
-    def step(self) -> ca.Function:
+    def step(self) -> StepFunction:
         """Observer and decision as one step, with the further output ``alarm``.
 
-        (memory, u, y[, theta]) -> (memory, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
+        (memory, u, y[, theta]) -> (memory_next, xhat, fhat, x_lower, x_upper, f_lower, f_upper,
         status, alarm[, mean_lower, mean_upper, mean_status]); the memory is the observer's with
         the counters, and what the means remember, behind it.
         """
@@ -268,12 +270,10 @@ class FaultDetector:
         outputs[0] = ca.vertcat(outputs[0], count, following)
         results = [ca.densify(output) for output in (*outputs, alarm, *means)]
         labels = [*STEP_OUTPUTS, ALARM_OUTPUT, *(MEAN_OUTPUTS if means else ())]
-        options = {"allow_duplicate_io_names": True}
-        composed = ca.Function("step", ports, results, names, labels, options)
-        try:
-            return composed.expand("step", options)
-        except RuntimeError:
-            return composed
+        composed = ca.Function("step", ports, results, names, labels)
+        with suppress(RuntimeError):
+            composed = composed.expand("step")
+        return named_step(composed, self.model)
 
     @property
     def memory_layout(self) -> dict[str, slice]:

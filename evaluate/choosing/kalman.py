@@ -77,13 +77,14 @@ class ExtendedKalman:
         moved, _, A, _ = self.both(mean, u, rho)
         A = ca.diag(1.0 / half[:kept]) @ A @ ca.diag(half)
         after = ca.vertcat(clip(moved[:n], box), moved[n:], ca.vec(A @ P @ A.T + self.walk))
-        outputs = {"memory": after, "status": ca.SX(0)}
+        outputs = {"memory_next": after, "status": ca.SX(0)}
         for letter, part in (("x", slice(0, n)), ("f", slice(kept - len(plant.f), kept))):
             outputs[f"{letter}hat"] = mean[part]
             outputs[f"{letter}_lower"] = mean[part] - reach[part]
             outputs[f"{letter}_upper"] = mean[part] + reach[part]
         inputs = {"memory": memory, "u": u, "y": y}
-        return make_step({**inputs, "theta": known} if known.numel() else inputs, outputs)
+        given = {**inputs, "theta": known} if known.numel() else inputs
+        return make_step(plant, given, outputs)
 
     def memory0(self, guess: Any, **_: Any) -> FloatArray:
         """Return the memory for a first state, with the variances of the declared ranges."""

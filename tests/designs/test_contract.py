@@ -289,6 +289,13 @@ def test_the_step_keeps_the_contract(observer):
     measured = [s for s in model.rho if s.measured]
     names = ["memory", "u", "y", "theta"]
     assert step.name_in() == names[: step.n_in()] and step.name_out() == list(STEP_OUTPUTS)
+    memory, given = observer.memory0(guess(observer)), held(observer)
+    many = step.mapaccum(3)(memory, *(np.tile(part[:, None], 3) for part in given))
+    for k in range(3):
+        told = outputs(observer, memory, given)
+        for name, all_of_them in zip(STEP_OUTPUTS, many, strict=True):
+            np.testing.assert_array_equal(np.array(all_of_them)[:, k], told[name])
+        memory = told["memory_next"]
     n, n_f, m = len(model.x), len(model.f), len(model.output_names)
     size = max(part.stop for part in observer.memory_layout.values())
     assert [step.numel_in(i) for i in range(3)] == [size, len(model.u), m]
@@ -335,14 +342,14 @@ def test_a_missing_measurement_is_told_and_survived(observer):
     given = held(observer)
     memory = observer.memory0(guess(observer), y0=given[1])
     for _ in range(3):
-        memory = outputs(observer, memory, given)["memory"]
+        memory = outputs(observer, memory, given)["memory_next"]
     for bad in (np.nan, np.inf):
         y = given[1].copy()
         y[0] = bad
         told = outputs(observer, memory, held(observer, y))
         assert int(told["status"][0]) & (2 | 8 | 32) == 32
         assert np.isfinite(told["xhat"]).all() and np.isfinite(told["fhat"]).all()
-        after = outputs(observer, told["memory"], given)
+        after = outputs(observer, told["memory_next"], given)
         assert np.isfinite(after["xhat"]).all() and np.isfinite(after["fhat"]).all()
         assert not int(after["status"][0]) & (2 | 8 | 32)
         assert (after["x_lower"] <= after["x_upper"]).all()
@@ -354,11 +361,11 @@ def test_a_missing_input_begins_the_sets_anew(observer):
         pytest.skip("no inputs")
     memory = observer.memory0(guess(observer), y0=given[1])
     for _ in range(3):
-        memory = outputs(observer, memory, given)["memory"]
+        memory = outputs(observer, memory, given)["memory_next"]
     told = outputs(observer, memory, [np.full_like(given[0], np.nan), *given[1:]])
     assert int(told["status"][0]) & (2 | 8) == 2
-    assert told["memory"][observer.memory_layout["age"]] == 0
-    after = outputs(observer, told["memory"], given)
+    assert told["memory_next"][observer.memory_layout["age"]] == 0
+    after = outputs(observer, told["memory_next"], given)
     assert not int(after["status"][0]) & (2 | 8)
     assert (after["x_lower"] <= after["x_upper"]).all()
 
@@ -377,7 +384,7 @@ def test_an_impossible_reading_is_void_and_forgotten(entry, observer):
         x_range = near if np.isfinite(near).all() else None
         memory = observer.memory0(other, x_range=x_range, y0=given[1])
         for _ in range(3):
-            memory = outputs(observer, memory, given)["memory"]
+            memory = outputs(observer, memory, given)["memory_next"]
         memories.append(memory)
     y = given[1] + 1e20
     told = [outputs(observer, memory, held(observer, y)) for memory in memories]
@@ -393,13 +400,13 @@ def test_an_impossible_reading_is_void_and_forgotten(entry, observer):
         x_box = observer.model.box("x")
         np.testing.assert_array_equal(one["x_lower"], x_box[:, 0])
         np.testing.assert_array_equal(one["x_upper"], x_box[:, 1])
-        assert one["memory"][layout["age"]] == 0
-        assert one["memory"][layout["begin"]] == one["memory"][layout["begin_2"]] == 1
+        assert one["memory_next"][layout["age"]] == 0
+        assert one["memory_next"][layout["begin"]] == one["memory_next"][layout["begin_2"]] == 1
     shared = contract_of(observer).guard(observer.certificate.design).shared
     kept = np.ones(len(memories[0]), dtype=bool)
     for part in shared:
         kept[layout[part]] = False
-    follow = [one["memory"] for one in told]
+    follow = [one["memory_next"] for one in told]
     recovery = entry.method.recovery
     for k in range(recovery + 2):
         after = [outputs(observer, memory, given) for memory in follow]
@@ -407,7 +414,7 @@ def test_an_impossible_reading_is_void_and_forgotten(entry, observer):
             for bound in ("x_lower", "x_upper", "f_lower", "f_upper"):
                 np.testing.assert_array_equal(after[0][bound], after[1][bound])
         assert bool(int(after[0]["status"][0]) & 64) == (k < recovery)
-        follow = [one["memory"] for one in after]
+        follow = [one["memory_next"] for one in after]
 
 
 def test_an_observer_pickles(observer):
@@ -419,7 +426,7 @@ def test_an_observer_pickles(observer):
         expected, told = outputs(observer, memory, given), outputs(again, memory, given)
         for name in STEP_OUTPUTS:
             np.testing.assert_array_equal(told[name], expected[name])
-        memory = expected["memory"]
+        memory = expected["memory_next"]
     assert again.record == observer.record
     assert str(again.guarantee) == str(observer.guarantee)
     np.testing.assert_equal(dict(again.gains), dict(observer.gains))

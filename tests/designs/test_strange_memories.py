@@ -98,17 +98,17 @@ def test_what_no_step_can_have_written_is_void_or_not_initialised(name):
         assert status & shown, f"{name}: {where} gives status {status}"
         if status & STATUS["not_initialised"]:
             assert where.startswith("initialised")
-            np.testing.assert_array_equal(said["memory"], arguments[0])
+            np.testing.assert_array_equal(said["memory_next"], arguments[0])
             continue
         k = next(k for k in range(WARM) if found[k][1] is arguments[1])
         for later in range(k + 1, k + AFTER):
-            said = told(observer, step, [said["memory"], *found[later][1:]])
+            said = told(observer, step, [said["memory_next"], *found[later][1:]])
             assert not int(said["status"][0]) & STATUS["void"], f"{name}: {where} lasts"
             assert np.isfinite(said["xhat"]).all()
             assert np.all(said["x_lower"] <= run.x[later])
             assert np.all(run.x[later] <= said["x_upper"])
         # nothing that is no number is left but ends of sets and bounds that are infinite
-        assert not np.isnan(said["memory"]).any(), f"{name}: {where} is remembered"
+        assert not np.isnan(said["memory_next"]).any(), f"{name}: {where} is remembered"
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -131,7 +131,7 @@ def test_no_memory_spoils_a_bound(name):
                 assert not wrong.any(), f"{name}: {kind} {said}, status {status}"
                 assert status or not estimated or np.isfinite(said[f"{kind}hat"]).all()
             assert "alarm" not in said or np.isin(said["alarm"], (0, 1)).all()
-            arguments[0] = said["memory"]
+            arguments[0] = said["memory_next"]
 
 
 def test_strange_counters_count_as_none():

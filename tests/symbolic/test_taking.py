@@ -1,7 +1,10 @@
 """Front doors refuse what they do not take, and tuples of symbols are no expressions."""
 
 import operator
+import pickle
 
+import numpy as np
+import pandas as pd
 import pytest
 import sympy as sp
 
@@ -24,6 +27,9 @@ from obsynth.symbolic.taking import takes
         lambda h: h**2,
         lambda h: sp.Symbol("v") - h,
         lambda h: sp.Symbol("v") * h,
+        np.sqrt,
+        sp.sin,
+        sp.tanh,
     ],
 )
 def test_a_forgotten_unpacking_is_told(mistake):
@@ -37,6 +43,111 @@ def test_tuples_of_symbols_are_tuples():
     x, u = plant.states("x1:3", range=(0, 1)), plant.inputs("u", range=(0, 1))
     assert x + u == (*x, *u) and type(x + u) is tuple
     assert sp.Matrix(x).shape == (2, 1) and isinstance(x, tuple) and len(x) == 2
+
+
+def test_functions_of_numpy_take_expressions():
+    (h,) = ob.Plant("tank").states("h", range=(1, 2))
+    assert np.sqrt(2 * h) == sp.sqrt(2 * h) and np.maximum(h, 0) == sp.Max(h, 0)
+    assert np.arctan2(h, np.float64(2)) == sp.atan2(h, 2.0) and (np.float64(2) < h) == (h > 2.0)
+    assert list(np.array([1, 2]) * h) == [h, 2 * h] and np.add.reduce([h, h]) == 2 * h
+    for function in (np.cbrt, lambda x: np.hypot(x, 1)):
+        with pytest.raises(TypeError, match="has no form for the expression h: write it in SymPy"):
+            function(h)
+
+
+def tank(rows=lambda h, v: [v - h]):
+    plant = ob.Plant("tank")
+    (h,), (v,) = plant.states("h", range=(1, 9)), plant.inputs("v", range=(0, 9), nominal=2)
+    plant.dynamics(rows(h, v))
+    plant.outputs([h, 2 * h], names="level weight")
+    return plant
+
+
+@pytest.fixture(scope="module")
+def observer():
+    return ob.BoundedErrorUIO().design(tank().discretise("euler", Ts=0.1))
+
+
+MISTAKES = {
+    "an exponential of a tuple": (
+        lambda: tank(lambda h, v: [sp.exp(ob.Plant("t").states("h"))]),
+        r"dynamics row 1: a tuple of symbols \(h\) .* take it apart",
+    ),
+    "an array for a scalar": (
+        lambda: tank(lambda h, v: [np.array([1.0, 2.0]) * h]),
+        "dynamics row 1: .* one scalar to a row",
+    ),
+    "a state without an equation": (
+        lambda: tank(lambda h, v: []),
+        r"0 rows for 1 states \(h\): give one for each, in this order",
+    ),
+    "a range the wrong way round": (
+        lambda: ob.Plant("t").states("a", range=(sp.Float(3), sp.Float(1))),
+        r"state a: the range \(3.0, 1.0\) is empty; give the lower bound first",
+    ),
+    "a name used twice": (lambda: tank().inputs("h"), "input h: the name is taken by the state h"),
+    "an equation for a right side": (
+        lambda: tank(lambda h, v: [sp.Eq(h, v)]),
+        "is a condition; give the right-hand side alone",
+    ),
+    "a misspelt option": (lambda: ob.HinfUIO(gama=1), "HinfUIO has no option 'gama'"),
+    "a plant in continuous time": (
+        lambda: ob.BoundedErrorUIO().design(tank()),
+        r"tank is in continuous time .* call discretise\(",
+    ),
+    "a number for a plant": (lambda: ob.BoundedErrorUIO().design(3), "design takes model as a Pl"),
+    "gains by themselves": (
+        lambda: ob.BoundedErrorUIO().analyse(tank(), np.ones((2, 3))),
+        r"analyse takes gains as a mapping \(by label\); it was given a ndarray",
+    ),
+    "an observer for a plant": (lambda: ob.split([1]), "split takes model as a Plant .* list of"),
+    "a plant for a path": (lambda: ob.report(tank(), None), "path as a Path .* given a Plant"),
+    "a method that is none": (
+        lambda: tank().discretise("eulr", 1),
+        "'eulr' is unknown; methods are euler, rk4, taylor",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_told_with_its_mend(mistake):
+    call, message = MISTAKES[mistake]
+    with pytest.raises(ob.ObsynthError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([[2.0], [5.0]], r"y has 1 number for 2 outputs \(level, weight\)"),
+        ([[2.0], 5.0], r"y has 1 number for 2 outputs"),
+        ([[2.0], [5.0, 10.0, 1.0]], r"y has 3 numbers for 2 outputs \(level, weight\)"),
+        ([[2.0, 2.0], [5.0, 10.0]], r"u has 2 numbers for 1 inputs \(v\)"),
+        ([[2.0], [5.0, None]], "nan for a reading that is missing; not list"),
+        ([[2.0], None], "nan for a reading that is missing; not NoneType"),
+        ([[2.0], "high"], r"y is an array of numbers, .*nan for a reading .* not str 'high'"),
+        (
+            [[2.0], pd.Series({"weight": 10.0, "level": 5.0})],
+            r"y is a Series with the labels \['weight', 'level'\].* y\[\['level', 'weight'\]\]",
+        ),
+        ([[2.0]], r"step takes \(memory, u, y\), each once; it was given 2 arguments"),
+        ([np.array([2.0]), pd.Series([5.0, 10.0])], None),
+        ([2, np.array([[5.0, 10.0]]).T], None),
+    ],
+)
+def test_a_step_takes_as_many_numbers_as_there_are_signals(observer, given, message):
+    """CasADi fills a vector with one number, reads labels in any order and none as zero.
+
+    Mutants: sizes not compared; labels not looked at.
+    """
+    memory = observer.memory0([5.0])
+    if message is None:
+        assert len(observer.step(memory, *given)) == 8
+        return
+    with pytest.raises(ob.ObsynthError, match=message):
+        observer.step(memory, *given)
+    with pytest.raises(ob.ObsynthError, match=r"entries of the memory \(observer.memory0"):
+        pickle.loads(pickle.dumps(observer)).step(memory[1:], [2.0], [5.0, 10.0])
 
 
 CAR = ob.plants.cruise_control

@@ -12,8 +12,10 @@ from obsynth.derive.forms.qpv.polynomial import read_coefficients
 from obsynth.derive.forms.scheduling import make_schedule
 from obsynth.derive.forms.varying import prove_rows
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 
+@takes(model="Plant")
 def qpv(
     model: Plant,
     form_of_N: Literal["upper", "symmetric"] = "upper",

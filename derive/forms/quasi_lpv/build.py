@@ -26,8 +26,10 @@ from obsynth.derive.forms.quasi_lpv.terms import (
 from obsynth.derive.forms.scheduling import make_schedule
 from obsynth.derive.forms.varying import Layout, prove_rows
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import takes
 
 
+@takes(model="Plant")
 def quasi_lpv(
     model: Plant,
     prefer: Sequence[Any] | Mapping[Any, Any] | None = None,

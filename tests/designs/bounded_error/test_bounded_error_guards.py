@@ -158,7 +158,7 @@ def test_a_start_box_that_is_too_small_is_noticed(given_peak, alone, tank):
 
 
 def step(observer, memory, u=(10.0, 10.0), y=(128.0, 168.0, 30.0)):
-    names = ("memory", "xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper", "status")
+    names = ("memory_next", "xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper", "status")
     values = observer.step(memory, list(u), list(y))
     return {name: np.array(v).ravel() for name, v in zip(names, values, strict=True)}
 
@@ -167,7 +167,7 @@ def test_not_initialised(base):
     out = step(base, np.zeros(base.step.size1_in(0)))
     assert int(out["status"][0]) & 1
     assert np.all(np.isinf(out["x_lower"]))
-    assert np.all(out["memory"] == 0)
+    assert np.all(out["memory_next"] == 0)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -176,10 +176,10 @@ def test_a_missing_reading_leaves_what_the_equations_say(base, alone, bad):
     for observer in (base, alone(base)):
         memory = observer.memory0([125, 165, 25, 35], x_range=box)
         good = step(observer, memory)
-        out = step(observer, good["memory"], y=(128.0, bad, 30.0))
+        out = step(observer, good["memory_next"], y=(128.0, bad, 30.0))
         assert int(out["status"][0]) & (2 | 8 | 32) == 32
-        assert np.all(np.isfinite(out["xhat"])) and np.all(np.isfinite(out["memory"]))
-        later = step(observer, out["memory"])
+        assert np.all(np.isfinite(out["xhat"])) and np.all(np.isfinite(out["memory_next"]))
+        later = step(observer, out["memory_next"])
         assert np.all(np.isfinite(later["xhat"])) and np.all(np.isfinite(later["x_upper"]))
         # without the equations nothing bounds a fault whose range is not declared
         assert np.all(np.isfinite(later["f_upper"])) == (observer is base)
@@ -192,7 +192,7 @@ def test_a_missing_input_begins_the_sets_anew(base):
     out = step(base, memory, u=(np.nan, 10.0))
     assert int(out["status"][0]) & 2
     assert np.all(np.isfinite(out["x_lower"]))
-    later = step(base, out["memory"])
+    later = step(base, out["memory_next"])
     assert later["x_upper"][3] - later["x_lower"][3] == pytest.approx(95, rel=1e-9)
     assert int(later["status"][0]) == 16
 
@@ -210,7 +210,7 @@ def test_leaving_the_domain_is_flagged_and_survived(base):
     memory = base.memory0([125, 165, 25, 35])
     out = step(base, memory, y=(-50.0, 20.0, -4.0))
     assert int(out["status"][0]) & 8
-    assert np.all(np.isfinite(out["memory"]))
+    assert np.all(np.isfinite(out["memory_next"]))
 
 
 @pytest.mark.long
@@ -227,9 +227,9 @@ def test_bounds_return_after_a_missing_measurement(alone):
         memory = one.memory0([40], x_range=[[30, 50]])
         lost = step(one, memory, u=[5], y=[np.nan])
         assert (lost["x_lower"][0], lost["x_upper"][0]) == (30, 50)
-        back = step(one, lost["memory"], u=[5], y=[40.0])
+        back = step(one, lost["memory_next"], u=[5], y=[40.0])
         assert np.isfinite(back["x_upper"][0])
-        far = np.array(lost["memory"])
+        far = np.array(lost["memory_next"])
         far[one.memory_layout["fhat"]] = 3000.0
         # an estimate far off is of no use: it is placed anew
         again = step(one, far, u=[5], y=[40.0])
@@ -253,7 +253,7 @@ def test_rounding_of_a_step_is_within_its_allowance(base, design, run):
         z = design.T @ run.xhat[k]
         memory[layout["z"]], memory[layout["fhat"]] = z, run.fhat[k]
         memory[layout["initialised"]] = 1.0
-        after = step(base, memory, run.u[k], run.y[k])["memory"]
+        after = step(base, memory, run.u[k], run.y[k])["memory_next"]
         exact = [
             [sp.Rational(float(v)) for v in row] for row in (z, run.y[k], run.u[k], run.fhat[k])
         ]

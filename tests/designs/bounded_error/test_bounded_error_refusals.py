@@ -92,7 +92,7 @@ def test_options(options, message):
 
 
 def test_unknown_option_is_refused():
-    with pytest.raises(TypeError, match="gama"):
+    with pytest.raises(ob.ObsynthError, match="no option 'gama'; 'gamma' is meant"):
         ob.BoundedErrorUIO(gama=0.1)
 
 

@@ -421,7 +421,7 @@ def test_a_glitch_of_one_sensor_raises_no_false_alarm(peak, tank, size):
     _, y = (np.array(v) for v in truth(x, u, *zeros))
     y[0, at] += size
     near = np.column_stack([x - 1, x + 1])
-    many = detector.step.mapaccum("many", steps, {"allow_duplicate_io_names": True})
+    many = detector.step.mapaccum(steps)
     *_, lower, upper, status, alarm = many(detector.memory0(x, x_range=near), u, y)
     status = np.array(status).ravel().astype(int)
     run = SimpleNamespace(

@@ -42,7 +42,7 @@ def test_the_step_is_the_runge_kutta_step_of_the_ode(designed):
     k3 = rate(memory + h / 2 * k2)
     k4 = rate(memory + h * k3)
     expected = memory + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    found = call(observer, memory, y, theta)["memory"]
+    found = call(observer, memory, y, theta)["memory_next"]
     np.testing.assert_allclose(found[:6], expected[:6], rtol=1e-13, atol=1e-13)
     # the level in closed form: V' = alpha_q (1 - V)
     level = observer.memory_layout["level"]
@@ -69,7 +69,7 @@ def test_a_memory_of_zeros_is_not_initialised(designed):
     zeros = np.zeros(designed("noise").step.numel_in(0))
     found = call(designed("noise"), zeros)
     assert "not_initialised" in bits(found)
-    assert not found["memory"].any() and np.isinf(found["f_upper"]).all()
+    assert not found["memory_next"].any() and np.isinf(found["f_upper"]).all()
     assert not np.array(designed("noise").ode(zeros, U, CENTRE, THETA)).any()
 
 
@@ -120,7 +120,7 @@ def test_scheduling_outside_its_range_is_told(designed):
     assert {"outside_domain", "fault_not_valid"} <= bits(found)
     np.testing.assert_allclose(found["x_upper"], CENTRE + NOISE, rtol=1e-12)
     lost = call(designed("box_tight"), near(designed("box_tight"), 1e-3), theta=[0.5, -0.01])
-    assert "fault_not_valid" in bits(call(designed("box_tight"), lost["memory"]))
+    assert "fault_not_valid" in bits(call(designed("box_tight"), lost["memory_next"]))
 
 
 def test_an_innovation_that_no_error_in_the_set_explains(designed):
@@ -145,8 +145,8 @@ def test_a_bound_begins_anew_after_a_missing_measurement(designed):
             # of this instant all is known from before
             assert bits(found) == {"measurement_left_out"}
             np.testing.assert_array_equal(found["f_upper"], before["f_upper"])
-            assert np.isfinite(found["memory"][:6]).all()
-            after = call(observer, found["memory"])
+            assert np.isfinite(found["memory_next"][:6]).all()
+            after = call(observer, found["memory_next"])
             assert "measurement_left_out" not in bits(after)
             assert ("fault_not_valid" in bits(after)) is (name == "box_tight")
 

@@ -94,7 +94,7 @@ def test_a_reading_that_is_held_counts_as_a_disturbance(observer, design):
             low, high = float(found["x_lower"]), float(found["x_upper"])
             inside = float(found["f_lower"]) <= f <= float(found["f_upper"])
             outside += int(not (low <= x <= high and inside))
-            memory = found["memory"]
+            memory = found["memory_next"]
             # x' = -(1 + theta) x + f x + u + w with w = y - x, held y, in closed form
             a, b = -(1 + theta) + f - 1, u + y
             x = (x + b / a) * np.exp(a * h) - b / a
