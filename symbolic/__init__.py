@@ -5,12 +5,15 @@ from obsynth.symbolic import records as records
 from obsynth.symbolic import scenarios as scenarios
 from obsynth.symbolic.convert import nearest_double as nearest_double
 from obsynth.symbolic.convert import to_sx as to_sx
+from obsynth.symbolic.delays import delayed as delayed
 from obsynth.symbolic.errors import ObsynthError as ObsynthError
 from obsynth.symbolic.errors import ObsynthWarning as ObsynthWarning
 from obsynth.symbolic.errors import PlantError as PlantError
 from obsynth.symbolic.errors import RecordError as RecordError
 from obsynth.symbolic.functions import phi1 as phi1
 from obsynth.symbolic.functions import tanhc as tanhc
+from obsynth.symbolic.pieces import lookup as lookup
+from obsynth.symbolic.pieces import sat as sat
 from obsynth.symbolic.plant import Plant as Plant
 from obsynth.symbolic.plant_file import read_plant as read_plant
 from obsynth.symbolic.reading import read_record as read_record

@@ -28,6 +28,7 @@ from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue,
 
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import ALIASES, BY_CLASS, BY_NAME
+from obsynth.symbolic.pieces import COMPOSED
 
 WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
 """Words of the language that cannot name a symbol."""
@@ -290,22 +291,25 @@ class _Reader:
     def _call(self, token: _Token) -> sp.Basic:
         if token.text in ("piecewise", "Piecewise"):
             return self._piecewise(token)
-        function = BY_NAME.get(ALIASES.get(token.text, token.text))
-        if function is None:
-            self._fail(
-                f"the function {token.text} is not supported; supported are "
-                f"{', '.join(sorted(BY_NAME))}, piecewise",
-                token.position,
-            )
+        known = BY_NAME.get(ALIASES.get(token.text, token.text))
+        if known is None and token.text not in COMPOSED:
+            names = ", ".join(sorted({*BY_NAME, *COMPOSED}))
+            told = f"the function {token.text} is not supported; supported are {names}, piecewise"
+            self._fail(told, token.position)
+        own = known and (known.sympy, known.least, known.most)
+        make, least, most = own or COMPOSED[token.text]
         self._expect("(")
         arguments = [self._number(self._condition)]
         while self._take(","):
             self._another(arguments, self._number(self._condition))
         self._expect(")")
-        most = len(arguments) if function.most is None else function.most
-        if not function.least <= len(arguments) <= most:
+        if not least <= len(arguments) <= (len(arguments) if most is None else most):
             self._fail(f"{token.text} does not take {len(arguments)} arguments", token.position)
-        return self._finite(function.sympy(*arguments), token.position)
+        try:
+            made = make(*arguments)
+        except PlantError as error:
+            self._fail(str(error), token.position)
+        return self._finite(made, token.position)
 
     def _piecewise(self, token: _Token) -> sp.Expr:
         pairs: list[Any] = []

@@ -67,10 +67,13 @@ from .symbolic import PlantError as PlantError
 from .symbolic import Record as Record
 from .symbolic import RecordError as RecordError
 from .symbolic import Scenario as Scenario
+from .symbolic import delayed as delayed
+from .symbolic import lookup as lookup
 from .symbolic import plants as plants
 from .symbolic import read_plant as read_plant
 from .symbolic import read_record as read_record
 from .symbolic import records as records
+from .symbolic import sat as sat
 from .symbolic import scenarios as scenarios
 
 __version__: str
