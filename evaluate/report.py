@@ -13,10 +13,16 @@ from obsynth.designs.core.observer import Observer
 from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import plot_widths
-from obsynth.evaluate.plotting.layout import panels, style
+from obsynth.evaluate.plotting.layout import style
 from obsynth.evaluate.plotting.plots import plot_errors, plot_run
 from obsynth.evaluate.run import Run, percent
-from obsynth.evaluate.svg import constants_html, equations_html, figure_svg, signals_table
+from obsynth.evaluate.svg import (
+    colour_of,
+    constants_html,
+    equations_html,
+    figure_svg,
+    signals_table,
+)
 from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
 from obsynth.symbolic.taking import takes
@@ -259,10 +265,15 @@ def _width_section(
     say("half widths")
     signals = (*plant.x, *plant.f)
     names, units = [s.name for s in signals], [s.unit for s in signals]
-    with style():
-        figure = _new_figure(7.4, 3.0)
-        plot_widths(widths, names, units, ax=figure)
-    section.add(_figure_html(figure, "widths", ""))
+    drawn = []
+    for unit in dict.fromkeys(units):
+        group = [i for i, own in enumerate(units) if own == unit]
+        with style():
+            figure, ax = _panel(1.9)
+            table = {label: [row[i] for i in group] for label, row in widths.items()}
+            plot_widths(table, [names[i] for i in group], [unit] * len(group), ax=ax, title="")
+        drawn.append((figure, ax))
+    section.add(_panels_html(drawn, "widths", "half widths", ""))
     rows = [[label, *map(_width, row), _width(sum(row))] for label, row in widths.items()]
     section.add(Table("Half widths in steady state", ["", *names, "sum"], rows)._repr_html_())
     return section
@@ -292,18 +303,14 @@ def _run_section(runs: Mapping[str, Sequence[Run]], say: Callable[[str], None]) 
             words = f"{', '.join(shown[:-1])} and {shown[-1]}"
             caption = f"{scenario}, {label}, seed {run.seed}: {words}"
             say(caption)
-            figure, axes = _panels(run)
-            with style():
-                plot_run(run, axes=axes)
-            section.add(_figure_html(figure, f"run{i}{j}", caption), _facts(run))
+            drawn = _panels(run, plot_run)
+            section.add(_panels_html(drawn, f"run{i}{j}", caption, caption), _facts(run))
         between = " between their guaranteed bounds"
         between = between if any(run.bounded for run in first.values()) else ""
         caption = f"{scenario}: errors{between}, settled"
         say(caption)
-        figure, axes = _panels(next(iter(first.values())))
-        with style():
-            plot_errors(first if len(first) > 1 else next(iter(first.values())), axes=axes)
-        section.add(_figure_html(figure, f"err{i}", caption))
+        drawn = _panels(first if len(first) > 1 else next(iter(first.values())), plot_errors)
+        section.add(_panels_html(drawn, f"err{i}", caption, caption))
     return section
 
 
@@ -312,11 +319,8 @@ def _record_section(every: "Sequence[Estimate]", say: Callable[[str], None]) -> 
     for i, told in enumerate(every):
         caption = f"{told.record.source}: estimate and interval"
         say(caption)
-        figure, axes = _panels(told)
-        with style():
-            plot_run(told, axes=axes)
-        table = replace(told.summary(), note="")
-        section.add(table._repr_html_(), _figure_html(figure, f"record{i}", caption))
+        table, drawn = replace(told.summary(), note=""), _panels(told, plot_run)
+        section.add(table._repr_html_(), _panels_html(drawn, f"record{i}", caption, caption))
         section.add(_bullets("In words", told.said))
     return section
 
@@ -327,24 +331,46 @@ def _facts(run: Run) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
 
 
-def _panels(run: "Run | Estimate") -> tuple[Any, Any]:
-    """Make a figure with one panel for each estimated signal, two beside each other."""
-    count = len(run.estimated)
-    with style():
-        figure = _new_figure(7.4, 0.6 + 1.45 * ((count + 1) // 2))
-        return figure, panels(figure, count)
+Drawn = list[tuple[Any, Any]]
 
 
-def _new_figure(width: float, height: float) -> Any:
+def _panels(shown: Any, plot: Callable[..., Any]) -> Drawn:
+    """Draw a figure for each estimated signal, so that a page sets as many in a row as fit."""
+    first = next(iter(shown.values())) if isinstance(shown, Mapping) else shown
+    drawn = []
+    for name in first.estimated:
+        with style():
+            figure, ax = _panel(1.6)
+            plot(shown, signals=[name], axes=[ax])
+        drawn.append((figure, ax))
+    return drawn
+
+
+def _panel(height: float) -> tuple[Any, Any]:
+    """Make a figure as wide as a telephone in inches, whose letters stay legible there."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(4.2, height), layout="constrained")
+    return figure, figure.subplots()
 
 
-def _figure_html(figure: Any, key: str, caption: str) -> str:
-    picture = figure_svg(figure, key, caption or "bar plot")
-    words = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{picture}{words}</figure>"
+def _panels_html(drawn: Drawn, key: str, label: str, caption: str) -> str:
+    """Set figures beside each other, their lines named once above them."""
+    named: dict[str, str] = {}
+    pictures = []
+    for i, (figure, ax) in enumerate(drawn):
+        for line, word in zip(*ax.get_legend_handles_labels(), strict=True):
+            named.setdefault(word, colour_of(line))
+        for legend in (*figure.legends, ax.get_legend()):
+            if legend is not None:
+                legend.remove()
+        picture = figure_svg(figure, f"{key}{i}", f"{label}: {ax.get_ylabel() or caption}")
+        pictures.append(f"<figure>{picture}</figure>")
+    keys = "".join(
+        f'<span style="--key:{colour}">{html.escape(word)}</span>' for word, colour in named.items()
+    )
+    words = f'<p class="caption">{html.escape(caption)}</p>' if caption else ""
+    return f'<div class="keys">{keys}</div><div class="panels">{"".join(pictures)}</div>{words}'
 
 
 def _highlights(

@@ -17,10 +17,10 @@ from obsynth.symbolic import Plant
 # Drawn in these colours, shown in the page's own, so that dark pages have light ink.
 _VARIABLES = {INK: "var(--ink)", SOFT: "var(--soft)"}
 
-# A hundredth of a point is invisible and a third of the page.
-_LONG = re.compile(r"(\d+\.\d\d)\d+")
+# Less than a tenth of a point is invisible and half of the page.
+_LONG = re.compile(r"(\d+\.\d)\d+")
 
-_SETTINGS = {"svg.fonttype": "path", "svg.hashsalt": "obsynth", "path.simplify": True}
+_SETTINGS = {"svg.hashsalt": "obsynth", "path.simplify": True}
 
 
 def figure_svg(figure: Any, key: str, label: str) -> str:
@@ -28,9 +28,20 @@ def figure_svg(figure: Any, key: str, label: str) -> str:
     import matplotlib as mpl
 
     buffer = io.StringIO()
-    with mpl.rc_context(_SETTINGS):
+    with mpl.rc_context({**_SETTINGS, "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    return _inline(buffer.getvalue(), key, label)
+    text = _inline(buffer.getvalue(), key, label)
+    return re.sub(r' d="M[^"]*"', lambda match: _LONG.sub(r"\1", match[0]), text)
+
+
+def colour_of(drawn: Any) -> str:
+    """Return the colour of a line, a bar or an area, as a page has it."""
+    from matplotlib.colors import to_hex
+
+    part = drawn[0] if isinstance(drawn, tuple) else drawn
+    given = part.get_color() if hasattr(part, "get_color") else part.get_facecolor()
+    found = to_hex(given[0] if np.ndim(given) > 1 else given)
+    return _VARIABLES.get(found, found)
 
 
 def math_svg(latex: str, key: str, size: float = 12.0) -> str | None:
@@ -42,7 +53,7 @@ def math_svg(latex: str, key: str, size: float = 12.0) -> str | None:
     buffer = io.BytesIO()
     font = FontProperties(size=size, math_fontfamily="cm")
     try:
-        with mpl.rc_context({**_SETTINGS, "savefig.transparent": True}):
+        with mpl.rc_context({**_SETTINGS, "svg.fonttype": "path", "savefig.transparent": True}):
             math_to_image(f"${latex}$", buffer, prop=font, format="svg", color=INK)
     except ValueError:
         return None
@@ -62,7 +73,6 @@ def _inline(text: str, key: str, label: str) -> str:
     text = re.sub(r"url\(#", f"url(#{key}-", text)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
-    text = re.sub(r' d="[^"]*"', lambda match: _LONG.sub(r"\1", match[0]), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1).strip()
 
@@ -83,7 +93,9 @@ def equations_html(plant: Plant, key: str) -> str:
     for i, (left, plain, row) in enumerate(rows):
         formula = math_svg(f"{left} = {sp.latex(row)}".replace(r"\frac", r"\dfrac"), f"{key}{i}")
         shown = formula or f"<code>{html.escape(f'{plain} = {row}')}</code>"
-        lines.append(f'<div class="formula">{shown}</div>')
+        width = re.search(r'<svg[^>]* width="([\d.]+)pt"', shown)
+        natural = f' style="--natural:{width[1]}pt"' if width else ""
+        lines.append(f'<div class="formula"{natural}>{shown}</div>')
     return "\n".join(lines)
 
 

@@ -111,8 +111,11 @@ class Table:
         )
         body = []
         for i, row in enumerate(self.cells()):
+            # narrow pages set the cells of a row below each other, each with its column's head
             cells = "".join(
-                f"<td{kind}>{html.escape(cell)}</td>" for cell, kind in zip(row, right, strict=True)
+                f'<td{kind} data-head="{html.escape(head)}"{" data-none" if cell == "–" else ""}>'
+                f"{html.escape(cell)}</td>"
+                for cell, kind, head in zip(row, right, self.columns, strict=True)
             )
             body.append(
                 f'<tr class="marked">{cells}</tr>' if i in self.marked else f"<tr>{cells}</tr>"
@@ -120,7 +123,7 @@ class Table:
         note = f'<p class="note">{html.escape(self.note)}</p>' if self.note else ""
         title = f'<caption style="text-align:left">{html.escape(self.title)}</caption>'
         return (
-            f'<div class="table"><table>{title}'
+            f'<div class="table{" wide" * (len(self.columns) > 8)}"><table>{title}'
             f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{note}</div>"
         )
 

@@ -88,7 +88,7 @@ def _draw(
         finite = np.where(np.isfinite(values), values, 0.0)
         bars = ax.bar(at, finite, 0.92 * step, color=BARS[i % len(BARS)], label=label, linewidth=0)
         marks = [f"{v:.3g}" if np.isfinite(v) else "∞" for v in values]
-        ax.bar_label(bars, marks, fontsize=6.8, color=INK, padding=1.5)
+        ax.bar_label(bars, marks, fontsize=8.0, color=INK, padding=1.5)
     marked = zip(names, units, strict=True)
     ax.set_xticks(places, [f"{name}\n[{unit}]" if unit else name for name, unit in marked])
     ax.grid(visible=False, axis="x")

@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, opened
 
 from obsynth.evaluate import ReportError, Table, coverage_table, report
 from obsynth.evaluate import report as report_function
@@ -14,6 +15,9 @@ from obsynth.symbolic import Plant
 
 VOID = {"meta", "link", "br", "hr", "img", "input", "path", "use", "rect"}
 NUMBERS = Table("Bounds < printed", ["entry", "derived"], [["m13", 0.00504]], "why & how")
+
+
+WIDE = Table("Wide", [f"column {i}" for i in range(12)], [[f"{i}.123456" for i in range(12)]])
 
 
 class Strict(HTMLParser):
@@ -66,7 +70,7 @@ def page(tmp_path_factory, toy, toy_run):
         path,
         {"wide": toy.observer(toy.plant), "narrow": toy.observer(toy.plant)},
         runs={"wide": [toy_run], "narrow": [toy_run]},
-        tables={"Derived bounds": NUMBERS, "C code": [NUMBERS], "Errata": NUMBERS},
+        tables={"Derived bounds": NUMBERS, "C code": [NUMBERS, WIDE], "Errata": NUMBERS},
         lead="A toy.",
         progress=said.append,
     )
@@ -171,6 +175,18 @@ def test_a_write_that_fails_leaves_no_piece(toy, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk"):
         report(tmp_path / "report.html", toy.observer(toy.plant))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium")
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_browser_shows_all_of_it(page, tmp_path, width):
+    """Mutants: no rules of their own for narrow pages; panels two in a row there."""
+    found = opened(page, tmp_path, width)
+    assert found["width"] == width and found["page"] <= width
+    assert (found["trouble"], found["wide"], found["cut"]) == ([], [], [])
+    count, least = found["letters"]
+    assert count > 50 and least >= 9.0
+    assert max(found["figures"]) < 300_000
 
 
 def test_void_instants_and_kept_assumptions_do_not_contradict_each_other(toy_run):

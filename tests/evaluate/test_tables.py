@@ -16,5 +16,5 @@ def test_html_is_escaped_numbers_are_flush_right_and_marked_rows_marked():
     assert "x &lt; y" in text
     assert "a&amp;b" in text
     assert "n &gt; 1" in text
-    assert '<td class="number" style="text-align:right">1.5</td>' in text
-    assert '<tr class="marked"><td style="text-align:left">c</td>' in text
+    assert '<td class="number" style="text-align:right" data-head="value">1.5</td>' in text
+    assert '<tr class="marked"><td style="text-align:left" data-head="name">c</td>' in text
