@@ -128,7 +128,6 @@ class BoundedErrorUIO(Method):
         quiet=True,
         settle=settling,
         core=build_core,
-        single=True,
         shared=("z", "fhat", "prediction"),
     )
 

@@ -47,7 +47,7 @@ HORIZON = 400
 MOST_CALLS = 10**9
 """N of what is never given up."""
 MOST_COUNTED = 2**22
-"""N in single precision, whose whole numbers end at four times that."""
+"""N in single precision, whose whole numbers end at four times that; `MOST_CALLS` is never."""
 _LATE = 2
 YOUNG = "_2"
 """What the names of the younger copy's parts of the memory end with."""
@@ -83,7 +83,7 @@ class Watch:
         known = isinstance(named, list | tuple) and all(name in EVERY_CUT for name in named)
         counts = [n for n in (given, recovery) if isinstance(n, int) and 1 <= n <= MOST_CALLS]
         counted = MOST_CALLS if precision_of(options) == "double" else MOST_COUNTED
-        if not known or len(counts) < 2 or counts[0] > counted:
+        if not known or len(counts) < 2 or counted < counts[0] < MOST_CALLS:
             raise CertificateError(
                 f"the stored design cannot be read: horizon {horizon!r}, recovery {recovery!r} and "
                 f"cuts {cuts!r} are no options of the guard"

@@ -21,7 +21,7 @@ from obsynth.derive import JacobianBounds, split
 from obsynth.designs.core.certificate import Certificate, Claim, Guarantee, Level
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT
 from obsynth.designs.core.core import Core
-from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, MOST_COUNTED, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
@@ -80,7 +80,6 @@ class Contract(Generic[D]):
     settle: of a design, half widths of the sets that its core begins from, and a number of calls
         or None: how many calls its bounds take to settle, or that number, and its half widths from
         then on, all infinite where they cannot begin from such sets; None without any bounds
-    single: whether the step can run in single precision
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
         without, the declared ranges hold
     """
@@ -101,15 +100,6 @@ class Contract(Generic[D]):
     step_covered: bool = False
     settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
     quiet: bool = False
-    single: bool = False
-
-    @property
-    def refusal(self) -> str:
-        """Why a step in single precision is refused."""
-        return (
-            f"precision='single': rounding of the step of {self.name} is not proved in single "
-            "precision; take precision='double'"
-        )
 
     def to_record(self, design: Any) -> dict[str, Any]:
         """Return a design as JSON-able data with the header that `load` reads."""
@@ -118,8 +108,6 @@ class Contract(Generic[D]):
 
     def certify(self, design: Any, level: Level = "full", model: Any = None) -> Certificate:
         """Prove a design; `model`, what was read of the plant, spares deriving it again."""
-        if design.precision == "single" and not self.single:
-            raise CertificateError(f"the stored design cannot be read: {self.refusal}")
         claims = [*self.claims(design)]
         if level == "full" or model is not None:
             try:
@@ -241,8 +229,6 @@ class Method:
             raise ObsynthError(
                 f"cuts is {self.cuts!r}; it takes a tuple of {', '.join(EVERY_CUT)}", option="cuts"
             )
-        if self.precision == "single" and not self.CONTRACT.single:
-            raise ObsynthError(self.CONTRACT.refusal, option="precision")
         if self.precision == "single" and (self.horizon or 1) > MOST_COUNTED:
             raise ObsynthError(
                 f"horizon is {self.horizon}; precision='single' counts up to {MOST_COUNTED}: take "
@@ -394,7 +380,9 @@ class Method:
     def settling(self, seconds: float, Ts: float) -> Mapping[str, Any]:
         """Return the options with a default horizon of so many seconds."""
         most = MOST_CALLS if self.precision == "double" else MOST_COUNTED
-        calls = min(math.ceil(seconds / Ts), most) if self.horizon is None else self.horizon
+        calls = min(math.ceil(seconds / Ts), MOST_CALLS)
+        calls = calls if calls == MOST_CALLS else min(calls, most)
+        calls = calls if self.horizon is None else self.horizon
         return {**self.options(), "horizon": calls}
 
     def _checked(self, given: Any, bounds: JacobianBounds | None = None) -> Any:

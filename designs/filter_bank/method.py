@@ -92,7 +92,6 @@ class FilterBank(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         ode=build_ode,
         step_covered=True,
     )

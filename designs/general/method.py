@@ -73,7 +73,6 @@ class GeneralUIO(Method):
         quiet=True,
         settle=settling,
         core=build_core,
-        single=True,
         shared=("prediction",),
         fault_delay=fault_delay,
     )

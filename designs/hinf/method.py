@@ -129,7 +129,6 @@ class HinfUIO(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         shared=("prediction", "innovation", "running"),
         fault_delay=1,
     )

@@ -112,7 +112,6 @@ class IntervalObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         fault_delay=1,
         settle=half_widths_after,
     )

@@ -26,8 +26,8 @@ from obsynth.designs.qpv.lmis import (
     start_block,
 )
 from obsynth.designs.qpv.model import Derived
-from obsynth.designs.qpv.record import FASTEST, NoiseBound, QPVDesign, VertexData
-from obsynth.designs.qpv.step import allowance
+from obsynth.designs.qpv.record import ASSUMED, FASTEST, NoiseBound, QPVDesign, VertexData
+from obsynth.designs.qpv.rounding import needed
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.text import write_text
 
@@ -37,8 +37,8 @@ EXACT = "the worst ones also by exact rational LDL'"
 def claims(design: QPVDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     yield from prove_inequalities(design)
-    if design.bounded and allowance(design).proved:
-        yield _rounding(design)
+    if design.bounded and design.rounding != ASSUMED:
+        yield prove_rounding(design)
     product = design.fastest_mode * design.Ts
     yield Claim(
         "sampling",
@@ -138,15 +138,18 @@ def _error_set(P: FloatArray, sets: ErrorSets) -> Claim:
     )
 
 
-def _rounding(design: QPVDesign) -> Claim:
+def prove_rounding(design: QPVDesign) -> Claim:
     """Prove that the inequalities hold in E made larger by what rounding adds: P made smaller."""
-    added = allowance(design).value
-    larger = _error_set(design.P * (1.0 - 3.0 * added), design.sets)
+    added = design.rounding
+    larger = _error_set(design.P / (1.0 + 1.5 * added) ** 2, design.sets)
+    room = added - needed(design)
     return replace(
         larger,
         name="rounding",
         statement=f"rounding of the steps adds at most {added:.1e} to the root of V, and E made "
         "larger by that lies in the polytope of the error",
+        holds=larger.holds and room >= 0.0,
+        margin=min(larger.margin, room),
         proof=f"interval analysis of the rounding of every instruction; {larger.proof}",
     )
 

@@ -7,10 +7,12 @@ import numpy as np
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.guard import MOST_CALLS, Watch
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import about_centre, within
+from obsynth.designs.core.running import above
+from obsynth.designs.core.signals import IEEE, about_centre, within
 from obsynth.designs.qpv.claims import undisturbed
-from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.step import SETTLED, allowance, found_again, measured_schedule
+from obsynth.designs.qpv.equations import measured_schedule
+from obsynth.designs.qpv.record import ASSUMED, QPVDesign
+from obsynth.designs.qpv.step import SETTLED, found_again
 
 
 def numbers(design: QPVDesign) -> Numbers:
@@ -19,10 +21,11 @@ def numbers(design: QPVDesign) -> Numbers:
     horizon = Watch.of(design.options).horizon
     if design.bounded and (horizon == MOST_CALLS or found_again(design)):
         # without disturbances the bound shrinks for as long as a copy is kept at least
-        decay = 0.5 * design.alpha * design.Ts * Watch.of(design.options).calls
-        shrunk = 0.0 if design.noise is not None else min(decay, 0.5 * SETTLED)
+        up = above(design.precision, 4 * len(design.P))
+        decay = 0.5 * (design.alpha * design.Ts - np.log(up)) * Watch.of(design.options).calls
+        shrunk = 0.0 if design.noise is not None else min(max(decay, 0.0), 0.5 * SETTLED)
         left = float(np.exp(-shrunk)) * (1.0 + 2.0**-40)
-        widths = np.sqrt(design.inverse_diagonal) * (left + allowance(design).value)
+        widths = np.sqrt(design.inverse_diagonal) * ((left + design.rounding) * up**3)
     gains = {f"L{k}": gain for k, gain in enumerate(design.L, 1)} | {"P": design.P}
     return Numbers(gains, _performance(design), widths, ("eta",))
 
@@ -88,11 +91,10 @@ def _assumptions(design: QPVDesign) -> Iterator[str]:
         "formula leaves out of the flow of the ode is not bounded"
     )
     if design.bounded:
-        added = allowance(design)
         yield (
-            f"IEEE doubles, rounded to nearest, and inputs within their ranges (1e+06 where there "
-            f"is none): rounding then adds {added.value:.1e} of the error set to the intervals"
-            f"{'' if added.proved else ', which is not proved'}"
+            f"{IEEE[design.precision]}, rounded to nearest, and inputs within their ranges (1e+06 "
+            f"where there is none): rounding then adds {design.rounding:.1e} of the error set to "
+            f"the intervals{', which is not proved' if design.rounding == ASSUMED else ''}"
         )
     yield "state and faults stay in the ellipsoid of the region [monitored: status bit 4]"
     yield (

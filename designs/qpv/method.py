@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive import QPV
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.qpv.claims import claims, covers
+from obsynth.designs.qpv.claims import claims, covers, prove_rounding
 from obsynth.designs.qpv.defaults import default_sets, takes_rate
 from obsynth.designs.qpv.guarantee import guarantee, numbers
 from obsynth.designs.qpv.model import (
@@ -35,6 +36,7 @@ from obsynth.designs.qpv.model import (
 from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.designs.qpv.rounding import settle
 from obsynth.designs.qpv.step import (
     SETTLED,
     build_core,
@@ -51,6 +53,8 @@ from obsynth.symbolic.errors import ObsynthError
 
 ETA = Number(0.0, at_most=1.0, because="1 / eta enlarges the polytopes, so it lies in (0, 1]")
 DECAY = Number(at_least=0.0, because="a decay rate is not negative")
+TRIES = 4
+"""How often a design in single precision is solved for the room that its rounding needs."""
 ORDER = Number(at_least=2.0, because="the order s of the relaxation is an integer from 2 on")
 
 
@@ -268,6 +272,27 @@ class QPVObserver(Method):
         """Return the options as JSON-able data, the region apart."""
         return {name: value for name, value in super().options().items() if name != "region"}
 
+    def _rounded(self, setting: Setting, gains: FloatArray | None) -> QPVDesign:
+        """Solve; in single precision again, with room for what rounding adds."""
+        for _ in range(TRIES):
+            design = settle(synthesise(setting, self.options(), gains, self.Ts))
+            if self.precision == "double" or not design.bounded:
+                return design
+            if not np.isfinite(design.rounding):
+                break
+            if prove_rounding(design).holds:
+                return design
+            setting = replace(setting, room=2.0 * design.rounding)
+        half = np.sqrt(design.inverse_diagonal)
+        raise InfeasibleDesign(
+            "rounding in single precision leaves the error set no room: take precision='double'",
+            [
+                f"{name}: +-inf in single precision, +-{near:.3g} in doubles"
+                for name, near in zip(setting.model.form.names, half, strict=True)
+            ],
+            option="precision",
+        )
+
     def _fixed_eta(self, apart: bool) -> float | None:
         """Return the given eta; 1 for sets apart from each other, None to search it."""
         return 1.0 if self.eta is None and apart else self.eta
@@ -279,7 +304,7 @@ class QPVObserver(Method):
         check_faults(setting.data, setting.sets, model.form.names)
         if setting.printed:
             raise printed_refusal(setting, gains)
-        design = synthesise(setting, self.options(), gains, self.Ts)
+        design = self._rounded(setting, gains)
         rate = design.alpha if design.noise is None else design.noise.rate
         most = MOST_CALLS * design.Ts
         seconds = min(SETTLED / rate, most) if rate > 0.0 and found_again(design) else most

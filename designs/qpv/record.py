@@ -30,6 +30,10 @@ and is far from its limit of stability.
 """
 
 
+ASSUMED = 2.0**-40
+"""What rounding in doubles is assumed to add where no bound of it is of use."""
+
+
 @dataclass(frozen=True, eq=False)
 class VertexData:
     """Matrices of the augmented plant at the V vertices of the scheduling variables.
@@ -144,6 +148,8 @@ class QPVDesign(Design):
     inverse_diagonal: proved upper bounds of (P^-1)_ii
     reset: X - c lies in {e'P e <= reset^2}, proved
     Ts: sample time of the step
+    rounding: what rounding of all steps adds to the root of V at most, see `rounding`; `ASSUMED`
+        where that is not proved, 0 where no set follows from V
     options: the options of the method, as given
     """
 
@@ -170,6 +176,7 @@ class QPVDesign(Design):
     inverse_diagonal: Annotated[FloatArray, "n+n_f"]
     reset: float
     Ts: float
+    rounding: float
     options: Mapping[str, Any]
 
     @cached_property
@@ -239,7 +246,7 @@ class QPVDesign(Design):
                 f"the polytope of the error has {self.error.dimension} of {n} coordinates; those "
                 f"that enter are {self.sets.error_entering}"
             )
-        if self.Ts <= 0 or self.alpha < 0:
-            raise CertificateError("alpha or Ts of the stored design is negative")
+        if self.Ts <= 0 or self.alpha < 0 or self.rounding < 0:
+            raise CertificateError("alpha, Ts or rounding of the stored design is negative")
         if (self.gamma is None) == (self.norm == "hinf"):
             raise CertificateError("gamma of the stored design belongs to norm 'hinf'")

@@ -57,6 +57,7 @@ class Setting:
     polya: order of the relaxation
     gain_cap: largest singular value of every L_l
     printed: whether (19) and (20) are taken as printed
+    room: share of E that the polytope of the error has to hold beyond E, for rounding
     """
 
     model: QPVModel
@@ -66,6 +67,7 @@ class Setting:
     polya: int | None
     gain_cap: float | None
     printed: bool
+    room: float = 0.0
 
     @property
     def data(self) -> VertexData:
@@ -182,7 +184,7 @@ def _state_sets(problem: Problem, setting: Setting, P: Affine) -> None:
         problem.add_lmi("error set", start_block(P, normals / half), ">>")
         return
     problem.add_lmi("start", start_block(P, corners / half), ">>")
-    problem.add_lmi("error set", inside_block(P, normals * half), ">>")
+    problem.add_lmi("error set", inside_block(P, normals * half * (1.0 + setting.room)), ">>")
 
 
 def rough_objective(setting: Setting, gains: FloatArray | None = None) -> float:
@@ -268,6 +270,7 @@ def complete(setting: Setting, unknowns: Unknowns, options: Mapping[str, Any]) -
         inverse_diagonal=inverse_bounds(P, np.eye(n)),
         reset=region_factor(P, model.region.Q),
         Ts=1.0,
+        rounding=0.0,
         options=options,
     )
 

@@ -126,7 +126,6 @@ class SetAdaptiveObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         shared=MONITORS,
         ode=build_ode,
         step_covered=True,

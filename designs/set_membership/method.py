@@ -119,7 +119,6 @@ class SetMembershipObserver(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         shared=shared,
         settle=settling,
         fault_delay=fault_delay,

@@ -83,7 +83,7 @@ def test_no_truth_is_outside_of_a_set_in_single_precision(name):
     assert np.all(observer.half_widths >= (1.0 - 1e-9) * observer_of(name).half_widths)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, pytest.param("qpv_observer", marks=pytest.mark.long)])
 def test_no_number_of_a_step_is_beyond_single_precision(name):
     """Mutants: `Ends.of` without the precision; `FAR` for the end of a fault."""
     limits = LIMITS["single"]

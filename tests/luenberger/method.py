@@ -39,7 +39,6 @@ class Luenberger(Method):
         memory=memory_sizes,
         first=first_memory,
         core=build_core,
-        single=True,
         shared=("prediction",),
         settle=settling,
     )
