@@ -1,6 +1,6 @@
 """The plant: signals, dynamics and outputs as the control engineer writes them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import casadi as ca
@@ -15,13 +15,7 @@ from obsynth.symbolic.display import plant_html, plant_latex
 from obsynth.symbolic.equations import insert_faults, read_dynamics, read_outputs
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.from_casadi import plant_from_casadi
-from obsynth.symbolic.serialize import (
-    check_format,
-    fill_from_dict,
-    plant_to_dict,
-    read_field,
-    step_from_dict,
-)
+from obsynth.symbolic.serialize import plant_from_dict, plant_to_dict
 from obsynth.symbolic.signal_table import SignalTable, check_targets
 from obsynth.symbolic.signals import KINDS, LONGEST_NAME, Role, Signal, one_line
 from obsynth.symbolic.sxmodel import SxModel, build_sx
@@ -408,22 +402,8 @@ class Plant:
         return result
 
     from_casadi = classmethod(plant_from_casadi)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the complete plant as JSON-able data, expressions as text."""
-        return plant_to_dict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Plant":
-        """Read a plant from what :meth:`to_dict` returned; nothing is evaluated."""
-        check_format(data)
-        if "continuous" in data:
-            discretise = read_field(data, "discretise", dict)
-            original = cls.from_dict(read_field(data, "continuous", dict))
-            return original.discretise(**step_from_dict(discretise))
-        plant = cls(read_field(data, "name", str))
-        fill_from_dict(plant, data)
-        return plant
+    from_dict = classmethod(plant_from_dict)
+    to_dict = plant_to_dict
 
     def __repr__(self) -> str:
         time = "continuous" if self.Ts is None else f"Ts = {self.Ts:g} s"

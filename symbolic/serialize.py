@@ -99,20 +99,26 @@ def _read_pair(name: str, pair: Any) -> tuple[float, float]:
     return pair[0], pair[1]
 
 
-def fill_from_dict(plant: "Plant", data: Mapping[str, Any]) -> None:
-    """Declare in a new plant what stored data say."""
+def plant_from_dict(cls: type["Plant"], data: Mapping[str, Any]) -> "Plant":
+    """Read a plant from what `Plant.to_dict` returned; nothing is evaluated."""
+    check_format(data)
+    if "continuous" in data:
+        step = step_from_dict(read_field(data, "discretise", dict))
+        return plant_from_dict(cls, read_field(data, "continuous", dict)).discretise(**step)
+    plant = cls(read_field(data, "name", str))
     plant.add_signals([signal_from_dict(item) for item in read_field(data, "signals", list)])
-    step = read_field(data, "Ts", str, None)
+    Ts = read_field(data, "Ts", str, None)
     rows = read_field(data, "dynamics", list)
     if not all(isinstance(row, str) for row in rows):
         raise PlantError(f"stored plant: dynamics are texts, not {rows!r}", key="dynamics")
-    plant.dynamics(rows, Ts=None if step is None else read_text(step, {}))
+    plant.dynamics(rows, Ts=None if Ts is None else read_text(Ts, {}))
     outputs = read_field(data, "outputs", list)
     names = [_read_name(item) for item in outputs]
     units, texts = (
         [read_field(item, key, str) for item in outputs] for key in ("unit", "expression")
     )
     plant.outputs(texts, names=names, unit=units, range=[_read_ends(item) for item in outputs])
+    return plant
 
 
 def _row_text(row: sp.Expr, plant: "Plant") -> str:

@@ -82,7 +82,7 @@ def discretisation_remainder(
     Returns
     -------
     Remainder
-        Intervals with attained values; ``.as_disturbance()`` is the plant that carries them.
+        Intervals with attained values; ``Plant.discretise(remainder=True)`` carries them.
         ``order`` is the highest that helped.
 
     Raises

@@ -1,11 +1,10 @@
-"""Intervals for the local error of a discretisation, and the plant that carries them."""
+"""Intervals for the local error of a discretisation."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import Step
@@ -79,60 +78,6 @@ class Remainder:
         wide, real = self.upper - self.lower, self.attained_upper - self.attained_lower
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(wide <= 1e-250, 1.0, np.where(real > 0.0, wide / real, np.inf))
-
-    def as_disturbance(self, prefix: str = "r_") -> Plant:
-        """Return the discrete plant with the remainder as one more disturbance per state.
-
-        What is guaranteed for it holds for the continuous plant at the sampling instants, as long
-        as inputs, faults and disturbances are held over each step and the state is in its box.
-        Assumed ranges become ranges of the signals.
-
-        Parameters
-        ----------
-        prefix : str
-            Put before the names of the states.
-
-        Returns
-        -------
-        Plant
-            Discrete; states whose remainder is zero get no disturbance.
-
-        Raises
-        ------
-        DerivationError
-            A name that is taken.
-        """
-        step = self.plant.discretise(
-            self.formula.method,
-            self.exact_Ts,
-            self.formula.order if self.formula.method == "taylor" else None,
-            remainder=False,
-        )
-        result = Plant(step.name)
-        taken = {s.name for s in step.signals} | set(step.output_names)
-        signals = [
-            replace(s, lower=self.assumed[s.name][0], upper=self.assumed[s.name][1])
-            if s.name in self.assumed
-            else s
-            for s in step.signals
-        ]
-        result.add_signals(signals)
-        rows, outputs = list(step.equations[0]), step.equations[1]
-        for i, signal in enumerate(step.x):
-            if self.lower[i] == self.upper[i] == 0.0:
-                continue
-            name = prefix + signal.name
-            if name in taken:
-                raise DerivationError(
-                    f"the plant has a signal {name} already; choose another prefix=", symbol=name
-                )
-            pair = (float(self.lower[i]), float(self.upper[i]))
-            (symbol,) = result.disturbances([name], range=pair, unit=signal.unit)
-            rows[i] = rows[i] + symbol
-        result.dynamics(rows, Ts=step.exact_Ts)
-        units, ranges = list(step.output_units), step.output_ranges
-        result.outputs(list(outputs), names=step.output_names, unit=units, range=ranges)
-        return result
 
     def _table(self) -> list[tuple[str, ...]]:
         return [

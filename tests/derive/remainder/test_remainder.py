@@ -388,55 +388,14 @@ def test_jump_is_refused():
 # -- the plant that carries it ---------------------------------------------------------------------
 
 
-def test_remainder_becomes_a_disturbance_per_state():
-    found = certified("tank", "euler")
-    model = found.as_disturbance()
-    assert model.Ts == 1.0
-    assert model.names("w") == ("w1", "w2", "w3", "r_h1", "r_h2", "r_h3", "r_h4")
-    np.testing.assert_array_equal(model.box("w")[3:, 0], found.lower)
-    np.testing.assert_array_equal(model.box("w")[3:, 1], found.upper)
-    assert model.box("d").tolist() == [[-0.1, 0.1]]
-    assert [s.unit for s in model.w[3:]] == ["cm"] * 4
-    assert model.output_names == ("y1", "y2", "y3")
-    plain = plants.quadruple_tank().discretise("euler", Ts=1.0)
-    for i in range(4):
-        rest = model.rhs[i] - plain.rhs[i] - model.w[3 + i].symbol
-        assert (
-            sp.expand(rest.xreplace(dict(zip([s.symbol for s in model.f], [0, 0], strict=True))))
-            == 0
-        )
-
-
 def test_the_disturbed_plant_keeps_the_ranges_of_its_sensors():
-    """Mutant: as_disturbance forgets the ranges."""
+    """Mutant: the step forgets the ranges."""
     plant = Plant("decay")
     plant.states("x", range=(0, 1))
     plant.dynamics(["-x"])
     plant.outputs(["x"], range=(-1, sp.oo))
-    model = discretisation_remainder(plant, "euler", sp.Rational(1, 10)).as_disturbance()
+    model = plant.discretise("euler", sp.Rational(1, 10), remainder=True)
     assert model.output_ranges.tolist() == [[-1.0, np.inf]]
-
-
-def test_continuous_plant_is_covered_by_the_disturbed_one():
-    """One step of the discrete plant with some r in its range reaches the continuous solution."""
-    found = certified("van der Pol", "rk4")
-    model = found.as_disturbance()
-    errors, noise = local_errors(found, 500, seed=3)
-    box = model.box("w")
-    assert (errors >= (box[-2:, 0] - noise)[:, None]).all()
-    assert (errors <= (box[-2:, 1] + noise)[:, None]).all()
-
-
-def test_prefix_avoids_names_that_are_taken():
-    plant = Plant("taken")
-    (x,) = plant.states("x", range=(1, 2))
-    (r,) = plant.inputs("r_x", range=(0, 1))
-    plant.dynamics([r - x])
-    plant.outputs([x])
-    found = discretisation_remainder(plant, "euler", sp.Rational(1, 10))
-    with pytest.raises(DerivationError, match="r_x"):
-        found.as_disturbance()
-    assert found.as_disturbance(prefix="e_").names("w") == ("e_x",)
 
 
 def test_exact_step_gets_no_disturbance():
@@ -446,7 +405,8 @@ def test_exact_step_gets_no_disturbance():
     plant.dynamics([v, a])
     plant.outputs([x])
     euler = discretisation_remainder(plant, "euler", sp.Rational(1, 10))
-    assert euler.as_disturbance().names("w") == ("r_x",)
+    step = plant.discretise("euler", sp.Rational(1, 10), remainder=True)
+    assert step.names("w") == ("remainder_x",)
     np.testing.assert_allclose(euler.upper, [0.005, 0.0], rtol=1e-9, atol=1e-12)
 
 
