@@ -16,7 +16,6 @@ from itertools import product
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.sizes import expanded, simplified
@@ -81,11 +80,6 @@ class AffineFamily:
         """Number of vertices, without making them."""
         return 1 << int((self.ranges[:, 1] > self.ranges[:, 0]).sum())
 
-    @property
-    def vertex_radius(self) -> FloatArray:
-        """How far a matrix of the family may lie from the hull of the vertices, elementwise."""
-        return self.radius
-
     def at(self, scalars: Sequence[float] | FloatArray) -> FloatArray:
         """Matrix for given scalars.
 
@@ -129,30 +123,6 @@ class AffineFamily:
         corners = [self.at(corner) for corner in product(*ends)]
         return np.array(corners).reshape(-1, *self.constant.shape)
 
-    def contains(self, matrix: FloatArray) -> bool:
-        """Whether a matrix belongs to the family, up to the radius.
-
-        The scalars are read off the entries that define them; a linear program looks for them
-        where there are no such entries.
-
-        Parameters
-        ----------
-        matrix : ndarray, shape (n, k)
-            The matrix.
-
-        Returns
-        -------
-        bool
-            True when scalars in their ranges reproduce it.
-        """
-        scalars = []
-        for direction, (lower, upper) in zip(self.directions, self.ranges, strict=True):
-            places = np.argwhere((direction == 1.0) & self._defining(direction))
-            if not len(places):
-                return self._reaches(matrix)
-            scalars.append(min(max(float(matrix[tuple(places[0])]), lower), upper))
-        return bool((np.abs(matrix - self.at(scalars)) <= self.radius).all())
-
     def room(self, other: AffineFamily) -> float:
         """By how much the ranges of another family leave these, negative; -inf for other counts."""
         mine, its = self.ranges, other.ranges
@@ -181,26 +151,6 @@ class AffineFamily:
             and np.all(self.ranges[:, 0] <= other.ranges[:, 0])
             and np.all(self.ranges[:, 1] >= other.ranges[:, 1])
         )
-
-    def _reaches(self, matrix: FloatArray) -> bool:
-        """Look for scalars that reproduce a matrix where no entry defines them."""
-        from scipy.optimize import linprog
-
-        columns = self.directions.reshape(len(self.directions), -1).T
-        rest, slack = (matrix - self.constant).ravel(), self.radius.ravel()
-        slack = slack + 8 * UNIT_ROUNDOFF * np.abs(matrix).ravel()
-        found = linprog(
-            np.zeros(len(self.ranges)),
-            np.vstack([columns, -columns]),
-            np.concatenate([rest + slack, slack - rest]),
-            bounds=self.ranges,
-            method="highs",
-        )
-        return bool(found.status == 0)
-
-    def _defining(self, direction: FloatArray) -> NDArray[np.bool_]:
-        alone = np.abs(self.directions).sum(axis=0) == np.abs(direction)
-        return np.asarray(alone & (self.constant == 0.0) & (self.radius == 0.0))
 
 
 def build_family(
