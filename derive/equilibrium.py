@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.taking import takes
 
@@ -43,6 +44,12 @@ class Equilibrium:
     residual: float
     p: FloatArray = field(default_factory=lambda: _NO_VALUES)
     rho: FloatArray = field(default_factory=lambda: _NO_VALUES)
+
+    def _repr_html_(self) -> str:
+        kinds = {"x": self.x, "u": self.u, "p": self.p, "rho": self.rho}
+        rows = [[kind, ", ".join(f"{v:.6g}" for v in part)] for kind, part in kinds.items()]
+        shown = [row for row in rows if row[1]]
+        return html_table((), [*shown, ["residual", f"{self.residual:.2g}"]], "Equilibrium")
 
 
 def operating_values(model: Plant, kind: str) -> FloatArray:

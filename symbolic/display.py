@@ -28,6 +28,12 @@ def html_table(heads: Sequence[str], rows: Iterable[Iterable[str]], caption: str
     return f"<table>{title}{''.join(lines)}</table>"
 
 
+def html_lines(shown: object) -> str:
+    """Return what is printed of an object as a table: its first line above, the others in rows."""
+    title, *lines = str(shown).splitlines()
+    return html_table((), ([line.strip()] for line in lines), title)
+
+
 def plant_latex(plant: "Plant") -> str:
     r"""Return the equations of a plant, faults inserted, as one LaTeX environment."""
     # A Runge-Kutta step written out fills pages; its derivatives say the same.

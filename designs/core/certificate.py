@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import reading, shown
+from obsynth.symbolic.display import html_lines
 
 if TYPE_CHECKING:
     from obsynth.designs.core.method import Contract
@@ -80,6 +81,9 @@ class Guarantee:
         lines = ["Guaranteed:", *(f"  - {text}" for text in self.claims)]
         lines += ["provided that:", *(f"  - {text}" for text in self.assumptions)]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return html_lines(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,7 @@ from obsynth.designs.core.stepping import counter
 from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_lines
 from obsynth.symbolic.taking import check_kind
 
 SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "recovering")
@@ -427,6 +428,9 @@ class FaultDetector:
             mean = " for the mean" if self._of_mean else ""
             lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}{mean}")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return html_lines(self)
 
 
 def core_of(observer: Any) -> Core | None:
