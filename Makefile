@@ -33,15 +33,15 @@ mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print 
 	$(BIN)/python tools/mutants.py --workers $(WORKERS) --minutes 6
 
 firmware: $(VENV)/.installed ## the C of every method on emulated Cortex-M3, M4F and M7
-	sh tools/firmware/install.sh
+	sh tools/install.sh firmware
 	$(BIN)/python tools/firmware --workers $(WORKERS)
 
 prove: $(VENV)/.installed ## prove and search the C of every method: Eva, MISRA, compilers, libFuzzer
-	sh tools/prove/install.sh
+	sh tools/install.sh prove
 	$(BIN)/python tools/prove --workers $(WORKERS)
 
 prove-long: $(VENV)/.installed ## the same with the fuzzer on everything, for a minute each
-	sh tools/prove/install.sh
+	sh tools/install.sh prove
 	$(BIN)/python tools/prove --workers $(WORKERS) --long --fuzz 60
 
 lint: $(VENV)/.installed

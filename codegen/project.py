@@ -16,10 +16,11 @@ from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.description import Description, Port, describe
 from obsynth.codegen.errors import BuildError, CodegenError
 from obsynth.codegen.folder import MANIFEST, complete_folder
-from obsynth.codegen.kernel import DOUBLE, REALS, Kernel, instructions, scalar_function
+from obsynth.codegen.kernel import DOUBLE, REALS, Kernel, counted, instructions, scalar_function
+from obsynth.codegen.numbers import prove_numbers
 from obsynth.codegen.recording import Vectors
 from obsynth.codegen.render import package_name, render
-from obsynth.codegen.tape import write_tape, written
+from obsynth.codegen.tape import read_tape, write_tape
 from obsynth.codegen.vectors import COUNT, make_vectors
 from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -266,6 +267,8 @@ def _manifest(
 ) -> str:
     observer, real = description.observer, description.real
     kinds = ("u", "y", "theta", "x", "f") if description.theta else ("u", "y", "x", "f")
+    values, results = read_tape(observer.step, real)
+    numbers = prove_numbers(values, results)
     data = {
         "kind": KIND,
         "format": _FORMAT,
@@ -295,6 +298,12 @@ def _manifest(
         },
         "signals": {kind: _signals(getattr(description, kind)) for kind in kinds},
         "input_box": input_box(description),
+        "numbers_in_order": {
+            "over": "all bit patterns of memory and inputs",
+            "at_every_status": list(numbers.always),
+            "at_status_0": list(numbers.quiet),
+            "not_proved": list(numbers.unproved),
+        },
         "guarantee": {
             "claims": list(observer.guarantee.claims),
             "assumptions": list(observer.guarantee.assumptions),
@@ -302,7 +311,7 @@ def _manifest(
         "operations": kernel.operations,
         "operations_of_backends": {
             "casadi": sum(instructions(scalar_function(observer.step)).values()),
-            "tape": sum(written(observer.step, real).values()),
+            "tape": sum(counted(value.name for value in values).values()),
         },
         "operation_counts": dict(kernel.counts),
         "library_functions": list(kernel.library),

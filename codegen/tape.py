@@ -363,11 +363,6 @@ def _function(head: str, lines: Sequence[str]) -> str:
     return f"static {head}\n{{\n{body}\n}}"
 
 
-def written(step: ca.Function, real: Real) -> dict[str, int]:
-    """Return how often the text that `write_tape` writes does what."""
-    return counted(value.name for value in _Reader(scalar_function(step), real).used())
-
-
 def write_function(name: str, prefix: str, real: Real) -> tuple[str, set[str]]:
     """Write a function of our own; return it and what it calls of the library."""
     function = own_function(name)

@@ -314,10 +314,13 @@ class Step:
         for j in range(F.lower.numel() if known.f is not None else 0):
             unknown = ca.logic_or(unknown, F.lower[j] < -0.5 * self.limits.far)
             unknown = ca.logic_or(unknown, F.upper[j] > 0.5 * self.limits.far)
+        outside = known.outside
+        if known.x is None:
+            # nothing else bounds these estimates, and what is beyond counts as no number
+            outside = ca.logic_or(outside, ca.logic_not(all_finite(known.xhat, self.limits.finite)))
+            unknown = ca.logic_or(unknown, ca.logic_not(all_finite(known.fhat, self.limits.finite)))
         recovering = self.part["since"] < self.guard.watch.recovery - 0.5
-        out = ca.logic_or(
-            ca.logic_not(self.covered), ca.logic_and(known.outside, ca.logic_not(void))
-        )
+        out = ca.logic_or(ca.logic_not(self.covered), ca.logic_and(outside, ca.logic_not(void)))
         return status_word(
             {
                 "not_initialised": ca.logic_not(initialised),

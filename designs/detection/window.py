@@ -97,14 +97,17 @@ class Window:
         moved |= {"known": ca.vertcat(*kept), "x": ca.vertcat(X.lower, X.upper)}
         moved |= {"f": ca.vertcat(F.lower, F.upper), "parts": parts[: -newest.numel()]}
         following = ca.vertcat(*(moved[name[5:]] for name in self.layout))
-        results = ca.cse([following, self._open(mean.lower), self._open(mean.upper), word])
+        results = ca.cse([following, *self._open(mean), word])
         labels = ["memory", *self.sizes], ["next", *MEAN_OUTPUTS]
         return ca.Function("window", [memory, *ports], [*map(ca.densify, results)], *labels)
 
-    def _open(self, ends: ca.SX) -> ca.SX:
+    def _open(self, mean: Ends) -> list[ca.SX]:
         """Write infinities for ends that some unbounded set went into."""
-        entries, huge = ca.vertsplit(ends), Rounding(self.precision).limits.huge
-        return ca.vertcat(*(ca.if_else(ca.fabs(e) > huge, ca.sign(e) * ca.inf, e) for e in entries))
+        huge, pairs = Rounding(self.precision).limits.huge, ((-1.0, mean.lower), (1.0, mean.upper))
+        return [
+            ca.vertcat(*(ca.if_else(s * e > huge, s * ca.inf, e) for e in ca.vertsplit(ends)))
+            for s, ends in pairs
+        ]
 
     def _mean(self, parts: ca.SX, now: list[Lifted]) -> Ends:
         """Enclose the means from (F, D, P) of m instants, the newest first, and P of this one."""

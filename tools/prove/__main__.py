@@ -19,7 +19,7 @@ import numpy as np
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent.parent / "tests")]
 
-from checks import Project, Said, compilers, eva, fuzz, misra  # noqa: E402
+from checks import Project, Said, compilers, eva, fuzz, misra, numbers  # noqa: E402
 
 import obsynth as ob  # noqa: E402
 from methods import METHODS, observer_of  # noqa: E402
@@ -87,6 +87,7 @@ def checked(what: str, long: bool, seconds: int) -> Iterator[tuple[str, str, Sai
     with tempfile.TemporaryDirectory(prefix="obsynth-prove-") as place:
         project = generated(what, Path(place))
         checks: dict[str, Callable[[], Said]] = {
+            "numbers": lambda: numbers(project),
             "eva": lambda: eva(project),
             "misra": lambda: misra(project),
             "compilers": lambda: compilers(project),

@@ -104,6 +104,12 @@ def eva(project: Project, box: bool = False) -> Said:
     return Said(int(summary[1]) + unknown + stopped, "\n".join(alarms[:3]))
 
 
+def numbers(project: Project) -> Said:
+    """Count results that the generator has not proved to be numbers in order."""
+    missing = project.manifest["numbers_in_order"]["not_proved"]
+    return Said(len(missing), ", ".join(missing))
+
+
 def misra(project: Project) -> Said:
     """Count hits of rules of MISRA C:2012 that are not among those that are named."""
     place = project.folder.parent / f"{project.name}_misra"
