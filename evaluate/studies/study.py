@@ -17,11 +17,11 @@ Beside the tables of a plant (see `obsynth.symbolic.plant_file`)::
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -36,8 +36,8 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant_file import PlantText, read_text_file
 from obsynth.symbolic.scenarios import gentle
 
-_SIGNALS = {"inputs": "u", "faults": "f", "unknown_inputs": "d", "scheduling": "rho"}
-_SCENARIO = {"steps", "x0", "guess", "seed", "disturbances", *_SIGNALS}
+_SIGNALS = {"faults": "f", "unknown_inputs": "d", "scheduling": "rho"}
+_SCENARIO = {"steps", "x0", "guess", "seed", "inputs", "disturbances", *_SIGNALS}
 _RECORD = {"file", "map", "time", "from", "to"}
 _TIME = sp.Symbol("t", real=True)
 _DEFAULT = {"method": "BoundedErrorUIO", "bounds": "peak"}
@@ -91,24 +91,44 @@ class Study:
             signals["disturbances"] = self._rows("disturbances", "w", t)
         start = {name: self._state(name) for name in ("x0", "guess")}
         build: Scenario = self.told.tried(
-            ("scenario",), Scenario, self.told.where, steps, **start, **signals
+            ("scenario",),
+            Scenario,
+            self.told.where,
+            steps,
+            inputs=self._inputs(t),
+            **start,
+            **signals,
         )
         return build
 
+    def _inputs(self, t: FloatArray) -> FloatArray | Callable[[float, FloatArray], FloatArray]:
+        """Return samples of the inputs, or a function of k and y where some name an output."""
+        outputs = {name: sp.Symbol(name, real=True) for name in self.model.output_names}
+        said = self._said("inputs", "u", outputs)
+        if not said.depends_on_outputs:
+            return said.samples(t)
+        Ts = float(self.model.Ts or 1.0)
+        return lambda k, y: np.array(said.function(Ts * k, y)).ravel()
+
     def _rows(self, field: str, kind: str, t: FloatArray) -> FloatArray:
         """Return samples of the signals of a kind: nominal values, or zero, where none are said."""
+        return self._said(field, kind, {}).samples(t)
+
+    def _said(self, field: str, kind: str, outputs: Mapping[str, sp.Symbol]) -> "_Said":
+        """Return what is said of the signals of a kind as a function of the time and of outputs."""
         plant, path = self.model, ("scenario", field)
         given = self.told.table(path, self.told.data["scenario"].get(field, {}))
         self.told.known(path, given, plant.names(kind))
-        rows = np.zeros((len(t), len(plant.names(kind))))
-        for j, signal in enumerate(getattr(plant, kind)):
+        names = {"t": _TIME, **outputs}
+        said = []
+        for signal in getattr(plant, kind):
             value = _nominal(signal) if kind in ("u", "rho") else 0.0
             text = given.get(signal.name, repr(value))
-            said = self.told.expression((*path, signal.name), text, {"t": _TIME})
-            time = ca.SX.sym("t")
-            (row,) = to_sx([said], {_TIME: time}, [signal.name])
-            rows[:, j] = np.array(ca.Function("row", [time], [row])(t[None, :])).ravel()
-        return rows
+            said.append(self.told.expression((*path, signal.name), text, names))
+        time, y = ca.SX.sym("t"), ca.SX.sym("y", len(outputs))
+        symbols = {_TIME: time, **dict(zip(outputs.values(), ca.vertsplit(y), strict=True))}
+        rows = ca.vertcat(*to_sx(said, symbols, plant.names(kind)))
+        return _Said(ca.Function("said", [time, y], [rows]), bool(ca.depends_on(rows, y)))
 
     def _state(self, field: str) -> FloatArray:
         """Return x0 or the guess, nominal values where nothing is said."""
@@ -140,6 +160,18 @@ class Study:
         return read[given.get("from", 0) : given.get("to")]
 
 
+class _Said(NamedTuple):
+    """Signals (count,) as a function of the time in s and of the outputs (m,)."""
+
+    function: ca.Function
+    depends_on_outputs: bool
+
+    def samples(self, t: FloatArray) -> FloatArray:
+        """Return their rows (N+1, count) where no output matters."""
+        y = np.zeros((self.function.size1_in(1), len(t)))
+        return np.array(self.function(t[None, :], y)).reshape(-1, len(t)).T
+
+
 def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a plant and what is done with it from a TOML file.
 
@@ -147,8 +179,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     ----------
     path : path
         Of a plant as text, with the tables ``[design]`` (a method and its options),
-        ``[scenario]`` (expressions of the time ``t`` in s) and ``[record]`` where these are
-        wanted. Files it names are beside it.
+        ``[scenario]`` (expressions of the time ``t`` in s; those of inputs of the outputs, too) and
+        ``[record]`` where these are wanted. Files it names are beside it.
 
     Returns
     -------

@@ -51,6 +51,17 @@ def test_time_is_in_seconds(tmp_path):
     assert np.allclose(arrays["u"][:, 0], 5 + np.sin(np.arange(601) / 80), atol=1e-15)
 
 
+def test_inputs_may_follow_what_is_measured(tmp_path):
+    told = changed(tmp_path, '"5 + sin(t/20)"', '"5 + t/1000 - 3*(y - 30)/100"')
+    fed = told.scenario
+    assert fed.feedback
+    assert fed.inputs(200, np.array([33.0])) == pytest.approx([5 + 0.2 - 0.09], abs=1e-12)
+    run = ob.simulate(told.model, told.observer, fed, seed=told.seed)
+    assert run.kept and min(run.coverage.values()) == 1.0
+    k = np.arange(len(run.u))
+    assert run.u[:, 0] == pytest.approx(5 + k / 1000 - 0.03 * (run.y[:, 0] - 30), abs=1e-9)
+
+
 def test_without_a_scenario_waves(tmp_path):
     told = changed(tmp_path, TANK[TANK.index("[scenario]") :], "")
     assert told.scenario.name == "gentle 0" and told.record is None and told.seed == 0
@@ -98,5 +109,5 @@ def test_commands(tmp_path):
     jump = file.read_text().replace("Min(1/2, (t - 200)/100)", "1")
     file.write_text(jump)
     ran = runner.invoke(app, ["simulate", str(file)])
-    assert ran.exit_code == 1 and "a guaranteed interval was violated" in ran.output
+    assert ran.exit_code == 1 and "left what the guarantee assumes: f moves by 1" in ran.output
     assert runner.invoke(app, ["design", str(tmp_path / "none.toml")]).exit_code == 1

@@ -235,6 +235,16 @@ def _simulated(observer: Observer, runs: list[Run]) -> Told:
         }
         for run in runs
     ]
-    violated = any(run.coverage[name] < 1.0 for run in runs for name in run.bounded)
-    failed = "a guaranteed interval was violated; see the table." if violated else ""
+    failed = ""
+    for run in runs:
+        missed = [name for name in run.bounded if run.coverage[name] < 1.0]
+        if missed and run.kept:
+            failed = "a guaranteed interval was violated; see the table."
+            break
+        if missed:
+            left = (*run.outside, *run.domain.left, "the observer was void")[0]
+            failed = (
+                f"{', '.join(missed)}: not inside their intervals, but the run left what the "
+                f"guarantee assumes: {left}; change the scenario or the ranges of the plant."
+            )
     return Told(facts, (obsynth.coverage_table({observer.method: runs}),), failed=failed)
