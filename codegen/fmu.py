@@ -276,4 +276,5 @@ def _template_values(variables: Sequence[Variable], start: Start) -> dict[str, A
         "guesses": start.guesses,
         "places": [(k, fields.index(k), fields.count(k)) for k in dict.fromkeys(fields) if k],
         "rules": start.rules,
+        "largest": start.largest,
     }

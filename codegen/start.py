@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.codegen.description import nominal_values
-from obsynth.codegen.kernel import DOUBLE
+from obsynth.codegen.kernel import DOUBLE, REALS, Real
+from obsynth.derive.rigour import outward
+from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-
-LARGEST = 1e90
-"""Numbers of larger size are no start values."""
 
 _SCALES = (1.0, 1.0, 1.0, 0.3, 0.01, 1e-4)
 _ROUNDED = 1e-13
@@ -49,10 +48,13 @@ class Start:
     memory (n_memory,): for the start values of the parameters
     parameters: parts of the guess, then pairs of ends of ranges
     guesses: how many parts of the guess there are
-    rules: entries of the memory that depend on parameters v, in C
+    rules: entries of the memory that depend on parameters v, in C; ``outward(v, way)`` is the next
+        number of single precision that way
+    largest: numbers of larger size are no start values
     """
 
     memory: FloatArray
+    largest: float
     parameters: tuple[Variable, ...] = ()
     guesses: int = 0
     rules: tuple[tuple[int, str], ...] = ()
@@ -70,6 +72,8 @@ def start_of(
     nothing depends on them, or something does in another way.
     """
     model = observer.model
+    inner = observer.observer if isinstance(observer, FaultDetector) else observer
+    real, largest = REALS[inner.precision], LIMITS[inner.precision].finite
     fixed = {
         "guess": np.asarray(nominal_values(model, "x") if guess is None else guess, dtype=float),
         "x_range": x_range,
@@ -92,16 +96,17 @@ def start_of(
     starts: dict[str, FloatArray] = {}
     for name, candidates in tried.items():
         for value in (np.asarray(one, dtype=float) for one in candidates if one is not None):
-            if np.all(np.abs(value) <= LARGEST) and _same(made(**{name: value}), memory):
+            if np.all(np.abs(value) <= largest) and _same(made(**{name: value}), memory):
                 starts.setdefault(name, value)
     for count in range(len(starts), 0, -1):
         for names in combinations(starts, count):
             chosen = {name: starts[name] for name in names}
-            rules = _rules(made, memory, chosen, boxes)
+            rules = _rules(made, memory, chosen, boxes, real)
             if rules:
                 parts = [p for name in names for p in _parameters(observer, name, chosen[name])]
-                return Start(memory, tuple(parts), len(chosen.get("guess", ())), rules)
-    return Start(memory)
+                guesses = len(chosen.get("guess", ()))
+                return Start(memory, largest, tuple(parts), guesses, rules)
+    return Start(memory, largest)
 
 
 def _same(one: FloatArray | None, other: FloatArray) -> bool:
@@ -120,8 +125,11 @@ def _rules(
     memory: FloatArray,
     starts: Mapping[str, FloatArray],
     boxes: Mapping[str, FloatArray],
+    real: Real,
 ) -> tuple[tuple[int, str], ...]:
     """Return entries of the memory as copies, middles or sums; none if that is not what they are.
+
+    Copies and middles may be rounded to the type of the step, ends of ranges outwards.
 
     Each start, flattened, is a part of the vector of parameters v; all of them have to matter.
     """
@@ -137,7 +145,7 @@ def _rules(
     base, *ones = (made(guess=e) if guesses else None for e in np.eye(guesses + 1, guesses, -1))
     rules = []
     for i in np.flatnonzero(np.any((m != memory) & ~(np.isnan(m) & np.isnan(memory)), axis=0)):
-        rule = _rule(m[:, i], v, guesses)
+        rule = _rule(m[:, i], v, guesses, real)
         if not rule and base is not None:
             linear = [one[i] - base[i] for one in ones if one is not None]
             rule = _sum(m[:, i], v, [float(base[i]), *linear])
@@ -152,15 +160,19 @@ def _rules(
     return tuple(rules)
 
 
-def _rule(entry: FloatArray, v: FloatArray, guesses: int) -> str:
+def _rule(entry: FloatArray, v: FloatArray, guesses: int, real: Real) -> str:
     """Return an entry, (draws,), as a parameter or the middle of a range; empty if it is none."""
-    for k in range(v.shape[1]):
-        if np.array_equal(entry, v[:, k]):
-            return f"v[{k}]"
+    found = [(f"v[{k}]", [column]) for k, column in enumerate(v.T)]
+    found += [(rule, [column.astype(real.type)]) for rule, (column,) in found[:guesses]]
     for k in range(guesses, v.shape[1], 2):
-        if np.array_equal(entry, 0.5 * (v[:, k] + v[:, k + 1])):
-            return f"0.5 * (v[{k}] + v[{k + 1}])"
-    return ""
+        middle = 0.5 * (v[:, k] + v[:, k + 1])
+        found.append((f"0.5 * (v[{k}] + v[{k + 1}])", [middle, middle.astype(real.type)]))
+        ends = outward(v[:, k : k + 2], real.precision).T
+        found += [
+            (f"outward(v[{k + i}], {way}INFINITY)", [ends[i]]) for i, way in enumerate(("-", ""))
+        ]
+    fits = (rule for rule, forms in found if any(np.array_equal(entry, form) for form in forms))
+    return next(fits, "")
 
 
 def _sum(entry: FloatArray, v: FloatArray, terms: list[float]) -> str:

@@ -20,6 +20,8 @@ from obsynth.codegen import BuildError, CodegenError, find_compiler
 from obsynth.codegen.kernel import REALS
 from obsynth.codegen.single import machine_of
 from obsynth.codegen.start import start_of
+from obsynth.derive.rigour import outward
+from obsynth.designs.core.limits import LIMITS
 
 fmpy = pytest.importorskip("fmpy")
 from fmpy.fmi2 import FMU2Slave  # noqa: E402
@@ -312,39 +314,45 @@ def test_steps_take_the_sample_time_or_multiples_of_it(toy_unit: Any, tmp_path: 
     assert "fixed once" in one.said[-1]
 
 
-def test_the_first_memory_follows_the_parameters(make_toy: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_the_first_memory_follows_the_parameters(
+    precision: str, make_toy: Any, make_single: Any, tmp_path: Path
+) -> None:
     """As copies, middles and sums, in C as in Python; ranges that are none are refused.
 
-    Mutants: a term of a sum left out; the ends of a range exchanged; no check of the limits.
+    In single precision ends of ranges are rounded outwards, middles to the nearest number.
+    Mutants: a term of a sum left out; the ends of a range exchanged; no check of the limits; ends
+    rounded to the nearest, or a number too far; the largest number of double in single.
     """
-    toy = make_toy()
+    toy = make_single() if precision == "single" else make_toy()
     toy.model.boxes["f"] = [(-2.0, 2.0)]
 
     def memory0(guess: Any, x_range: Any = None, f_range: Any = None) -> Any:
         x = np.asarray(guess, dtype=float)
-        box = np.array(toy.model.boxes["x"] if x_range is None else x_range)
+        box = outward(np.array(toy.model.boxes["x"] if x_range is None else x_range), precision)
         f = np.zeros((1, 2)) if f_range is None else np.asarray(f_range)
         z = np.array([[1.0, 0.25], [0.5, 0.0]]) @ x
-        return np.array([box[1, 1], 1.0, box[0, 0], f.mean(), 1.0 + z[0], z[1]])
+        middle = REALS[precision].type(f.mean())
+        return np.array([z[1], 1.0, box[0, 0], middle, 1.0 + z[0], box[1, 1]])
 
     toy.memory0 = memory0
     start = start_of(toy)
     assert start.guesses == 2
     assert [p.name for p in start.parameters[-2:]] == ["φ_first_lower", "φ_first_upper"]
     assert [rule for _, rule in start.rules] == [
-        "v[5]",
-        "v[2]",
+        "0.5 * v[0]",
+        "v[2]" if precision == "double" else "outward(v[2], -INFINITY)",
         "0.5 * (v[6] + v[7])",
         "1.0 + 1.0 * v[0] + 0.25 * v[1]",
-        "0.5 * v[0]",
+        "v[5]" if precision == "double" else "outward(v[5], INFINITY)",
     ]
     if find_compiler() is None:
         return
     fmu = ob.generate_fmu(toy, tmp_path / "x.fmu", vectors=100)
     assert validate_fmu(str(fmu.path)) == []
-    given = {"h_1_guess": 17.0, "h_2_guess": 9.0, "h_1_first_lower": 3.0, "h_2_first_upper": 39.0}
-    given |= {"φ_first_lower": -1.0, "φ_first_upper": 2.0}
-    memory = memory0([17, 9], [[3, 50], [1, 39]], [[-1, 2]])
+    given = {"h_1_guess": 17.0, "h_2_guess": 9.0, "h_1_first_lower": 3.0, "h_2_first_upper": 39.1}
+    given |= {"φ_first_lower": -1.1, "φ_first_upper": 2.0}
+    memory = memory0([17, 9], [[3, 50], [1, 39.1]], [[-1.1, 2]])
     samples = samples_of_toy(5)
     found = simulate(fmu, 0.5, samples, start_values=given)
     expected = flat(toy, told_by_machine(toy, memory, samples))
@@ -352,6 +360,7 @@ def test_the_first_memory_follows_the_parameters(make_toy: Any, tmp_path: Path) 
     vr = references(fmu)
     for name, value, word in (
         ("h_1_guess", np.nan, "number from"),
+        ("h_1_guess", 2.0 * LIMITS[precision].finite, "number from"),
         ("h_1_first_lower", 0.5, "number from"),
         ("h_1_first_upper", 0.5, "number from"),
         ("φ_first_upper", -1.0, "lies above"),
@@ -361,6 +370,18 @@ def test_the_first_memory_follows_the_parameters(make_toy: Any, tmp_path: Path) 
         with pytest.raises(fmpy.fmi1.FMICallException):
             begin(one)
         assert word in one.said[-1]
+
+
+def test_a_design_for_single_precision_has_the_parameters_of_one_for_double() -> None:
+    """Mutant: ends of ranges as copies alone, which a memory of single precision does not hold."""
+    entry = METHODS["interval_observer"]
+    single: Any = replace(entry.method, precision="single")
+    names = [
+        [p.name for p in start_of(observer).parameters]
+        for observer in (observer_of("interval_observer"), single.design(entry.plant()))
+    ]
+    assert len(names[0]) == 8
+    assert names[0] == names[1]
 
 
 def test_a_memory_that_depends_in_another_way_has_no_parameters(make_toy: Any) -> None:
