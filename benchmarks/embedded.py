@@ -25,8 +25,8 @@ from obsynth.codegen.single import machine_of
 from obsynth.codegen.tape import write_tape
 from obsynth.derive.rigour import inward
 from obsynth.designs.core.core import Seen
-from obsynth.designs.core.lifted import Rounding
 from obsynth.designs.core.observer import STEP_OUTPUTS
+from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import ROUND_UP, ULPS
 from obsynth.designs.general.step import Limits, build_core, memory_sizes, running
 from obsynth.evaluate import Table

@@ -7,7 +7,8 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
-from obsynth.designs.detection.detector import FaultDetector, core_of
+from obsynth.designs.detection.detector import FaultDetector
+from obsynth.designs.detection.observed import core_of
 from obsynth.evaluate.domain import outside_box
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario

@@ -10,7 +10,7 @@ from obsynth.designs.core.boxes import Ends, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import SETTLED, UP, Running, above, all_around, settle, shaken
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray

@@ -23,8 +23,9 @@ from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import PARTIAL, RULES
 from obsynth.derive.rigour.interval import UNIT
-from obsynth.designs.core.lifted import Lifted, Rounding, combine, is_point, lift, needed
+from obsynth.designs.core.lifted import combine, is_point, lift, needed
 from obsynth.designs.core.limits import FAR
+from obsynth.designs.core.outwards import Lifted, Rounding
 
 _HALF, _PI = 0.5 * np.pi, np.pi  # below what they stand for
 _UNITS = 2.0 * ULPS

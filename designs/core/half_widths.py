@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.contractor import SWEEPS, Contractor
-from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic.arrays import FloatArray

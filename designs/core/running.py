@@ -11,7 +11,7 @@ from functools import reduce
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.outwards import Rounding
 from obsynth.symbolic.arrays import FloatArray
 
 ROUND_UP = 1.0 + 2.0**-50

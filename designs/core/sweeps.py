@@ -17,7 +17,7 @@ from obsynth.designs.core.backward import contract
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.contractor import SWEEPS, Contractor
 from obsynth.designs.core.equations import Before
-from obsynth.designs.core.lifted import Lifted
+from obsynth.designs.core.outwards import Lifted
 from obsynth.symbolic.arrays import FloatArray
 
 

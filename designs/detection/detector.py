@@ -1,6 +1,5 @@
 """`FaultDetector`: alarms from guaranteed fault bounds."""
 
-import operator
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.certificate import Guarantee
-from obsynth.designs.core.core import Core
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.observer import (
     ALARM_OUTPUT,
@@ -24,6 +22,7 @@ from obsynth.designs.core.observer import (
 from obsynth.designs.core.stepped import StepFunction, named_step
 from obsynth.designs.core.stepping import counter
 from obsynth.designs.detection.comparison import Detection, compare
+from obsynth.designs.detection.observed import Handed, bounded_faults, core_of, whole_numbers
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.display import html_lines
@@ -33,19 +32,6 @@ SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "re
 """Bits of the status at which a sample never counts; at a void one all counters return to 0."""
 
 _COUNT = "alarm_count"
-
-
-class _Observers(property):
-    """What a detector has of its observer, under the same name."""
-
-    def __init__(self, doc: str) -> None:
-        super().__init__(doc=doc)
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        return self if instance is None else getattr(instance.observer, self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +115,7 @@ class FaultDetector:
                 "by actuator_faults, sensor_faults or process_faults.",
                 model=model.name,
             )
-        if not _bounded_faults(self.observer).any():
+        if not bounded_faults(self.observer).any():
             raise DetectorError(
                 f"{method} estimates {', '.join(names)} without bounds (its fault intervals are "
                 "infinite, or those declared), so that zero never leaves them: a detector needs a "
@@ -137,7 +123,7 @@ class FaultDetector:
                 method=method,
                 faults=names,
             )
-        object.__setattr__(self, "persistence", _whole_numbers(self.persistence, names))
+        object.__setattr__(self, "persistence", whole_numbers(self.persistence, names))
         unknown = [name for name in self.also_skip if name not in STATUS]
         if unknown:
             raise DetectorError(
@@ -146,7 +132,7 @@ class FaultDetector:
                 also_skip=self.also_skip,
             )
         if self.window is not None:
-            (length,) = _whole_numbers(self.window, names[:1], "window")
+            (length,) = whole_numbers(self.window, names[:1], "window")
             object.__setattr__(self, "window", length)
             if self._of_mean:
                 raise DetectorError(
@@ -170,15 +156,15 @@ class FaultDetector:
         """Name of the observer's method, with the detector's."""
         return f"{self.observer.method} with fault_detector"
 
-    model = _Observers("The observer's discrete plant.")
-    fault_delay = _Observers("By how many samples bounds and alarms lag behind.")
-    half_widths = _Observers("The observer's steady half widths.")
-    ode = _Observers("The observer's right-hand side; nothing of the detector flows.")
-    step_covered = _Observers("Whether the observer's guarantee covers its step.")
-    gains = _Observers("The observer's gains.")
-    performance = _Observers("The observer's performance.")
-    figures = _Observers("The observer's performance as it is shown.")
-    certificate = _Observers("The observer's certificate; an alarm rests on nothing else.")
+    model = Handed("The observer's discrete plant.")
+    fault_delay = Handed("By how many samples bounds and alarms lag behind.")
+    half_widths = Handed("The observer's steady half widths.")
+    ode = Handed("The observer's right-hand side; nothing of the detector flows.")
+    step_covered = Handed("Whether the observer's guarantee covers its step.")
+    gains = Handed("The observer's gains.")
+    performance = Handed("The observer's performance.")
+    figures = Handed("The observer's performance as it is shown.")
+    certificate = Handed("The observer's certificate; an alarm rests on nothing else.")
 
     @property
     def smallest_detectable(self) -> FloatArray | None:
@@ -431,58 +417,3 @@ class FaultDetector:
 
     def _repr_html_(self) -> str:
         return html_lines(self)
-
-
-def core_of(observer: Any) -> Core | None:
-    """Return the core of an observer's step; None for a stand-in without a certificate."""
-    contract = getattr(getattr(observer, "certificate", None), "contract", None)
-    if contract is None or contract.core is None:
-        return None
-    core: Core = contract.core(observer.certificate.design)
-    return core
-
-
-def _bounded_faults(observer: Observer) -> NDArray[np.bool_]:
-    """Return which faults have an interval that anything measured can make narrower.
-
-    Not those that are infinite, or handed on from call to call as they were declared.
-    """
-    step, n_f = observer.step, len(observer.model.f)
-    ports = [ca.SX.sym(name, step.numel_in(i)) for i, name in enumerate(step.name_in())]
-    try:
-        outputs = step.call(ports) if step.is_a("SXFunction") else step.expand().call(ports)
-    except RuntimeError:
-        # A step that has no scalar form cannot be looked into; its bounds are then taken as such.
-        return np.ones(n_f, dtype=bool)
-    layout = observer.memory_layout.items()
-    own = [part for name, part in layout if not name.startswith(("f_lower", "f_upper"))]
-    told = ca.vertcat(*ports[1:], *(ports[0][part] for part in own))
-    lower, upper = (outputs[STEP_OUTPUTS.index(key)] for key in ("f_lower", "f_upper"))
-    return np.array([_told(lower[i], told) and _told(upper[i], told) for i in range(n_f)])
-
-
-def _told(bound: ca.SX, told: ca.SX) -> bool:
-    slopes = ca.gradient(bound, told)
-    return not all(slopes[i].is_zero() for i in range(slopes.numel()))
-
-
-def _whole_numbers(
-    given: Any, names: tuple[str, ...], what: str = "persistence"
-) -> tuple[int, ...]:
-    """Return a number of samples for each fault."""
-    values = tuple(given) if np.ndim(given) else (given,) * len(names)
-    if len(values) != len(names):
-        raise DetectorError(
-            f"{what} has {len(values)} numbers for the {len(names)} faults {', '.join(names)}.",
-            **{what: given},
-        )
-    try:
-        whole = tuple(operator.index(value) for value in values)
-    except TypeError:
-        whole = (0,)
-    if any(isinstance(value, bool) for value in values) or min(whole) < 1:
-        raise DetectorError(
-            f"{what}={given!r} is not a whole number of samples from 1 on.",
-            **{what: given},
-        )
-    return whole

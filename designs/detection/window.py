@@ -22,8 +22,9 @@ import numpy as np
 
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.equations import Before, Equations
-from obsynth.designs.core.lifted import Lifted, Rounding, combine
+from obsynth.designs.core.lifted import combine
 from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
+from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.designs.core.stepping import counter, inside, slices
 from obsynth.designs.detection.relations import relations
 from obsynth.symbolic.arrays import FloatArray

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from obsynth.designs.core.boxes import Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.lifted import Rounding
 from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import above
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices
 from obsynth.designs.qpv.equations import Equations, build_update, symbols_of

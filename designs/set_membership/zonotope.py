@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.boxes import Ends
-from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.outwards import Rounding
 from obsynth.symbolic.arrays import FloatArray
 
 FEW = 12

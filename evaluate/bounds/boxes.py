@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 
 from obsynth.designs.core.backward import contract
-from obsynth.designs.core.lifted import Lifted, Rounding, lift
+from obsynth.designs.core.lifted import lift
 from obsynth.designs.core.limits import FAR
+from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.truth import Call, dense
 from obsynth.symbolic.arrays import FloatArray

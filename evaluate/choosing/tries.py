@@ -21,7 +21,7 @@ from obsynth.designs import (
     SetMembershipObserver,
 )
 from obsynth.designs.core.method import Method
-from obsynth.designs.detection.detector import core_of
+from obsynth.designs.detection.observed import core_of
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.run import Run
 from obsynth.symbolic import ObsynthError, Plant

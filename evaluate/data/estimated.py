@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import STATUS
 from obsynth.designs.detection.comparison import find_voids, list_voids
-from obsynth.designs.detection.detector import SKIPPED, core_of
+from obsynth.designs.detection.detector import SKIPPED
+from obsynth.designs.detection.observed import core_of
 from obsynth.evaluate.data.allowed import allowed
 from obsynth.evaluate.data.meter import compare
 from obsynth.evaluate.data.tables import to_dataset, write_columns

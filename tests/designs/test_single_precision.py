@@ -17,8 +17,9 @@ from obsynth.designs.core.boxes import Ends, cut_box
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.core import Seen
 from obsynth.designs.core.half_widths import HalfWidths
-from obsynth.designs.core.lifted import Lifted, Rounding, lift
+from obsynth.designs.core.lifted import lift
 from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.running import Running, all_around
 from obsynth.designs.core.stepping import clip, inside

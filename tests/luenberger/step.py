@@ -13,7 +13,7 @@ from luenberger.synthesis import prediction
 from obsynth.designs.core.boxes import Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.lifted import Rounding
+from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import UP, above
 from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import clip, inside
