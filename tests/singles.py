@@ -98,10 +98,10 @@ def follow(observer, scenario, runs, precision):
     said = {name: [] for name in STEP_OUTPUTS}
     for u, y in zip(runs["u"], runs["y"], strict=True):
         found = dict(zip(STEP_OUTPUTS, step(memory, u, y), strict=True))
-        memory = found["memory"]
+        memory = found["memory_next"]
         for name, value in found.items():
             said[name].append(value)
-    return {name: np.array(value) for name, value in said.items() if name != "memory"}
+    return {name: np.array(value) for name, value in said.items() if name != "memory_next"}
 
 
 def outside(observer, runs, said):

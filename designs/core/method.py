@@ -25,7 +25,7 @@ from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, MOST_COUNTED, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
-from obsynth.designs.core.record import Precision, plain
+from obsynth.designs.core.record import Precision, plain, precision_of
 from obsynth.designs.core.remainder import of_continuous, prove_remainder
 from obsynth.designs.core.signals import held_in_single
 from obsynth.designs.core.step import Step
@@ -108,6 +108,7 @@ class Contract(Generic[D]):
 
     def certify(self, design: Any, level: Level = "full", model: Any = None) -> Certificate:
         """Prove a design; `model`, what was read of the plant, spares deriving it again."""
+        precision_of(design.options)  # a word that names none is refused before anything is proved
         claims = [*self.claims(design)]
         if level == "full" or model is not None:
             try:
