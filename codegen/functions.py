@@ -33,6 +33,11 @@ _ARC = (
     *(-0.3333333, 0.1999974, -0.14278568, 0.11033763, -0.08656877),
     *(0.06250163, -0.035871476, 0.013507735, -0.0023869888),
 )
+_ERF = (0.12837915, -0.37612554, 0.11282497, -0.026792947, 0.005034371, -0.0006214585)
+_ERFC = (
+    *(0.00031515415, -1.1302189, -0.63184243, -0.110071845, 0.026420016, -0.004760286),
+    *(0.0005971515, -4.611923e-05, 1.6411144e-06),
+)
 _BITS = (64, 32, 16, 8, 4, 2, 1)
 _INF = float("inf")
 _NAN = float("nan")
@@ -240,6 +245,12 @@ def _sinh(a: ca.SX) -> ca.SX:
     return ca.if_else(a > 88.0, (0.5 * far) * far, 0.5 * (t + t / (t + 1.0)))
 
 
+def _erf(a: ca.SX) -> ca.SX:
+    """Return a polynomial in a^2 times a, or what the exponential of one in a leaves of 1."""
+    value = ca.if_else(a < 0.875, a + a * _sum(a * a, _ERF), 1.0 - _exp(_sum(a, _ERFC)))
+    return ca.if_else(a > 4.0, 1.0, value)
+
+
 def _cosh(x: ca.SX) -> ca.SX:
     a = ca.fabs(x)
     near, far = _exp(a), _exp(0.5 * a)
@@ -288,6 +299,7 @@ _MADE: Mapping[str, Callable[..., ca.SX]] = {
     "sinh": _odd(_sinh),
     "cosh": _cosh,
     "tanh": _odd(_tanh),
+    "erf": _odd(_erf),
     "asinh": _odd(_asinh),
     "acosh": _acosh,
     "atanh": _odd(lambda a: 0.5 * _log1p(2.0 * a / (1.0 - a))),
@@ -299,6 +311,7 @@ ULPS: Mapping[str, float] = {
     **{"sin": 0.9, "cos": 0.9, "tan": 2.5, "exp": 0.9, "expm1": 1.5, "log": 0.9, "log1p": 1.0},
     **{"atan": 1.5, "atan2": 1.7, "asin": 2.6, "acos": 3.0, "sinh": 2.6, "cosh": 2.6, "tanh": 2.6},
     **{"asinh": 2.2, "acosh": 2.2, "atanh": 2.2, "hypot": 2.2, "pow": 5.5},
+    "erf": 1.3,
 }
 """Largest error in units in the last place, by name."""
 

@@ -122,12 +122,6 @@ class _Reader:
                 " the equations without it",
                 symbol=name,
             )
-        if self.real is not DOUBLE and _CALLED.get(name, "sqrt") not in {*EXACT, *ULPS}:
-            raise CodegenError(
-                f"the step uses {_CALLED[name]!r}, which has no form in {self.real.precision}"
-                " precision: write the equations without it, or design with precision='double'",
-                symbol=_CALLED[name],
-            )
         return self._value(name, args)
 
     def _value(
