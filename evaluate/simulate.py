@@ -51,7 +51,8 @@ def simulate(
         or, with `substeps`, the continuous plant behind it.
     observer : Observer or FaultDetector
         Its step runs in double precision, also where it was designed for single: the sets hold, as
-        rounding is less than they count. What a target computes are the numbers of `generate_c`.
+        rounding is less than they count. What a target computes, float by float, are the vectors of
+        `generate_c`, evaluated by ``codegen/single.py``.
     scenario : Scenario
         Inputs, faults, disturbances and initial values.
     seed : int

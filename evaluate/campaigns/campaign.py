@@ -145,6 +145,7 @@ def campaign(
     Parameters
     ----------
     designs : Observer or FaultDetector, or mapping of label to them
+        Steps run in double precision, see `simulate`.
     scenarios : Scenario or sequence of them
         Told apart by their names.
     seeds : int or iterable of int
