@@ -3,9 +3,11 @@
 from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import exact, image, inverse, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.interval.record import NEGATIVE, IntervalDesign
 from obsynth.designs.interval.rows import Part
 from obsynth.symbolic import ObsynthError
@@ -97,17 +99,66 @@ def refuse_printed(design: IntervalDesign) -> InfeasibleDesign:
 
 
 def printed_faults(
-    design: IntervalDesign,
-    r_lower: FloatArray,
-    r_upper: FloatArray,
-    y: FloatArray,
-    u: FloatArray,
+    observer: Observer,
+    r_lower: ArrayLike,
+    r_upper: ArrayLike,
+    y: ArrayLike,
+    u: ArrayLike,
     flaws: Collection[str] = FLAWS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Evaluate (32) for logged bounds of r, with all or some of its flaws."""
+    """Bound the fault by (32) as printed, or with some of its flaws.
+
+    For showing what the printed equation does; without flaws it is what the observer's step
+    returns, but for rounding and cuts.
+
+    Parameters
+    ----------
+    observer : Observer
+        Made by `IntervalObserver`.
+    r_lower, r_upper : array_like, shape (..., N, n - q)
+        Bounds of r, in the memory of the observer under these names.
+    y, u : array_like, shape (..., N, m), (..., N, n_u)
+        Outputs and inputs of the same instants.
+    flaws : collection of str
+        Any of "y" (the output of k + 1 in place of that of k), "theta" (the upper noise term in
+        the lower bound) and "product" (bounds times a matrix of any sign).
+
+    Returns
+    -------
+    (ndarray, ndarray), each of shape (..., N - 1, n_f)
+        Lower and upper bounds of the fault at all instants but the last.
+
+    Raises
+    ------
+    ObsynthError
+        An observer of another method; an unknown flaw.
+
+    References
+    ----------
+    Lamouchi, Raissi, Amairi, Aoun: Interval observer design for actuator fault estimation of linear
+    parameter-varying systems, IFAC PapersOnLine 51-24, 2018, equation (32).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from obsynth.designs import IntervalObserver, printed_faults
+    >>> from obsynth.symbolic.plants import interval_example
+    >>> observer = IntervalObserver().design(interval_example())
+    >>> r, y, u = np.full((2, 2), 0.1), np.zeros((2, 2)), np.zeros((2, 1))
+    >>> low, high = printed_faults(observer, -r, r, y, u, flaws=())
+    >>> low.shape, bool((low < 0).all() and (high > 0).all())
+    ((1, 1), True)
+    """
+    if observer.method != "interval_observer":
+        raise ObsynthError(
+            f"an observer of the method {observer.method!r} has no fault bounds (32)",
+            method=observer.method,
+        )
     unknown = set(flaws) - set(FLAWS)
     if unknown:
         raise ObsynthError(f"flaws {sorted(unknown)} are not among {FLAWS}", option="flaws")
+    r_lower, r_upper, y, u = (np.asarray(a, dtype=float) for a in (r_lower, r_upper, y, u))
+    design: IntervalDesign = observer.certificate.design
     model, free, chosen = design.model, design.decoupled, design.transformation
     K = exact(chosen.K0) @ inverse(exact(chosen.R0))
     rows = inverse(K) @ free.F_left

@@ -32,7 +32,34 @@ _LISTS = {"first": [*_FIRST, _FIRST[2]], "H2": _H2}
 
 
 def printed_gains(name: Literal["first", "H2"]) -> dict[str, FloatArray]:
-    """Return L1, ..., L4 of Rotondo, Buciakowski and Witczak, Section 5."""
+    """Return the gains L1, ..., L4 that the paper prints for its example.
+
+    Parameters
+    ----------
+    name : {"first", "H2"}
+        The list; L4 of the first one repeats L3, an error of copying.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (6, 3)
+        For `QPVObserver.analyse` of `obsynth.plants.qpv_example`.
+
+    Raises
+    ------
+    ObsynthError
+        Another name.
+
+    References
+    ----------
+    Rotondo, Buciakowski, Witczak: Simultaneous state and process fault estimation in LPV systems
+    using robust QPV observers, Section 5.
+
+    Examples
+    --------
+    >>> from obsynth.designs import printed_gains
+    >>> printed_gains("H2")["L1"][5].tolist()
+    [0.1198, 0.1033, 31.6956]
+    """
     if name not in _LISTS:
         raise ObsynthError(f"there are gains 'first' and 'H2', not {name!r}", name=name)
     return {

@@ -72,7 +72,42 @@ def fault_indicators(
 ) -> Indicators:
     """Evaluate the tests (16)-(18) for one memory or many.
 
-    Shapes: memory (..., n_memory), y (..., m).
+    Parameters
+    ----------
+    observer : Observer
+        Made by `SetAdaptiveObserver`.
+    memory : array_like, shape (..., n_memory)
+        As `Observer.step` takes and returns it.
+    y : array_like, shape (..., m)
+        The outputs of the same instants.
+    form : {"corrected", "printed"}
+        (17) as printed takes the upper bound of the fault for the lower one.
+
+    Returns
+    -------
+    Indicators
+        Flags `s`, `d`, `z` per output and fault, and any of them as `S`, `D`, `Z`.
+
+    Raises
+    ------
+    ObsynthError
+        An observer of another method; another form.
+
+    References
+    ----------
+    Efimov, Raissi, Zolghadri: Set adaptive observers for linear parameter-varying systems:
+    application to fault detection, 2014, equations (16)-(18).
+
+    Examples
+    --------
+    >>> from obsynth.designs import SetAdaptiveObserver, fault_indicators
+    >>> from obsynth.symbolic.plants import three_tanks
+    >>> observer = SetAdaptiveObserver().design(three_tanks())
+    >>> memory = observer.memory0([0.5, 0.1, 0.3])
+    >>> bool(fault_indicators(observer, memory, [0.5, 0.1]).D)
+    False
+    >>> bool(fault_indicators(observer, memory, [0.5, 0.1], form="printed").D)
+    True
     """
     design = _design(observer)
     parts = np.asarray(memory, dtype=float)

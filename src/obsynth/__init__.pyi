@@ -33,7 +33,10 @@ from .designs import QPVObserver as QPVObserver
 from .designs import SetAdaptiveObserver as SetAdaptiveObserver
 from .designs import SetMembershipObserver as SetMembershipObserver
 from .designs import SolverTrouble as SolverTrouble
+from .designs import fault_indicators as fault_indicators
 from .designs import load as load
+from .designs import printed_faults as printed_faults
+from .designs import printed_gains as printed_gains
 from .designs import worst_case as worst_case
 from .evaluate import BoundsError as BoundsError
 from .evaluate import Campaign as Campaign

@@ -177,9 +177,9 @@ def controls(designs, hundred, flaws, **given):
     def by_run(array):
         return array[1:].swapaxes(0, 1)
 
-    design = given.get("design", stored(designs["c2"]))
+    observer = given.get("observer", designs["c2"])
     low, high = printed_faults(
-        design, by_run(r_lower), by_run(r_upper), by_run(run.y), by_run(run.u), flaws
+        observer, by_run(r_lower), by_run(r_upper), by_run(run.y), by_run(run.u), flaws
     )
     f = by_run(run.f)[:, :-1]
     return ((low <= f + 1e-12) & (f <= high + 1e-12)).mean(), (low, high)
@@ -203,7 +203,7 @@ def test_negative_controls(designs, hundred, flaws, fraction):
         contraction=False,
         H=np.diag([-1.0, 1.0, 1.0]),
     ).design(design.model.plant)
-    inside, (low, _) = controls(designs, hundred, flaws, design=stored(turned))
+    inside, (low, _) = controls(designs, hundred, flaws, observer=turned)
     assert inside == pytest.approx(fraction, abs=0.02 if fraction < 1.0 else 0.0)
     # at full inclusion only the numbers tell the wrong lower theta_1 from the right one
     right = controls(designs, hundred, ())[1]
@@ -216,10 +216,10 @@ def test_bounds_times_a_negative_gain_change_sides(designs, hundred):
         gains=(np.diag([1.0, -1.0]), [0.4, -1]), bound="paper", contraction=False, **flipped
     ).design(stored(designs["c2"]).model.plant)
     assert float((turned.gains["K0"] @ turned.gains["R0"]).item()) == -1.0
-    inside, (low, high) = controls(designs, hundred, ("product",), design=stored(turned))
+    inside, (low, high) = controls(designs, hundred, ("product",), observer=turned)
     assert inside == 0.0
     assert (high - low)[:, 50:].mean() == pytest.approx(-WIDTHS["c2"][2], rel=0.01)
-    assert controls(designs, hundred, (), design=stored(turned))[0] == 1.0
+    assert controls(designs, hundred, (), observer=turned)[0] == 1.0
 
 
 def test_the_printed_example_is_refused_with_its_numbers(example):
