@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import exact, nearest
-from obsynth.designs import InfeasibleDesign, IntervalObserver
-from obsynth.designs.interval.printed import printed_faults
+from obsynth.designs import InfeasibleDesign, IntervalObserver, printed_faults
 from obsynth.designs.interval.record import IntervalDesign
 from obsynth.designs.interval.synthesis import sylvester_gain
 from obsynth.evaluate.papers.claim import Claim
@@ -78,7 +77,7 @@ def _inside(plant: Plant, options: dict[str, Any]) -> float:
     given = {"gains": (_MIRROR, [0.4, -1.0]), **options, "cuts": (), "horizon": 10**9}
     observer = IntervalObserver(**given).design(plant)
     turned = IntervalObserver(**given, H=np.diag([-1.0, 1.0, 1.0])).design(plant)
-    design, held = IntervalDesign.from_record(turned.record), []
+    held = []
     for seed in range(_SEEDS):
         scenario = scenarios.interval_example(seed)
         run = simulate(plant, observer, scenario)
@@ -88,7 +87,7 @@ def _inside(plant: Plant, options: dict[str, Any]) -> float:
             memory = observer.step(memory, u, y)[0]
         # what r is at the first call is not in the memory
         r = np.array(rows)[1:]
-        low, high = printed_faults(design, r[:, :2], r[:, 2:4], run.y[1:], run.u[1:])
+        low, high = printed_faults(turned, r[:, :2], r[:, 2:4], run.y[1:], run.u[1:])
         f = run.f[1:-1]
         held.append(np.mean((low <= f) & (f <= high)))
     return float(np.mean(held))
