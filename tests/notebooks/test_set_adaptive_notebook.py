@@ -62,6 +62,6 @@ def test_the_design_is_proved_again_and_the_c_code_compared(found):
 
 
 def test_figures_are_shown(executed):
-    assert sum(executed.pictures) == 4
+    assert sum(executed.pictures) == 6
     for expected in ("not Metzler", "exp(-0.1 age)", "D = 1"):
         assert expected in executed.page, expected

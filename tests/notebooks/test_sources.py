@@ -27,7 +27,8 @@ def test_outputs_are_stored_as_one_run_from_top_to_bottom_left_them(path, notebo
     nbformat.validate(notebook)
     cells = notebooks.code(notebook)
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
-    assert not [o for cell in cells for o in cell.outputs if o.output_type == "error"]
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert not [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"]
     assert notebook.cells[0].cell_type == "markdown"
     assert notebook.cells[0].source.startswith("# ")
     assert path.stat().st_size < 1_500_000
@@ -35,6 +36,16 @@ def test_outputs_are_stored_as_one_run_from_top_to_bottom_left_them(path, notebo
 
 def test_nothing_of_the_machine_is_stored(path):
     assert not re.findall(r"/(?:tmp|home|root|work)/", path.read_text())
+
+
+def test_plants_are_typed_and_only_public_names_are_used(notebook):
+    source = "\n".join(cell.source for cell in notebooks.code(notebook))
+    assert not re.findall(r"(?:from|import) obsynth\.|ob\.plants\.", source)
+
+
+def test_nobody_has_to_read_a_double_in_full(notebook):
+    lines = [line for cell in notebooks.code(notebook) for line in notebooks.shown(cell)]
+    assert not [line for line in lines if re.search(r"\d{14}|\.\d{12}", line)]
 
 
 def test_every_notebook_is_executed_by_a_test_that_it_is_current(path):
