@@ -127,6 +127,7 @@ def test_hosted_checks_call_what_there_is():
 def test_one_version_is_told():
     import obsynth
 
-    files = "\n".join((ROOT / name).read_text() for name in ("pyproject.toml", "CITATION.cff"))
-    told = re.findall(r"^version(?: = \"|: )(\d[\d.]*)", files, re.MULTILINE)
-    assert told == [obsynth.__version__] * 2
+    files = ("pyproject.toml", "CITATION.cff", "CHANGELOG.md")
+    text = "\n".join((ROOT / name).read_text() for name in files)
+    told = re.findall(r"^(?:version = \"|version: |## \[)(\d[\d.]*)", text, re.MULTILINE)
+    assert told[:3] == [obsynth.__version__] * 3

@@ -45,10 +45,10 @@ class StepFunction(ca.Function):
 
     def _check(self, name: str, size: int, value: Any) -> None:
         if isinstance(value, ca.SX | ca.MX | ca.DM):
-            shape: Any = (value.numel(),) if value.is_vector() else value.shape
+            shape: Any = value.shape
         else:
             shape = self._shape(name, value)
-        if len(shape) == 2 and 1 not in shape and shape[0] == size:
+        if len(shape) == 2 and shape[0] == size:  # a column for every one of many steps
             return
         if (number := int(np.prod(shape, dtype=int))) != size:
             raise ObsynthError(

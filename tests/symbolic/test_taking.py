@@ -134,6 +134,8 @@ def test_a_mistake_is_told_with_its_mend(mistake):
         ([[2.0]], r"step takes \(memory, u, y\), each once; it was given 2 arguments"),
         ([np.array([2.0]), pd.Series([5.0, 10.0])], None),
         ([2, np.array([[5.0, 10.0]]).T], None),
+        ([np.full((1, 3), 2.0), np.full((2, 3), 5.0)], None),
+        ([np.full((1, 3), 2.0), np.full((3, 2), 5.0)], "y has 6 numbers for 2 outputs"),
     ],
 )
 def test_a_step_takes_as_many_numbers_as_there_are_signals(observer, given, message):
