@@ -7,7 +7,6 @@ import pytest
 import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from members import belongs
 
 import obsynth as ob
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family, psi_kept
@@ -68,7 +67,7 @@ def test_psi_is_the_difference_of_the_quadratic_terms(form, numbers, theta):
         error,
     )
     row = np.concatenate([x[list(state)], e[list(error)]])[None]
-    assert belongs(psi_family(N[0], sets, rows=row), psi[None])
+    assert psi_family(N[0], sets, rows=row).contains(psi[None])
     # mutant: the sign of the error's part
     wrong = np.einsum("a,iab->ib", x, symmetric) + np.einsum("a,iab->ib", e, N[0])
     if np.abs(np.einsum("a,iab->ib", e, N[0]) @ e).max() > 1e-6:
