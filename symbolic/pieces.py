@@ -69,6 +69,7 @@ def lookup(x: Any, knots: Sequence[Any], values: Sequence[Any]) -> sp.Expr:
             f"lookup of {x}: {len(knots)} knots and {len(values)} values; give as many of both, "
             "two at least"
         )
+    x = sp.sympify(x)
     at, of = ([_exact(item, f"lookup of {x}") for item in items] for items in (knots, values))
     for before, after in pairwise(at):
         if not before < after:

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Install what `make prove` or `make firmware` needs, on Debian and Ubuntu; where that is not possible, name it.
+# Install what `make prove` or `make firmware` needs, or the browser in which tests open the report, on Debian and
+# Ubuntu; where that is not possible, name it.
 set -eu
 
 missing=
@@ -21,15 +22,18 @@ firmware)
     needs arm-none-eabi-gcc gcc-arm-none-eabi
     has arm-none-eabi-gcc libm.a || missing="$missing libnewlib-arm-none-eabi"
     ;;
+browser)
+    needs chromium chromium
+    ;;
 *)
-    echo "usage: install.sh prove|firmware" >&2
+    echo "usage: install.sh prove|firmware|browser" >&2
     exit 2
     ;;
 esac
 [ -n "$missing" ] || exit 0
 
 if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null 2>&1; then
-    echo "make $1 needs$missing; as root: apt-get install --no-install-recommends$missing" >&2
+    echo "$1 needs$missing; as root: apt-get install --no-install-recommends$missing" >&2
     exit 1
 fi
 apt-get update -qq

@@ -12,7 +12,7 @@ from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import column, every, select
 from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
-from obsynth.designs.core.stepped import StepFunction, named_step
+from obsynth.designs.core.step_function import StepFunction, named_step
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

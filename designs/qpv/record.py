@@ -248,5 +248,9 @@ class QPVDesign(Design):
             )
         if self.Ts <= 0 or self.alpha < 0 or self.rounding < 0:
             raise CertificateError("alpha, Ts or rounding of the stored design is negative")
+        if self.precision == "single" and self.rounding == ASSUMED:
+            raise CertificateError(
+                "what rounding adds in single precision is assumed in the stored design"
+            )
         if (self.gamma is None) == (self.norm == "hinf"):
             raise CertificateError("gamma of the stored design belongs to norm 'hinf'")

@@ -60,7 +60,7 @@ def facts(run: Run) -> Row:
     """Return what is kept of a run, by the names of its signals."""
     found: dict[str, Any] = {
         "instants": len(run.t),
-        "kept": bool(run.domain.ok and not run.outside),
+        "kept": run.kept,
         "outside": "; ".join(run.outside),
         **{name: int(np.sum(run.status & bit > 0)) for name, bit in STATUS.items()},
     }

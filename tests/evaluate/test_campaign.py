@@ -48,6 +48,8 @@ def test_rows_are_those_of_runs(car, observer, scenario):
     assert told["f: half width"] == run["f"].half_width[late].mean()
     assert told["f: rms error"] == pytest.approx(run.rms(100)["f"], rel=1e-12)
     assert told["f: missed"] == 0 and told["kept"] and told["refused"] == ""
+    void = replace(run, status=run.status | np.where(np.arange(201) == 9, 8, 0))
+    assert facts(void)["void"] == 1 and not facts(void)["kept"]
     raised = np.flatnonzero(run.alarm[:, 0])
     assert told["f: delay"] == raised[0] - 51 and told["f: false alarms"] == 0
     assert "f: delay" not in found.rows[0]

@@ -110,4 +110,6 @@ def test_commands(tmp_path):
     file.write_text(jump)
     ran = runner.invoke(app, ["simulate", str(file)])
     assert ran.exit_code == 1 and "left what the guarantee assumes: f moves by 1" in ran.output
+    many = runner.invoke(app, ["campaign", str(file), "--seeds", "2"])
+    assert many.exit_code == 0 and "n/a" in many.output  # no run kept what is assumed
     assert runner.invoke(app, ["design", str(tmp_path / "none.toml")]).exit_code == 1

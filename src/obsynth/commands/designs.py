@@ -106,7 +106,7 @@ def campaign(
         workers=workers,
     )
     bounded = [k for k in found.rows[0] if k.endswith(": missed")]
-    missed = sum(row[key] or 0 for row in found.rows for key in bounded if not row["refused"])
+    missed = sum(row[key] or 0 for row in found.rows for key in bounded if row["kept"])
     failed = f"intervals missed the truth at {missed:g} instants; see the table." if missed else ""
     return Told({"table": found.table(), "runs": found.rows}, (found.table(),), failed=failed)
 

@@ -161,6 +161,9 @@ def test_no_bound_is_an_assumption_that_is_said(design):
     assert wild.rounding == ASSUMED
     assert "which is not proved" in guarantee(wild).assumptions[1]
     assert "rounding" not in {claim.name for claim in proofs.claims(wild)}
+    single = replace(design, options={**design.options, "precision": "single"}, rounding=ASSUMED)
+    with pytest.raises(ob.CertificateError, match="in single precision is assumed in the stored"):
+        single.check()
 
 
 def test_a_reading_that_is_held_counts_as_a_disturbance(observer, design):
