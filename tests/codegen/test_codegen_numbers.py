@@ -137,6 +137,16 @@ BROKEN = {
         ENDS,
     ),
     "not looked at": (lambda a, b, guess, void: {"xhat": guess}, ("fhat",), ("xhat",)),
+    "a comparison that a NaN fails": (
+        lambda a, b, guess, void: {"xhat": ca.if_else(guess > 9.0, 0.0, guess)},
+        ("fhat",),
+        ("xhat",),
+    ),
+    "one case of two": (
+        lambda a, b, guess, void: {"xhat": ca.if_else(a <= b, guess, 1.0)},
+        ("fhat",),
+        ("xhat",),
+    ),
     "no bit": (lambda a, b, guess, void: {"status": 8 * void}, (), ("fhat",)),
 }
 

@@ -117,6 +117,8 @@ def test_the_allowance_holds_what_all_steps_add(design):
     share = np.exp(-design.noise.rate * design.Ts)
     value = needed(design)
     rho = value * -np.expm1(-0.5 * design.noise.rate * design.Ts)
+    delta = of_step(design)
+    assert np.sqrt(delta @ np.abs(design.P) @ delta) <= rho * (1 + 1e-9)
     for first in (0.0, 0.3, 1.0):
         level, root = first**2, first
         for _ in range(5000):
@@ -128,6 +130,16 @@ def test_the_allowance_holds_what_all_steps_add(design):
     for _ in range(20_000):
         root = np.sqrt(share) * root + rho
     assert 0.9 * value < root <= value
+
+
+def test_innovations_are_as_large_as_the_matrices_may_be(design):
+    """Mutants: the middle of C alone, of H alone."""
+    assert design.noise is not None
+    data = design.data
+    for name in ("C_radius", "H_radius"):
+        wider = replace(design)
+        vars(wider)["data"] = replace(data, **{name: getattr(data, name) + 1.0})
+        assert (of_step(wider) > of_step(design)).any(), name
 
 
 def test_the_error_set_has_room_for_it(design):
