@@ -16,7 +16,7 @@ from obsynth.codegen.numbers import prove_numbers
 from obsynth.codegen.tape import read_tape
 
 WITHOUT_SETS = {"general_uio.l2", "hinf_uio"}
-QUICK = {"luenberger", "qpv_observer", "hinf_uio"}
+QUICK = {"luenberger", "qpv_observer", "hinf_uio", "general_uio.l2"}
 ALL = [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in (*METHODS, "detector")]
 STEPS = 30
 HANDED_ON = {"choose", "if_else_zero", "fmax", "fmin", "fabs", "neg", "sign", "floor", "ceil"}

@@ -29,6 +29,11 @@ def test_every_form_is_tried():
     assert set(ROUNDED) <= set(lifted._FORMS)
 
 
+def test_a_constant_interval_has_its_ends():
+    found = Lifted.number(1.0, 2.0)
+    assert (float(found.lower), float(found.upper)) == (found.low, found.high) == (1.0, 2.0)
+
+
 def code(op, number, ranges, rounding):
     """One operation as a function of the ends of its operands."""
     ends = [(ca.SX.sym("l"), ca.SX.sym("h")) for _ in ranges]
