@@ -26,8 +26,9 @@ run: $(VENV)/.installed ## quadruple tank: derive, design, prove, simulate, gene
 test: $(VENV)/.installed lint ## lint, types and all tests except the long statistics
 	$(BIN)/python -m pytest -m "not long" -n $(WORKERS) --dist worksteal
 
-test-long: $(VENV)/.installed ## the long statistics only
-	$(BIN)/python -m pytest -m long -n $(WORKERS) --dist worksteal --durations=40 --durations-min=5
+test-long: $(VENV)/.installed ## the long statistics only; MINUTES=25: what is not begun by then is left out, and counted
+	$(BIN)/python -m pytest -m long -n $(WORKERS) --dist worksteal --durations=40 --durations-min=5 \
+	  $(if $(MINUTES),--minutes $(MINUTES))
 
 mutants: $(VENV)/.installed ## plant mistakes in what guarantees rest on, print those that no test sees
 	$(BIN)/python tools/mutants.py --workers $(WORKERS) --minutes 6

@@ -1,12 +1,33 @@
 """The quadruple tank and its designs, made once for all tests of a worker."""
 
 import json
+import math
+import time
 from pathlib import Path
 
 import pytest
 
 import obsynth as ob
 from methods import PEAK_GAINS
+
+
+BEGUN = pytest.StashKey[float]()
+
+
+def pytest_addoption(parser):
+    parser.addoption("--minutes", type=float, default=math.inf, help="begin no test after so many")
+
+
+def pytest_configure(config):
+    config.stash[BEGUN] = time.monotonic()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Leave out, and say so, what a slow machine has no time for."""
+    minutes = item.config.getoption("--minutes")
+    if time.monotonic() - item.config.stash[BEGUN] > 60.0 * minutes:
+        pytest.skip(f"not begun within {minutes:g} minutes")
 
 
 @pytest.fixture(scope="session")
