@@ -10,7 +10,6 @@ import pytest
 import obsynth as ob
 from methods import PEAK_GAINS
 
-
 BEGUN = pytest.StashKey[float]()
 
 

@@ -32,7 +32,8 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Let links to the root lead to its pages here, and join the errata."""
     for page, source in OF_THE_ROOT.items():
-        markdown = markdown.replace(f"](../{source}", f"]({page}")
+        for link in (f"](../{source}", f"]({source}"):
+            markdown = markdown.replace(link, f"]({page}")
     return ERRATA.sub(errata, markdown)
 
 
