@@ -1,6 +1,5 @@
-"""The values of a step on many inputs at once: what leads where, and what a change would change."""
+"""The values of a step on many inputs at once: what leads where."""
 
-import heapq
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,13 +10,7 @@ from obsynth.codegen.kernel import Real
 from obsynth.codegen.single import lane_operations
 from obsynth.codegen.tape import read_tape
 
-_FIRST = 64
-"""Lanes on which a change is followed before it is followed on all."""
-
 _NEAR = 0.01
-
-Operation = tuple[str, tuple[int | float, ...]]
-"""What is computed in place of a value: its name, operands by their places (int) or numbers."""
 
 
 def differ(a: Any, b: Any) -> Any:
@@ -64,10 +57,6 @@ class Lanes:
         self._numbers = np.array(numbers, real.type).reshape(-1, 1)
         self.results = [(port, i, at[id(value)]) for port, i, value in results]
         self._told = {k for *_, k in self.results}
-        self._readers: list[list[int]] = [[] for _ in self.values]
-        for k, places in enumerate(self.places):
-            for place in set(places):
-                self._readers[place].append(k)
         self._table = lane_operations(real)
         zero: Any = real.type(0.0)
         self._table["choose"] = lambda c, a, b: np.where(c != 0, a, b) + zero
@@ -117,43 +106,3 @@ class Lanes:
                     for place, through in zip(places, passed, strict=True):
                         told[place] |= seen & through
         return told
-
-    def instead(self, found: Sequence[Any], change: Operation) -> Any:
-        """Return (lanes,) what another operation makes of values that were found."""
-        name, operands = change
-        taken = (found[p] if isinstance(p, int) else np.full_like(found[0], p) for p in operands)
-        with np.errstate(all="ignore"):
-            return self._table[name](*taken)
-
-    def seen(self, found: Sequence[Any], k: int, other: Any) -> bool:
-        """Whether a result changes in any lane if value k is another one."""
-        rows = np.flatnonzero(differ(found[k], other))
-        few = rows[:: -(-len(rows) // _FIRST)] if len(rows) else rows
-        return self._reaches(found, k, other, few) or (
-            len(few) < len(rows) and self._reaches(found, k, other, rows)
-        )
-
-    def _reaches(self, found: Sequence[Any], k: int, other: Any, rows: Any) -> bool:
-        if not len(rows):
-            return False
-        changed, waiting, entered = {k: other[rows]}, [k], {k}
-        with np.errstate(all="ignore"):
-            while waiting:
-                place = heapq.heappop(waiting)
-                if place != k:
-                    taken = (changed.get(p) for p in self.places[place])
-                    operands = [
-                        found[p][rows] if new is None else new
-                        for p, new in zip(self.places[place], taken, strict=True)
-                    ]
-                    new = self._table[self.values[place].name](*operands)
-                    if not differ(found[place][rows], new).any():
-                        continue
-                    changed[place] = new
-                if place in self._told:
-                    return True
-                for reader in self._readers[place]:
-                    if reader not in entered:
-                        entered.add(reader)
-                        heapq.heappush(waiting, reader)
-        return False

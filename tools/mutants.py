@@ -143,7 +143,7 @@ def made(lists: dict[str, Any], each: int | None, seed: int) -> Iterator[tuple[i
 
 def copied(place: Path) -> Path:
     """Copy what tests need of this checkout, links as links."""
-    for name in (*ROOMS, "src", "tests"):
+    for name in (*ROOMS, "src", "tests", "tools"):
         ignored = shutil.ignore_patterns("__pycache__", ".hypothesis")
         shutil.copytree(HERE / name, place / name, symlinks=True, ignore=ignored)
     shutil.copy(HERE / "pyproject.toml", place)

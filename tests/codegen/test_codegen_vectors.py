@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from obsynth.codegen import ComparisonError, build_and_compare, find_compiler, g
 from obsynth.codegen.description import describe
 from obsynth.codegen.kernel import DOUBLE, SINGLE
 from obsynth.codegen.lanes import Lanes, differ
-from obsynth.codegen.mutants import Mutant, score
 from obsynth.codegen.recording import Step
 from obsynth.codegen.vectors import COUNT, record
 from obsynth.designs.core.observer import STATUS
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from vector_score import Mutant, score
 
 FINITE = 1e300
 

@@ -1,6 +1,6 @@
 """How many wrong steps the vectors tell from the right one: the mutant score.
 
-    python -m obsynth.codegen.mutants design.json
+    python tools/vector_score.py design.json
 
 A mutant is one value of the tape's C computed otherwise: a constant by a unit in its last place,
 by 1 % or with the other sign, another comparison or operator, the branches of a choice exchanged.
@@ -8,17 +8,20 @@ It is caught if a result or a memory of any recorded step differs. One that no s
 as many others tells from the right one counts as equivalent: it changes nothing that was found.
 """
 
+import heapq
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from obsynth.codegen.description import describe
-from obsynth.codegen.lanes import Lanes, Operation
+from obsynth.codegen.kernel import Real
+from obsynth.codegen.lanes import Lanes, differ
 from obsynth.codegen.vectors import COUNT, as_ports, record
 from obsynth.designs.core.loading import load
 from obsynth.designs.core.observer import Observer
@@ -34,6 +37,62 @@ _EXCHANGED = (
 _COMPARED = _EXCHANGED[0]
 _LANES = 2000
 _MORE = 3
+_FIRST = 64
+"""Lanes on which a change is followed before it is followed on all."""
+
+Operation = tuple[str, tuple[int | float, ...]]
+"""What is computed in place of a value: its name, operands by their places (int) or numbers."""
+
+
+class Changed(Lanes):
+    """What becomes of a step where one of its values is computed otherwise."""
+
+    def __init__(self, step: ca.Function, real: Real) -> None:
+        super().__init__(step, real)
+        self._readers: list[list[int]] = [[] for _ in self.values]
+        for k, places in enumerate(self.places):
+            for place in set(places):
+                self._readers[place].append(k)
+
+    def instead(self, found: Sequence[Any], change: Operation) -> Any:
+        """Return (lanes,) what another operation makes of values that were found."""
+        name, operands = change
+        taken = (found[p] if isinstance(p, int) else np.full_like(found[0], p) for p in operands)
+        with np.errstate(all="ignore"):
+            return self._table[name](*taken)
+
+    def seen(self, found: Sequence[Any], k: int, other: Any) -> bool:
+        """Whether a result changes in any lane if value k is another one."""
+        rows = np.flatnonzero(differ(found[k], other))
+        few = rows[:: -(-len(rows) // _FIRST)] if len(rows) else rows
+        return self._reaches(found, k, other, few) or (
+            len(few) < len(rows) and self._reaches(found, k, other, rows)
+        )
+
+    def _reaches(self, found: Sequence[Any], k: int, other: Any, rows: Any) -> bool:
+        if not len(rows):
+            return False
+        changed, waiting, entered = {k: other[rows]}, [k], {k}
+        with np.errstate(all="ignore"):
+            while waiting:
+                place = heapq.heappop(waiting)
+                if place != k:
+                    taken = (changed.get(p) for p in self.places[place])
+                    operands = [
+                        found[p][rows] if new is None else new
+                        for p, new in zip(self.places[place], taken, strict=True)
+                    ]
+                    new = self._table[self.values[place].name](*operands)
+                    if not differ(found[place][rows], new).any():
+                        continue
+                    changed[place] = new
+                if place in self._told:
+                    return True
+                for reader in self._readers[place]:
+                    if reader not in entered:
+                        entered.add(reader)
+                        heapq.heappush(waiting, reader)
+        return False
 
 
 @dataclass(frozen=True)
@@ -45,7 +104,7 @@ class Mutant:
     change: Operation
 
 
-def mutants(lanes: Lanes) -> Iterator[Mutant]:
+def mutants(lanes: Changed) -> Iterator[Mutant]:
     """Return all mutants of a step, value by value."""
     for k, (value, places) in enumerate(zip(lanes.values, lanes.places, strict=True)):
         name = value.name
@@ -70,7 +129,7 @@ def mutants(lanes: Lanes) -> Iterator[Mutant]:
             yield Mutant("choice", k, ("choose", (places[0], 0.0, places[1])))
 
 
-def _numbers(lanes: Lanes, number: float) -> Iterator[tuple[str, float]]:
+def _numbers(lanes: Changed, number: float) -> Iterator[tuple[str, float]]:
     real = lanes.real.type
     for end in (-np.inf, np.inf):
         with np.errstate(over="ignore"):
@@ -80,7 +139,7 @@ def _numbers(lanes: Lanes, number: float) -> Iterator[tuple[str, float]]:
         yield "sign", -number
 
 
-def sample(lanes: Lanes, each: int, rng: np.random.Generator) -> list[Mutant]:
+def sample(lanes: Changed, each: int, rng: np.random.Generator) -> list[Mutant]:
     """Return at most so many mutants of each kind."""
     kinds: dict[str, list[Mutant]] = {}
     for mutant in mutants(lanes):
@@ -92,7 +151,7 @@ def sample(lanes: Lanes, each: int, rng: np.random.Generator) -> list[Mutant]:
     return chosen
 
 
-def caught(lanes: Lanes, tried: list[Mutant], ports: list[Any]) -> list[bool]:
+def caught(lanes: Changed, tried: list[Mutant], ports: list[Any]) -> list[bool]:
     """Return which mutants steps with these inputs (n, steps) tell from the right one."""
     told = [False] * len(tried)
     for start in range(0, ports[0].shape[1], _LANES):
@@ -138,7 +197,7 @@ def score(
 ) -> Score:
     """Plant mutants, at most so many of each kind, and compare them on the vectors of a step."""
     description = describe(observer)
-    lanes = Lanes(observer.step, description.real)
+    lanes = Changed(observer.step, description.real)
 
     def seen(tried: list[Mutant], count: int, seed: int) -> list[bool]:
         steps = record(description, count, seed)[0].steps
