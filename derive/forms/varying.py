@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import round_number
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.display import html_table
 from obsynth.symbolic.signals import Signal
 
 _DIGITS = 6
@@ -99,21 +100,19 @@ class Blocks(ABC):
 class Vertices(Blocks):
     """The blocks of a form at the vertices of its scheduling variables.
 
-    Attributes
-    ----------
-    family : AffineFamily
-        The stacked matrix, affine in the scheduling variables; its radius bounds the rounding.
-    layout : Layout
-        Where the blocks are. Each is an attribute: ``A`` of shape (V, n, n), ``B`` (V, n, n_u), ...
+    Each block is an attribute, with the vertices first: ``A`` (V, n, n), ``B`` (V, n, n_u), ...; of
+    a quadratic form N[v, i] is N_i and M[v, j] belongs to u_j, (V, n, n, n) and (V, n_u, n, n). The
+    last scheduling variable changes fastest, the lower end comes first. Their hull holds the
+    matrices of the form at every point of the box.
 
-    Notes
-    -----
-    The last scheduling variable changes fastest, the lower end comes first: (0, 0), (0, 1),
-    (1, 0), (1, 1) for two of them.
+    family: the stacked matrix, affine in the scheduling variables; its radius bounds the rounding
+    layout: where the blocks are
+    affinity: how every varying entry was proved to be affine
     """
 
     family: AffineFamily
     layout: Layout
+    affinity: dict[tuple[int, int], str] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -122,22 +121,11 @@ class Vertices(Blocks):
 
     @property
     def exact(self) -> bool:
-        """True when the hull of the vertices is that of the matrices that occur."""
+        """True when the hull is that of the matrices that occur, False for an outer box."""
         return self.family.exact
 
     def block(self, name: str) -> FloatArray:
-        """Vertices of a block.
-
-        Parameters
-        ----------
-        name : str
-            ``"A"``, ``"B"``, ``"C"``, ...
-
-        Returns
-        -------
-        ndarray, shape (V, rows, columns)
-            One matrix per vertex.
-        """
+        """Return a block at the vertices, (V, rows, columns)."""
         rows, columns = self.layout.place(name)
         return self.layout.unfold(name, self.family.vertices()[:, rows, columns])
 
@@ -145,22 +133,26 @@ class Vertices(Blocks):
         """Elementwise bound of the rounding of a block, shape (rows, columns)."""
         return self.layout.unfold(name, self.family.radius[self.layout.place(name)])
 
+    def __str__(self) -> str:
+        kind = "exact" if self.exact else "outer"
+        ways = ", ".join(sorted(set(self.affinity.values()))) or "no entry varies"
+        scalars = "; ".join(self.family.labels) or "none"
+        return f"{self.count} vertices ({kind}) over {scalars}; affine dependence proved ({ways})"
+
+    def _repr_html_(self) -> str:
+        ends = ((f"{low:.8g}", f"{high:.8g}") for low, high in self.family.ranges)
+        rows = [(label, *pair) for label, pair in zip(self.family.labels, ends, strict=True)]
+        return html_table(("variable", "min", "max"), rows, str(self))
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VaryingForm(Blocks):
-    """A plant as constant plus varying matrices, stacked in one.
+    """A plant as constant plus varying matrices, stacked in one; each block is an attribute.
 
-    Attributes
-    ----------
-    matrix : sympy.Matrix
-        All blocks stacked, exact, as functions of the plant's signals; see `block`.
-    layout : Layout
-        Where the blocks are. Each is an attribute: the state matrix ``A``, shape (n, n), the input
-        matrix ``B`` (n, n_u), the output matrix ``C`` (m, n), ...
-    schedule : AffineSchedule
-        The same matrix, affine in the scheduling variables.
-    proof : FormProof
-        That the form is the plant.
+    matrix: all blocks stacked, exact, as functions of the plant's signals
+    layout: where the blocks are
+    schedule: the same matrix, affine in the scheduling variables
+    proof: that the form is the plant
     """
 
     matrix: sp.Matrix
@@ -169,18 +161,7 @@ class VaryingForm(Blocks):
     proof: FormProof
 
     def block(self, name: str) -> sp.Matrix:
-        """Return a block of the form, exactly.
-
-        Parameters
-        ----------
-        name : str
-            One of ``layout.blocks``: ``"A"``, ``"B"``, ``"C"``, ...
-
-        Returns
-        -------
-        sympy.Matrix
-            As a function of the plant's signals.
-        """
+        """Return a block of the form, exactly, as a function of the plant's signals."""
         return self.matrix[self.layout.place(name)]
 
     @property
@@ -189,30 +170,9 @@ class VaryingForm(Blocks):
         return self.schedule.variables
 
     def constant(self, name: str) -> FloatArray:
-        """Return a block that does not vary as doubles.
+        """Return a block that does not vary as the nearest doubles; StructureError if it does.
 
-        Parameters
-        ----------
-        name : str
-            As for `block`; ``"N"`` and ``"M"`` of a quadratic form are stacked, shapes (n, n, n)
-            and (n_u, n, n).
-
-        Returns
-        -------
-        ndarray
-            The nearest doubles.
-
-        Raises
-        ------
-        StructureError
-            An entry varies; row, column and signals are named.
-
-        Examples
-        --------
-        >>> from obsynth.derive import quasi_lpv
-        >>> from obsynth.symbolic.plants import quadruple_tank
-        >>> quasi_lpv(quadruple_tank()).constant("C")[2].tolist()
-        [0.0, 0.0, 1.0, 0.0]
+        ``"N"`` and ``"M"`` of a quadratic form have the shapes (n, n, n) and (n_u, n, n).
         """
         block = self.block(name)
         values = np.zeros(block.shape)
@@ -229,6 +189,14 @@ class VaryingForm(Blocks):
                 )
             values[i, j] = round_number(entry)[0]
         return self.layout.unfold(name, values)
+
+    def vertices(self) -> Vertices:
+        """Return the blocks at the corners of the scheduling ranges, one where nothing varies.
+
+        UnboundedError where a scheduling variable has no finite range.
+        """
+        family = self.schedule.family(self.layout.shape)
+        return Vertices(family, self.layout, dict(self.schedule.methods))
 
 
 def prove_rows(

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from obsynth.derive.forms.qpv.form import QPVLayout, QPVVertices
+from obsynth.derive.forms.qpv.form import QPVLayout
+from obsynth.derive.forms.varying import Vertices
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design, Record
@@ -59,7 +60,7 @@ class VertexData:
     N_radius: FloatArray
 
     @classmethod
-    def of(cls, corners: QPVVertices, Cz: FloatArray, noise: NoiseBound | None) -> VertexData:
+    def of(cls, corners: Vertices, Cz: FloatArray, noise: NoiseBound | None) -> VertexData:
         """Take the blocks of a form, and the rates of faults as disturbances where bounded."""
         blocks = {name: getattr(corners, name) for name in ("A", "G", "C", "H", "N")}
         radii = {f"{name}_radius": corners.radius(name) for name in blocks}
@@ -189,7 +190,7 @@ class QPVDesign(Design):
     @cached_property
     def data(self) -> VertexData:
         """Matrices at the vertices, rates of faults included where they are bounded."""
-        return VertexData.of(QPVVertices(self.family, self.layout), self.Cz, self.noise)
+        return VertexData.of(Vertices(self.family, self.layout), self.Cz, self.noise)
 
     @cached_property
     def sets(self) -> ErrorSets:

@@ -10,7 +10,7 @@ import casadi as ca
 import sympy as sp
 
 from obsynth.derive.forms.qpv.augment import Augmented
-from obsynth.derive.forms.varying import Layout, VaryingForm, Vertices, short
+from obsynth.derive.forms.varying import Layout, VaryingForm, short
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import sx_function
 from obsynth.symbolic.display import aligned, html_table
@@ -56,32 +56,6 @@ class QPVLayout(Layout):
         return self.start("N") + a * self.states + b
 
 
-@dataclass(frozen=True, eq=False)
-class QPVVertices(Vertices):
-    """The matrices of a quadratic form at the vertices of its scheduling variables.
-
-    Attributes
-    ----------
-    family : AffineFamily
-        The stacked matrix, affine in the scheduling variables; its radius bounds the rounding.
-    layout : QPVLayout
-        Where the matrices are: N has the shape (V, n, n, n), N[v, i] is N_i; M (V, n_u, n, n),
-        M[v, j] belongs to u_j; G (V, n, n_w), C (V, m, n), H (V, m, n_w).
-
-    Notes
-    -----
-    The last scheduling variable changes fastest, the lower end comes first: (0, 0), (0, 1),
-    (1, 0), (1, 1) for two of them.
-    """
-
-    layout: QPVLayout
-
-    @property
-    def c(self) -> FloatArray:
-        """Constant part, shape (V, n)."""
-        return self.block("c")[:, :, 0]
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class QPV(VaryingForm):
     """x' = c + A x + [x'N_i x] + sum_j u_j M_j x + B u + D d + B_f f + G w, y = C x + H w + ...
@@ -90,22 +64,12 @@ class QPV(VaryingForm):
     the augmented state, faults last. For a discrete plant x' stands for the next state. The
     matrices are functions of scheduling variables and uncertain parameters.
 
-    Attributes
-    ----------
-    matrix : sympy.Matrix
-        All blocks stacked, exact.
-    layout : QPVLayout
-        Where the blocks are: the constant part c (n, 1), A, B, the unknown inputs' D, B_f of the
-        faults that are no states, the disturbances' G; C, feedthrough, D_f, H of the disturbances,
-        output_offset.
-    schedule : AffineSchedule
-        The same, affine in scheduling variables.
-    proof : FormProof
-        That the form is the plant.
-    plant : Augmented
-        Plant, augmented states, remaining faults.
-    form_of_N : str
-        ``"upper"`` or ``"symmetric"``: the same dynamics, different LMIs.
+    layout: where the blocks are: the constant part c (n, 1), A, B, D of the unknown inputs, B_f of
+        the faults that are no states, G of the disturbances; C, feedthrough, D_f, H of the
+        disturbances, output_offset
+    plant: plant, augmented states, remaining faults
+    form_of_N: ``"upper"`` or ``"symmetric"``: the same dynamics, different LMIs
+    matrix, schedule, proof: as of every `VaryingForm`
     """
 
     layout: QPVLayout
@@ -141,37 +105,8 @@ class QPV(VaryingForm):
         columns = self.block("M")
         return tuple(columns[:, j * n : (j + 1) * n] for j in range(self.layout.widths["u"]))
 
-    def vertices(self) -> QPVVertices:
-        """Matrices at the vertices of the scheduling variables.
-
-        Returns
-        -------
-        QPVVertices
-            One vertex where nothing varies.
-
-        Raises
-        ------
-        UnboundedError
-            A scheduling variable without a finite range.
-
-        Examples
-        --------
-        >>> from obsynth.derive import qpv
-        >>> from obsynth.symbolic.plants import qpv_example
-        >>> corners = qpv(qpv_example()).vertices()
-        >>> corners.A.shape, corners.A[1, 0, 2], corners.A[2, 0, 0]
-        ((4, 6, 6), np.float64(4.0), np.float64(-5.0))
-        """
-        return QPVVertices(self.schedule.family(self.layout.shape), self.layout)
-
     def function(self) -> ca.Function:
-        """Return the augmented system as a CasADi function.
-
-        Returns
-        -------
-        casadi.Function
-            (x, u, d, f, w, p, rho) -> (rhs, y), x the augmented and f the remaining faults.
-        """
+        """Return (x, u, d, f, w, p, rho) -> (rhs, y), x augmented and f the remaining faults."""
         groups = {kind: getattr(self.model, kind) for kind in KINDS}
         groups |= {"x": self.plant.states, "f": self.plant.faults}
         inputs = {kind: [s.symbol for s in part] for kind, part in groups.items()}

@@ -10,12 +10,8 @@ import casadi as ca
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from obsynth.derive.forms.quasi_lpv.centred import CentredForm, centre_form
 from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, Ranging, make_interval_form
-from obsynth.derive.forms.quasi_lpv.polytopic import (
-    CentredForm,
-    PolytopicForm,
-    centre_form,
-)
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
 from obsynth.derive.forms.quasi_lpv.terms import Centre
 from obsynth.derive.forms.scheduling import SchedulingVariable
@@ -50,33 +46,18 @@ class QuasiLPV(VaryingForm):
     For a continuous plant x+ stands for the time derivative; x_c = 0 and u_c = 0 by default. The
     outputs are y = C (x - x_c) + feedthrough (u - u_c) + D_y d + D_f f + W2 w + output_offset.
 
-    Attributes
-    ----------
-    matrix : sympy.Matrix, shape (n + m, n + n_u + n_d + n_f + n_w + 1)
-        All blocks in one matrix, exact, as functions of the plant's signals.
-    layout : Layout
-        Where the blocks are: A, B, D, B_f, W1, ``offset`` (what is left of the dynamics at the
-        centre, shape (n, 1)); C, feedthrough, D_y, D_f, W2, output_offset.
-    schedule : AffineSchedule
-        The same matrix, affine in the scheduling variables.
-    proof : FormProof
-        That the form is the plant.
-    model : Plant
-        The plant.
-    centre : Centre
-        The point (x_c, u_c) about which deviations are taken.
-    ranking : tuple of RowRanking
-        The ways to write every row, the chosen one first.
-    unfactored : tuple of (str, sympy.Expr, str)
-        Terms that stay in the offset although they vary: row, term, reason.
-    ranging : Ranging
-        How ranges of entries are found.
-
-    Notes
-    -----
     The form is not unique; `ranking` tells what else there was. It is the plant wherever its
     entries are defined; about another centre than the origin, |g| and sign(g) are taken with the
     sign that g has on the whole box, and the form is the plant on the box.
+
+    matrix (n + m, n + n_u + n_d + n_f + n_w + 1), schedule, proof: as of every `VaryingForm`
+    layout: where the blocks are: A, B, D, B_f, W1, ``offset`` (what is left of the dynamics at the
+        centre, (n, 1)); C, feedthrough, D_y, D_f, W2, output_offset
+    model: the plant
+    centre: the point (x_c, u_c) about which deviations are taken
+    ranking: the ways to write every row, the chosen one first
+    unfactored: terms that stay in the offset although they vary: row, term, reason
+    ranging: how ranges of entries are found
     """
 
     model: Plant
@@ -95,87 +76,22 @@ class QuasiLPV(VaryingForm):
         """All blocks, affine in the symbols of the scheduling variables."""
         return sp.ImmutableMatrix(self.schedule.matrix(self.layout.shape))
 
-    def vertices(self) -> PolytopicForm:
-        """Polytopic form: vertex matrices over the ranges of the scheduling variables.
-
-        Returns
-        -------
-        PolytopicForm
-            With all blocks, labelled exact or outer, and the proof that they vary affinely.
-
-        Raises
-        ------
-        UnboundedError
-            A scheduling variable has no finite range.
-
-        Examples
-        --------
-        >>> from obsynth.derive import quasi_lpv
-        >>> from obsynth.symbolic.plants import quadruple_tank
-        >>> form = quasi_lpv(quadruple_tank()).vertices()
-        >>> form.A.shape, form.exact
-        ((16, 4, 4), True)
-        """
-        family = self.schedule.family(self.layout.shape)
-        return PolytopicForm(family, self.layout, dict(self.schedule.methods))
-
     def centred(self, nominal: ArrayLike | None = None) -> CentredForm:
-        """Nominal matrices plus a remainder, for interval observers.
+        """Return nominal matrices plus a remainder, for interval observers.
 
-        Parameters
-        ----------
-        nominal : array_like, shape (n, n), optional
-            Nominal A; by default the middle of the ranges, which leaves nothing constant in the
-            remainder.
-
-        Returns
-        -------
-        CentredForm
-            Nominal, vertices and elementwise bounds of the remainder.
-
-        Examples
-        --------
-        >>> from obsynth.derive import quasi_lpv
-        >>> from obsynth.symbolic.plants import interval_example
-        >>> form = quasi_lpv(interval_example()).centred()
-        >>> form.A[0].tolist(), form.A_vertices[3].diagonal().tolist()
-        ([-1.0, 1.5, 0.1], [0.1, 0.0, 0.05])
+        nominal (n, n): by default the middle of the ranges, which leaves nothing constant in the
+            remainder
         """
         return centre_form(self.vertices(), nominal)
 
     def interval(self) -> IntervalForm:
-        """Constant elementwise bounds of A, B and the offset.
-
-        Returns
-        -------
-        IntervalForm
-            Guaranteed over the box.
-
-        Raises
-        ------
-        UnboundedError
-            An entry has no finite bound.
-
-        Examples
-        --------
-        >>> from obsynth.derive import quasi_lpv
-        >>> from obsynth.symbolic.plants import quadruple_tank
-        >>> bounds = quasi_lpv(quadruple_tank()).interval()
-        >>> bounds.A_min[0, 0].round(6), bounds.A_max[0, 0].round(6)
-        (np.float64(-0.0145), np.float64(-0.006712))
-        """
+        """Bound A, B and the offset elementwise over the box; UnboundedError where that fails."""
         matrix = self.ranging.matrix
         blocks = {name: matrix[self.layout.place(name)] for name in ("A", "B", "offset")}
         return make_interval_form(blocks, self.model, self.ranging)
 
     def function(self) -> ca.Function:
-        """Return the matrices as a CasADi function.
-
-        Returns
-        -------
-        casadi.Function
-            (x, u, p, rho, d, f, w) -> (A, B, offset, C).
-        """
+        """Return (x, u, p, rho, d, f, w) -> (A, B, offset, C)."""
         kinds = ("x", "u", "p", "rho", "d", "f", "w")
         inputs = {kind: [s.symbol for s in getattr(self.model, kind)] for kind in kinds}
         outputs = {name: self.block(name) for name in ("A", "B", "offset", "C")}

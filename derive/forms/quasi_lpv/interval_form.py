@@ -32,10 +32,7 @@ class Ranging:
 class IntervalForm:
     """A_min <= A(rho) <= A_max elementwise over the box, and the same for B and the offset.
 
-    Attributes
-    ----------
-    minimum, maximum : dict of str to ndarray
-        Guaranteed bounds of the blocks ``"A"`` (n, n), ``"B"`` (n, n_u) and ``"offset"`` (n, 1).
+    minimum, maximum: guaranteed bounds of ``"A"`` (n, n), ``"B"`` (n, n_u), ``"offset"`` (n, 1)
     """
 
     minimum: dict[str, FloatArray]

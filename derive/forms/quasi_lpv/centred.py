@@ -1,4 +1,4 @@
-"""Polytopic and centred versions of a linear form whose matrices are affine in scalars."""
+"""A linear form, affine in scalars, as nominal matrices and a remainder."""
 
 from dataclasses import dataclass, replace
 
@@ -9,60 +9,17 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.varying import Vertices
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
-
-
-@dataclass(frozen=True, eq=False)
-class PolytopicForm(Vertices):
-    """Vertex matrices whose convex hull holds the matrices of a form at every point of the box.
-
-    Attributes
-    ----------
-    family : AffineFamily
-        The stacked matrix [A B D B_f W1 offset; C ...], affine in the scheduling variables.
-    layout : Layout
-        Where the blocks are.
-    affinity : dict of (row, column) to str
-        How every varying entry was proved to be affine.
-
-    Notes
-    -----
-    ``exact`` says whether the polytope is the hull of the matrices that occur, up to the tolerance
-    of the ranges, or an outer box of scheduling variables that share signals. The last scheduling
-    variable changes fastest, the lower end comes first. The matrices hold up to `radius`, what
-    rounding costs.
-    """
-
-    affinity: dict[tuple[int, int], str]
-
-    def __str__(self) -> str:
-        kind = "exact" if self.exact else "outer"
-        ways = ", ".join(sorted(set(self.affinity.values()))) or "no entry varies"
-        scalars = "; ".join(self.family.labels) or "none"
-        return f"{self.count} vertices ({kind}) over {scalars}; affine dependence proved ({ways})"
-
-    def _repr_html_(self) -> str:
-        ends = ((f"{low:.8g}", f"{high:.8g}") for low, high in self.family.ranges)
-        rows = [(label, *pair) for label, pair in zip(self.family.labels, ends, strict=True)]
-        return html_table(("variable", "min", "max"), rows, str(self))
 
 
 @dataclass(frozen=True, eq=False)
 class CentredForm:
     """Nominal matrices plus a remainder: A(rho) = A + Delta, Delta in a polytope and in a box.
 
-    Attributes
-    ----------
-    A, B : ndarray, shapes (n, n), (n, n_u)
-        Nominal matrices.
-    A_vertices, B_vertices : ndarray, shapes (N, n, n), (N, n, n_u)
-        Vertices of the remainder, in common order.
-    A_lower, A_upper, B_lower, B_upper : ndarray
-        Elementwise bounds of the remainder, rounded outwards.
-    A_radius, B_radius : ndarray
-        What rounding may add to the remainder elementwise, beyond the hull of the vertices.
-    exact : bool
-        Whether the vertices are those of the hull itself.
+    A, B: nominal matrices, (n, n), (n, n_u)
+    A_vertices, B_vertices: vertices of the remainder in common order, (N, n, n), (N, n, n_u)
+    A_lower, A_upper, B_lower, B_upper: its elementwise bounds, rounded outwards
+    A_radius, B_radius: what rounding may add elementwise beyond the hull of the vertices
+    exact: whether the vertices are those of the hull itself
     """
 
     A: FloatArray
@@ -86,7 +43,7 @@ class CentredForm:
         )
 
 
-def centre_form(polytope: PolytopicForm, nominal: ArrayLike | None = None) -> CentredForm:
+def centre_form(polytope: Vertices, nominal: ArrayLike | None = None) -> CentredForm:
     """Split a polytopic form into nominal matrices and a remainder."""
     family, layout = polytope.family, polytope.layout
     middle = family.midpoint
