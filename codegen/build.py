@@ -30,14 +30,7 @@ _SUMMARY = re.compile(
 
 @dataclass(frozen=True)
 class Build:
-    """How a project was compiled.
-
-    Attributes
-    ----------
-    compiler : str
-        First line of what the compiler says of its version.
-    flags : tuple of str
-    """
+    """How a project was compiled: what the compiler says of its version, and the flags."""
 
     compiler: str
     flags: tuple[str, ...]
@@ -48,15 +41,7 @@ class Build:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the comparison of the compiled step with its vectors found: no difference.
-
-    Attributes
-    ----------
-    vectors : int
-        Number of steps.
-    values : int
-        Number of numbers and statuses, each equal to the last bit.
-    """
+    """Numbers of steps and of values, each of which the compiled step gives to the last bit."""
 
     vectors: int
     values: int
@@ -66,18 +51,7 @@ class Comparison:
 
 
 def find_compiler() -> tuple[str, ...] | None:
-    """Return the command of a C compiler: the environment's ``CC``, else cc, gcc or clang.
-
-    Returns
-    -------
-    tuple of str or None
-        None where there is no compiler.
-
-    Raises
-    ------
-    BuildError
-        If ``CC`` is set and names no program.
-    """
+    """Return the command of a C compiler: ``CC``, else cc, gcc or clang; None without one."""
     wanted = shlex.split(os.environ.get("CC", ""))
     if wanted:
         if shutil.which(wanted[0]) is None:
@@ -104,32 +78,11 @@ def build_and_compare(
 ) -> tuple[Build, Comparison]:
     """Compile library, test and example of a project elsewhere and run them.
 
-    Nothing is written to the project's folder.
+    BuildError where the compiler rejects a file, ComparisonError where a result differs in any bit.
 
-    Parameters
-    ----------
-    folder : path
-        A generated project.
-    name : str
-        Its C name.
-    compiler : sequence of str
-        The compiler's command, see `find_compiler`.
-    extra_flags : sequence of str
-        Flags besides `FLAGS`.
-    shared : tuple of two paths, optional
-        A shared library to make of the object that was compared and of a further source file.
-
-    Returns
-    -------
-    Build
-    Comparison
-
-    Raises
-    ------
-    BuildError
-        If the compiler rejects a file or a program cannot be run.
-    ComparisonError
-        If a result differs in any bit.
+    name: its C name
+    compiler: see `find_compiler`; extra_flags: flags besides `FLAGS`
+    shared: a library to make of the object that was compared and of a further source file
     """
     project = Path(folder).absolute()
     flags = (*FLAGS, *extra_flags)

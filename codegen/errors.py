@@ -4,13 +4,7 @@ from obsynth.symbolic.errors import ObsynthError
 
 
 class CodegenError(ObsynthError):
-    """A project that cannot be generated or put where it was asked for.
-
-    Examples
-    --------
-    >>> CodegenError("precision 'single' is not available", available=("double",)).available
-    ('double',)
-    """
+    """A project that cannot be generated or put where it was asked for."""
 
 
 class FolderError(CodegenError):
@@ -18,25 +12,11 @@ class FolderError(CodegenError):
 
 
 class BuildError(CodegenError):
-    """Generated C that a compiler rejects, or a program that cannot be run.
-
-    Parameters
-    ----------
-    message : str
-        Which step failed and the first lines of what the compiler said.
-    **facts
-        ``command`` and ``output`` as attributes.
-    """
+    """Generated C that a compiler rejects, or a program that cannot be run: `command`, `output`."""
 
 
 class ComparisonError(CodegenError):
-    """The compiled step differs from the CasADi function it was made from.
+    """The compiled step differs from the CasADi function it was made from, first told in full.
 
-    Parameters
-    ----------
-    message : str
-        The first difference: vector, output, both values in hexadecimal.
-    **facts
-        ``vector``, ``line``, ``output``, ``expected``, ``computed`` (bit patterns as text),
-        ``differing`` and ``vectors`` (counts) as attributes.
+    `vector`, `line`, `output`, `expected`, `computed` (bit patterns), `differing`, `vectors`.
     """

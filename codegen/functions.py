@@ -1,13 +1,10 @@
 """Functions that IEEE 754 does not define to the last bit, made of operations that it does.
 
-Each is a CasADi function of scalars: the writer makes C of it, the machine in single precision
-evaluates it, and both have the same bits wherever arithmetic is that of IEEE 754. Arguments are
-reduced without error, or with the error carried along; polynomials interpolate at Chebyshev nodes,
-coefficients rounded; powers of two are found by halving. `ULPS` bounds the errors that
-``tools/ulps.py`` found: over every float (sine, cosine, tangent, exp, log, atan), every seventh,
-or 40 million pairs. Below the normal numbers the unit is the smallest one. Zeros have no sign; what
-is not defined is a NaN, and so are sine, cosine and tangent beyond `FARTHEST`, where a float is no
-angle any more.
+Arguments are reduced without error, or with the error carried along; polynomials interpolate at
+Chebyshev nodes, coefficients rounded; powers of two are found by halving. `ULPS` bounds the errors
+that ``tools/ulps.py`` found, see docs/c.md. Below the normal numbers the unit is the smallest one.
+Zeros have no sign; what is not defined is a NaN, and so are sine, cosine and tangent beyond
+`FARTHEST`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

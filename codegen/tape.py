@@ -1,19 +1,9 @@
 """The arithmetic of one step as C of our own: the instruction tape, one assignment a value.
 
-What runs is what CasADi's virtual machine runs, to the last bit but for which NaN a NaN is:
-
-- `if_else` is on the tape ``(c ? a : 0) + (!c ? b : 0)``. Written is ``c ? a : b``, and ``+ 0.0``
-  behind it where a zero could be negative and its sign be seen: the sum has made it positive.
-- `fmax` and `fmin` of the mathematics library drop a NaN for the other operand, and return the
-  first of two that are equal. Comparisons do the same if they ask for a NaN of the first operand;
-  they need not where one of the two is never a NaN.
-- Comparisons are _Bool; as factors of positive constants they choose the constant or zero.
-- All inputs are read before a result is written, so that states and structs may overlap.
-- Beyond some thousand statements there are several functions, see `parts`.
-- In single precision constants are rounded to the nearest, literals and functions are those of
-  float, and functions that IEEE 754 does not define are our own, see `functions`.
-- A product is never written into the expression of a sum: what a compiler may fuse by C's rules
-  is not there.
+What runs is what CasADi's virtual machine runs, to the last bit but for which NaN a NaN is; what is
+written otherwise, and why no bit changes, stands in docs/c.md. Beyond some thousand statements
+there are several functions, see `parts`; functions that IEEE 754 does not define are in single
+precision our own, see `functions`.
 """
 
 from collections.abc import Callable, Mapping, Sequence

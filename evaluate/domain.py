@@ -39,16 +39,10 @@ class StatusCount:
 class Domain:
     """Where truth and estimate stood relative to the box of the guarantee.
 
-    Parameters
-    ----------
-    x_inside, xhat_inside : (N + 1,) bool arrays
-        True where every state is inside its range.
-    left : tuple of str
-        One sentence for each state that left, with the first instant and how far.
-    status : tuple of StatusCount
-        Bits of the status that occurred.
-    voids : tuple of Void
-        Stretches of void and recovering instants.
+    x_inside, xhat_inside (N + 1,): true where every state is inside its range
+    left: one sentence for each state that left, with the first instant and how far
+    status: bits of the status that occurred
+    voids: stretches of void and recovering instants
     """
 
     x_inside: NDArray[np.bool_]

@@ -110,15 +110,9 @@ def take(run: Any, name: str) -> Trace:
 class Violation:
     """A signal that was outside its interval.
 
-    Attributes
-    ----------
-    signal : str
-    count : int
-        Violated instants in the whole run.
-    instants, amounts : tuple
-        The first few instants k, and how far outside the truth was.
-    worst, worst_at : float, int
-        The largest amount and its instant.
+    count: violated instants in the whole run
+    instants, amounts: the first few instants k, and how far outside the truth was
+    worst, worst_at: the largest amount and its instant
     """
 
     signal: str

@@ -1,17 +1,10 @@
 """Exact rewriting of expressions: common factors, factors over a field, sums of angles.
 
-Common factors of numerators and denominators, cancelled where a denominator may be zero.
-
 (x**2 - y**2)/(x - y) is x + y, but an interval method sees a division by an interval that contains
-zero, and no quotient in one variable either. Where the denominator has no zero in the box, rows
-stay as they were typed.
-
-Products of sines and cosines as sums, before anything is bounded.
-
-cos(a) cos(a + b) + sin(a) sin(a + b) is cos(b), but an interval method sees three functions of a
-that vary independently. With products written as sums (Fu's rule TR8) what cancels has cancelled,
-and variables that do not matter are gone: the equations of a robot arm, as they come out of
-Lagrange's method, shrink to a fraction. Every rewritten part is proved equal to what it replaces.
+zero; where the denominator has no zero in the box, rows stay as they were typed. cos(a) cos(a + b)
++ sin(a) sin(a + b) is cos(b), but an interval method sees three functions of a that vary
+independently: with products written as sums (Fu's rule TR8) what cancels has cancelled. Every part
+that is rewritten so is proved equal to what it replaces.
 """
 
 from collections.abc import Callable, Iterator, Sequence

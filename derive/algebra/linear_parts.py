@@ -95,13 +95,10 @@ class IdentityProof:
     to signals that g must not contain, so they stay as the plant has them, and ``rounding``
     bounds how far the doubles handed to a design are away.
 
-    Attributes
-    ----------
-    methods : tuple of str
-        How every row of the dynamics, then every row of the outputs, was proved: ``"syntactic"``,
-        ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was found.
-    rounding : dict of str to ndarray
-        Bounds of |exact - double| for D, B_f, W1, C, W2, D_f.
+    methods: how every row of the dynamics, then every row of the outputs, was proved:
+        ``"syntactic"``, ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was
+        found
+    rounding: bounds of |exact - double| for D, B_f, W1, C, W2, D_f
     """
 
     methods: tuple[str, ...]

@@ -47,20 +47,12 @@ _SMALL = 1e-3
 class Maximum:
     """A largest value over a box: guaranteed from above, attained from below.
 
-    Attributes
-    ----------
-    upper : float
-        Guaranteed: no point of the box has a larger value.
-    attained : float
-        Guaranteed lower bound of the value at ``at``.
-    at : dict of str to float
-        The point, by symbol; symbols that do not matter are left out.
-    status : Status
-        How far the two are apart.
-    method : str
-        Where the upper bound comes from.
-    boxes : int
-        Boxes looked at.
+    upper: guaranteed: no point of the box has a larger value
+    attained: guaranteed lower bound of the value at ``at``
+    at: the point, by symbol; symbols that do not matter are left out
+    status: how far the two are apart
+    method: where the upper bound comes from
+    boxes: boxes looked at
     """
 
     upper: float

@@ -25,15 +25,10 @@ _MOST_VERTICES = 4096
 class InnerBound:
     """|g(a) - g(b)|^2 <= beta |a - b|^2 + gamma (a - b)'(g(a) - g(b)).
 
-    Attributes
-    ----------
-    beta : Maximum
-        Guaranteed for this gamma, with the attained value.
-    gamma : float
-        Chosen or given.
-    radius : float
-        sqrt(beta + gamma^2 / 4): g(a) - g(b) lies in a ball of this radius times |a - b| around
-        (gamma / 2) (a - b). With gamma = 0 it is the Lipschitz constant.
+    beta: guaranteed for this gamma, with the attained value
+    gamma: chosen or given
+    radius: sqrt(beta + gamma^2 / 4): g(a) - g(b) lies in a ball of this radius times |a - b| around
+        (gamma / 2) (a - b). With gamma = 0 it is the Lipschitz constant
     """
 
     beta: Maximum
@@ -45,17 +40,11 @@ class InnerBound:
 class LipschitzConstants:
     """How fast a nonlinearity can change over the box, in the 2-norm of the plant's units.
 
-    Attributes
-    ----------
-    norm : Maximum
-        Lipschitz constant: largest norm of the Jacobian.
-    one_sided : Maximum
-        One-sided Lipschitz constant: largest eigenvalue of the symmetric part of the Jacobian, so
-        that (a - b)'(g(a) - g(b)) <= one_sided |a - b|^2. May be negative.
-    inner : InnerBound
-        Constants of quadratic inner-boundedness.
-    what : str
-        Which function they belong to.
+    norm: Lipschitz constant: largest norm of the Jacobian
+    one_sided: one-sided Lipschitz constant: largest eigenvalue of the symmetric part of the
+        Jacobian, so that (a - b)'(g(a) - g(b)) <= one_sided |a - b|^2. May be negative
+    inner: constants of quadratic inner-boundedness
+    what: which function they belong to
     """
 
     norm: Maximum

@@ -31,20 +31,13 @@ from obsynth.symbolic.taking import takes
 class Majorant:
     """A diagonal M'M with J(x)'J(x) <= M'M at every point of the box, J = dg/dx.
 
-    Attributes
-    ----------
-    diagonal : ndarray, shape (n,)
-        Of M'M; zero for states on which g does not depend.
-    rows : tuple of RowMajorant
-        One per row of g that is not zero; the sum of their R is a majorant too, no smaller.
-    groups : tuple of (rows, columns, Maximum)
-        Parts of g that share no state, each with sup of the largest eigenvalue of
-        D^(-1/2) J'J D^(-1/2), D = M'M: at most 1, attained value and point.
-    rounding : ndarray, shape (n, n)
-        |difference between the plant's own linear coefficients and the doubles in A|, which g
-        takes up and which is not in ``diagonal``: a design counts it as an uncertainty of A.
-    split : Split
-        Where g comes from.
+    diagonal (n,): of M'M; zero for states on which g does not depend
+    rows: one per row of g that is not zero; the sum of their R is a majorant too, no smaller
+    groups: parts of g that share no state, each with sup of the largest eigenvalue of D^(-1/2) J'J
+        D^(-1/2), D = M'M: at most 1, attained value and point
+    rounding (n, n): |difference between the plant's own linear coefficients and the doubles in A|,
+        which g takes up and which is not in ``diagonal``: a design counts it as an uncertainty of A
+    split: where g comes from
     """
 
     diagonal: FloatArray

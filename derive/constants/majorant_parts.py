@@ -23,16 +23,11 @@ UP = 1.0 + 2.0**-50
 class RowMajorant:
     """phi^2 <= e' R e for one row of g: phi = g_i(a) - g_i(b), e = a - b, R diagonal.
 
-    Attributes
-    ----------
-    row : int
-        Row of g, from 0.
-    diagonal : ndarray, shape (n,)
-        Of R.
-    entries : ndarray, shape (n,)
-        Guaranteed bounds of |dg_i/dx_j|.
-    largest : Maximum
-        sup over the box of sum_j (dg_i/dx_j)^2 / R_jj, at most 1: guaranteed, attained, and where.
+    row: row of g, from 0
+    diagonal (n,): of R
+    entries (n,): guaranteed bounds of |dg_i/dx_j|
+    largest: sup over the box of sum_j (dg_i/dx_j)^2 / R_jj, at most 1: guaranteed, attained, and
+        where
     """
 
     row: int

@@ -1,15 +1,8 @@
 """The extended plant: faults as states, unknown inputs taken away, the rest as disturbances.
 
-For a discrete plant ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form:
-
-- a fault that is followed becomes a state with ``f+ = f + step``, the step within its rate;
-- other faults, parameters known to an interval, scheduling variables that are not measured, and
-  unknown inputs with a range are disturbances like w;
-- unknown inputs without a range, and faults to be divided out, are taken away. ``F(x, d) - F(x,
-  0)`` has to lie in the span of a constant D0, which is found from numbers and proved: rows that
-  hold the identity in D0 tell the others. With ``L0 = D0 (C D0)^-1`` on outputs of constant slopes
-  and ``T0 = I - L0 C``, the rows ``T0 F`` know nothing of d, whatever its size, and ``x = T0 x + L0
-  C x``.
+For a discrete plant ``x+ = F(x, u, f, d, w), y = h(x, u, f, w)`` of any form, as docs/methods/
+general_class.md tells it: the rows ``T0 F`` with ``T0 = I - L0 C``, ``L0 = D0 (C D0)^-1``, know
+nothing of d, whatever its size, and ``x = T0 x + L0 C x``.
 """
 
 from collections.abc import Sequence

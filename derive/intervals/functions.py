@@ -1,9 +1,8 @@
 """Ranges of elementary functions over batches of intervals.
 
-Monotone functions are evaluated at both ends; sine, cosine and tangent ask whether an extremum or a
-pole lies inside, with a margin that errs on the wide side. What the mathematics library returns is
-pushed outwards by `ULPS` units in the last place: C libraries are good to one or two, NumPy's
-vectorised versions to four.
+Extrema and poles are asked for with a margin that errs on the wide side. What the mathematics
+library returns is pushed outwards by `ULPS` units in the last place: C libraries are good to one or
+two, NumPy's vectorised versions to four.
 """
 
 from collections.abc import Callable

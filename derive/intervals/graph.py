@@ -1,7 +1,5 @@
 """The graph of interval operations, in which equal sub-expressions are one node, and its order.
 
-In which order a program is run: equal operations that are ready together are done as one.
-
 A call of NumPy costs as much as the work on some hundreds of boxes, and branch and bound mostly has
 fewer than that. So all products whose factors are known are taken in one call, on arrays with one
 row per product and one column per box, then all sums that have become possible, and so on.

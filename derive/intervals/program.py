@@ -1,16 +1,10 @@
 """Expressions as a program of interval operations, and its evaluation over a batch of boxes.
 
 The instruction list of a CasADi function is turned into a graph in which equal sub-expressions are
-one node (hash-consing). On the way some forms are replaced by others with the same value and a
-narrower range: ``x*x`` becomes a square, ``sqrt(x**2)`` becomes ``|x|``, ``sqrt(x)**2`` becomes
-``x`` on ``x >= 0``, the two halves into which CasADi cuts an ``if_else`` become one choice with the
-hull of both branches, and the quotient of truth values that CasADi writes for the derivative of
-``min`` and ``max`` becomes a weight in [0, 1].
-
-Constants: numbers with at most 24 significant bits (integers, halves, quarters) are taken as
-meant; all others are widened by `CONSTANT_ULPS`, which covers the rounding of the constants that
-CasADi folds while an expression is built. Inputs named in ``constants`` become intervals once and
-for all, which is how exact rational parameters enter as intervals of one unit in the last place.
+one node, and on the way some forms are replaced by narrower ones, see `rewriting`. Numbers with at
+most 24 significant bits are taken as meant; all others are widened by `CONSTANT_ULPS`, which covers
+the rounding of the constants that CasADi folds while an expression is built. Inputs named in
+``constants`` become intervals once and for all, as exact rational parameters do.
 """
 
 from __future__ import annotations

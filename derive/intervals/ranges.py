@@ -212,13 +212,7 @@ def _in_all_variables(
 
 
 class Status(StrEnum):
-    """How good a bound is; the value is a sentence for the reader.
-
-    Examples
-    --------
-    >>> print(Status.CONVERGED)
-    converged: the bound is within the tolerance of an attained value
-    """
+    """How good a bound is; the value is a sentence for the reader."""
 
     EXACT = "exact: the bound is attained, up to rounding"
     CONVERGED = "converged: the bound is within the tolerance of an attained value"
@@ -267,23 +261,14 @@ class Failure:
 class Ranges:
     """Guaranteed and attained ranges of m expressions of v variables.
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (m,)
-        Guaranteed bounds, rounded outwards.
-    attained_lower, attained_upper : ndarray, shape (m,)
-        Values the expressions are guaranteed to reach or pass at ``points_lower`` and
-        ``points_upper``, so that the true range lies between the two pairs.
-    points_lower, points_upper : ndarray, shape (m, v)
-        Where.
-    gap : ndarray, shape (m,)
-        Guaranteed width minus attained width.
-    status_lower, status_upper, status : list of Status
-        How good the bounds are; ``status`` is the worse of the two.
-    failures : tuple of Failure
-        Expressions without a finite bound.
-    boxes, sweeps : int
-        Work done.
+    lower, upper (m,): guaranteed bounds, rounded outwards
+    attained_lower, attained_upper (m,): values the expressions are guaranteed to reach or pass at
+        ``points_lower`` and ``points_upper``, so that the true range lies between the two pairs
+    points_lower, points_upper (m, v): where
+    gap (m,): guaranteed width minus attained width
+    status_lower, status_upper, status: how good the bounds are; ``status`` is the worse of the two
+    failures: expressions without a finite bound
+    boxes, sweeps: work done
     """
 
     lower: FloatArray
@@ -315,46 +300,14 @@ def bound_ranges(
     effort: str = "normal",
     quotients: Quotients | None = None,
 ) -> Ranges:
-    """Enclose the ranges of CasADi SX expressions over a box.
+    """Enclose the ranges of m CasADi SX expressions of v symbols over their box, (v, 2).
 
-    Parameters
-    ----------
-    expressions : casadi.SX
-        m expressions.
-    variables : casadi.SX
-        v symbols.
-    box : array_like, shape (v, 2)
-        Their ranges.
-    constants : casadi.SX, optional
-        Symbols with a fixed, not exactly representable value.
-    constant_box : sequence of (float, float)
-        Enclosures of these values.
-    rtol : float
-        Wanted gap relative to the width of the attained range.
-    effort : {"fast", "normal", "tight"}
-        How many boxes may be spent.
-    quotients : Quotients, optional
-        What further symbols in the expressions stand for, where they come from the derivatives of
-        something with removable singularities. Such singularities in the expressions themselves
-        are found without it.
-
-    Returns
-    -------
-    Ranges
-        Bounds, attained values and points, gaps, status.
-
-    Raises
-    ------
-    DerivationError
-        A box or an effort that is not understood, an operation without a range rule.
-
-    Examples
-    --------
-    >>> import casadi as ca
-    >>> x = ca.SX.sym("x")
-    >>> found = bound_ranges(x * (1 - x), x, [(0, 1)])
-    >>> bool(0.25 <= found.upper[0] < 0.25 + 1e-6), found.points_upper[0].tolist()
-    (True, [0.5])
+    constants, constant_box: symbols with a fixed value that is no double, and their enclosures
+    rtol: wanted gap relative to the width of the attained range
+    effort: how many boxes may be spent, see `EFFORTS`
+    quotients: what further symbols in the expressions stand for, where they come from the
+        derivatives of something with removable singularities. Such singularities in the
+        expressions themselves are found without it
     """
     if effort not in EFFORTS:
         raise DerivationError(

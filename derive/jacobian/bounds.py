@@ -1,7 +1,5 @@
 """Guaranteed bounds of a plant's Jacobian over its box; jumps are refused.
 
-Refusal of jumps: a Jacobian bounds the change of a function only where the function has none.
-
 CasADi differentiates past the jump of a sign, a step or a piecewise definition as if it were not
 there. A kink is harmless (both slopes enter the bounds), a jump is not.
 """

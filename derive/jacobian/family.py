@@ -1,10 +1,7 @@
 """Families of matrices that are affine in independent scalars, and what makes entries depend.
 
-Affine dependences between the entries of a matrix function: proposed by numbers, proved exactly.
-
-The rank of centred, scaled samples tells which entries can be written through which others. The
-coefficients then come from the exact expressions, compared monomial by monomial, and the
-dependence counts only when the difference is proved to be identically zero.
+Dependences are proposed by the rank of centred, scaled samples and proved exactly, from the
+expressions, monomial by monomial.
 """
 
 from __future__ import annotations
@@ -32,30 +29,16 @@ _MOST_SCALARS = 16
 class AffineFamily:
     """Matrices constant + sum_k s_k directions_k, s_k in ranges_k, up to an elementwise radius.
 
-    Attributes
-    ----------
-    constant : ndarray, shape (n, k)
-        Part that does not vary.
-    directions : ndarray, shape (K, n, k)
-        One matrix per independent scalar; 1 at the entry that is the scalar.
-    ranges : ndarray, shape (K, 2)
-        Guaranteed ranges of the scalars.
-    radius : ndarray, shape (n, k)
-        What the rounding of the coefficients and of the vertices may cost, elementwise.
-    labels : tuple of str
-        What every scalar is.
-    exact : bool
-        True when no matrix of the family is superfluous: the scalars depend on disjoint sets of
-        variables, so that they take their values independently of each other. False: an outer
-        box.
+    The family holds the Jacobian at every point of the box and is convex, so that it holds the
+    matrix M of g(a) - g(b) = M (a - b) as well, with its dependences between rows.
 
-    Notes
-    -----
-    The family holds the Jacobian at every point of the box. It is convex, so it also holds the
-    integral of J(b + t (a - b)) over t in [0, 1], which is the matrix M of g(a) - g(b) = M (a - b)
-    that keeps the dependences between rows. (The mean value theorem applied row by row, equation
-    (4) of Buciakowski et al., takes a different point in every row, and two entries of the same
-    function in two rows would no longer go together.)
+    constant (n, k): part that does not vary
+    directions (K, n, k): one matrix per independent scalar; 1 at the entry that is the scalar
+    ranges (K, 2): guaranteed ranges of the scalars
+    radius (n, k): what the rounding of the coefficients and of the vertices may cost, elementwise
+    labels: what every scalar is
+    exact: true when no matrix of the family is superfluous: the scalars depend on disjoint sets of
+        variables, so that they take their values independently of each other. False: an outer box
     """
 
     constant: FloatArray
@@ -81,36 +64,16 @@ class AffineFamily:
         return 1 << int((self.ranges[:, 1] > self.ranges[:, 0]).sum())
 
     def at(self, scalars: Sequence[float] | FloatArray) -> FloatArray:
-        """Matrix for given scalars.
-
-        Parameters
-        ----------
-        scalars : array_like, shape (K,)
-            Values of the scalars.
-
-        Returns
-        -------
-        ndarray, shape (n, k)
-            The matrix, to within the radius.
-        """
+        """Matrix (n, k) for given scalars, (K,), to within the radius."""
         matrix = self.constant.copy()
         for value, direction in zip(scalars, self.directions, strict=True):
             matrix = matrix + value * direction
         return matrix
 
     def vertices(self) -> FloatArray:
-        """Matrices at the corners of the ranges.
+        """Matrices at the corners of the ranges, (N, n, k); DerivationError beyond 2^16 of them.
 
-        Returns
-        -------
-        ndarray, shape (N, n, k)
-            N = 2^K for K scalars with a range of positive width, the last scalar fastest, lower
-            end first.
-
-        Raises
-        ------
-        DerivationError
-            More than 2^16 vertices.
+        N = 2^K for K scalars with a range of positive width, the last fastest, lower ends first.
         """
         if self.vertex_count > 2**_MOST_SCALARS:
             raise DerivationError(
@@ -131,18 +94,7 @@ class AffineFamily:
         return float(np.minimum(its[:, 0] - mine[:, 0], mine[:, 1] - its[:, 1]).min(initial=0.0))
 
     def covers(self, other: AffineFamily) -> bool:
-        """Whether a family with the same constant and directions holds another one.
-
-        Parameters
-        ----------
-        other : AffineFamily
-            The family that has to lie inside.
-
-        Returns
-        -------
-        bool
-            False too where the two do not vary in the same directions.
-        """
+        """Whether a family holds another one, of the same constant and directions."""
         return bool(
             self.directions.shape == other.directions.shape
             and np.array_equal(self.directions, other.directions)
@@ -217,21 +169,13 @@ def entry_name(entry: Entry) -> str:
 class AffineDependence:
     """An entry that is an affine function of others, with the proof.
 
-    Attributes
-    ----------
-    entry : (int, int)
-        Row and column, from 0.
-    coefficients : dict of (int, int) to sympy.Expr
-        Exact coefficient of every entry it is written through; empty for a constant entry.
-    constant : sympy.Expr
-        Exact constant.
-    proof : str
-        How the difference was proved to be zero.
-    shared : tuple of str
-        Names of the variables on which the entries depend.
-    size : float
-        Largest magnitude of the entry at the samples; the text does not add constants to it that
-        the rounding of a matrix has left.
+    entry: row and column, from 0
+    coefficients: exact coefficient of every entry it is written through; empty for a constant entry
+    constant: exact constant
+    proof: how the difference was proved to be zero
+    shared: names of the variables on which the entries depend
+    size: largest magnitude of the entry at the samples; the text does not add constants to it that
+        the rounding of a matrix has left
     """
 
     entry: Entry

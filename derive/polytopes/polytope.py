@@ -1,10 +1,7 @@
-"""Polytopes by half-spaces and by vertices, and the way from one to the other with proof.
-
-Vertices of a bounded polytope from its half-spaces, exactly, by walking along its edges.
+"""Polytopes by half-spaces and by vertices, and the way from one to the other, in rationals.
 
 A vertex of a simple polytope lies on exactly n faces; letting go of one of them leads along an edge
-to a neighbour. The graph of vertices and edges is connected, so the walk sees every vertex, and
-that the list is complete needs no further proof. Everything is computed in rational numbers.
+to a neighbour. The graph of vertices and edges is connected, so that a walk sees every vertex.
 """
 
 from __future__ import annotations
@@ -111,22 +108,14 @@ _NUDGES = (2.0**-44, 2.0**-40, 2.0**-34)
 class Polytope:
     """A bounded polytope {x : normals x <= offsets}, and vertices whose hull holds it.
 
-    Attributes
-    ----------
-    normals : ndarray, shape (m, n)
-        Outer normals.
-    offsets : ndarray, shape (m,)
-        Right-hand sides.
-    vertices : ndarray, shape (N, n)
-        Corners.
-    radius : ndarray, shape (n,)
-        Rounding of the vertices: every point of the polytope is a convex combination of points
-        that lie no farther than this from the vertices, coordinate by coordinate.
-
-    Notes
-    -----
     From `polytope_from_halfspaces` the half-spaces are the given ones and the vertices hold them;
     from `polytope_from_vertices` it is the other way round.
+
+    normals (m, n): outer normals
+    offsets (m,): right-hand sides
+    vertices (N, n): corners
+    radius (n,): rounding of the vertices: every point of the polytope is a convex combination of
+        points that lie no farther than this from the vertices, coordinate by coordinate
     """
 
     normals: FloatArray
@@ -146,32 +135,11 @@ class Polytope:
 
 
 def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope:
-    """Find the vertices of a polytope that is given by half-spaces.
+    """Find the vertices of {x : normals x <= offsets}, shapes (m, n) and (m,).
 
-    Parameters
-    ----------
-    normals : array_like, shape (m, n)
-        Outer normals.
-    offsets : array_like, shape (m,)
-        Right-hand sides of normals x <= offsets.
-
-    Returns
-    -------
-    Polytope
-        Its vertices are exact up to ``radius``. Where more than n faces meet in a vertex, they are
-        moved outwards by a relative 1e-13 or so, so that the hull of the vertices holds the
-        polytope in any case.
-
-    Raises
-    ------
-    DerivationError
-        Shapes that do not match, numbers that are not finite, an empty or unbounded polytope.
-
-    Examples
-    --------
-    >>> found = polytope_from_halfspaces([[1, 0], [0, 1], [-1, -1]], [1, 1, 0])
-    >>> found.vertices.tolist()
-    [[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]]
+    They are exact up to ``radius``. Where more than n faces meet in a vertex, they are moved
+    outwards by a relative 1e-13 or so, so that the hull of the vertices holds the polytope in any
+    case. An empty or unbounded one is a DerivationError.
     """
     A, b = np.atleast_2d(np.asarray(normals, dtype=float)), np.ravel(np.asarray(offsets, float))
     if A.ndim != 2 or len(A) != len(b) or A.shape[1] == 0:
@@ -208,29 +176,10 @@ def polytope_from_halfspaces(normals: ArrayLike, offsets: ArrayLike) -> Polytope
 
 
 def polytope_from_vertices(vertices: ArrayLike) -> Polytope:
-    """Find half-spaces whose intersection holds the hull of points.
+    """Find half-spaces whose intersection holds the hull of points (N, n).
 
-    Parameters
-    ----------
-    vertices : array_like, shape (N, n)
-        Points that do not lie in one hyperplane.
-
-    Returns
-    -------
-    Polytope
-        With the points on the hull, and offsets rounded up until every point satisfies them
-        exactly.
-
-    Raises
-    ------
-    DerivationError
-        Too few points, or points in one hyperplane.
-
-    Examples
-    --------
-    >>> found = polytope_from_vertices([[0, 0], [1, 0], [0, 1], [0.25, 0.25]])
-    >>> len(found.vertices), len(found.offsets), found.contains([0.25, 0.5])
-    (3, 3, True)
+    The points kept are those on the hull, and offsets are rounded up until every point satisfies
+    them exactly. Points in one hyperplane are a DerivationError.
     """
     points = np.atleast_2d(np.asarray(vertices, dtype=float))
     n = points.shape[1]

@@ -1,7 +1,6 @@
 """What `Plant.discretise` asks for: the remainder of a step per state, and the order that will do.
 
-Importing this module gives `Plant` the means: rooms import only to their left, so that the room of
-plants cannot ask for a proof, but it can be handed the function that makes one.
+Importing this module hands the function to `Plant`, as rooms import only to their left.
 """
 
 from typing import Any

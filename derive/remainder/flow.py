@@ -1,9 +1,7 @@
 """A box that no solution leaves within one step, and hulls over many pieces of a box.
 
-Hull of an interval program over a box that is cut into many pieces, without derivatives.
-
-For expressions that only have to be bounded in their order of magnitude: one sweep over a batch of
-pieces costs far less than gradients of a long program.
+Hulls are for expressions that only have to be bounded in their order of magnitude: one sweep over a
+batch of pieces costs far less than gradients of a long program.
 """
 
 from __future__ import annotations

@@ -18,29 +18,19 @@ _HEADS = ("state", "guaranteed", "attained", "flow over a step", "unit")
 class Remainder:
     """x(t + Ts) = step(x(t)) + r with r in [lower, upper], everything else held over the step.
 
-    Attributes
-    ----------
-    plant : Plant
-        The continuous plant.
-    formula : Step
-        The formula of the step.
-    exact_Ts : sympy.Expr
-        Sampling time in s, as it was given.
-    lower, upper : ndarray, shape (n,)
-        Guaranteed bounds of r, for every state of the box and every held signal in its range.
-    attained_lower, attained_upper : ndarray, shape (n,)
-        Values that r is guaranteed to reach or pass, so that the exact range lies between.
-    attained_at : tuple of dict
-        For every state, the state and held signals with the larger attained modulus.
-    flow_lower, flow_upper : ndarray, shape (n,)
-        A box that no solution from the plant's box leaves within a step.
-    order : int
-        Power of Ts of the bound: 2 for Euler, 5 for Runge-Kutta, one more than its own for a
-        Taylor polynomial, less where the dynamics have kinks inside the box.
-    assumed : dict of str to (float, float)
-        Ranges that were given for this purpose and are not the plant's own.
-    status : Status
-        How far bounds and attained values are apart, by the tolerance that was asked for.
+    plant: the continuous plant
+    formula: the formula of the step
+    exact_Ts: sampling time in s, as it was given
+    lower, upper (n,): guaranteed bounds of r, for every state of the box and every held signal in
+        its range
+    attained_lower, attained_upper (n,): values that r is guaranteed to reach or pass, so that the
+        exact range lies between
+    attained_at: for every state, the state and held signals with the larger attained modulus
+    flow_lower, flow_upper (n,): a box that no solution from the plant's box leaves within a step
+    order: power of Ts of the bound: 2 for Euler, 5 for Runge-Kutta, one more than its own for a
+        Taylor polynomial, less where the dynamics have kinks inside the box
+    assumed: ranges that were given for this purpose and are not the plant's own
+    status: how far bounds and attained values are apart, by the tolerance that was asked for
     """
 
     plant: Plant

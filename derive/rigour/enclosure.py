@@ -1,17 +1,11 @@
 """Matrices enclosed by middle and radius, and the proof that a family of them is definite.
 
-S. M. Rump, "Fast and parallel interval arithmetic", BIT 39 (1999), gives the midpoint-radius
-products; here the rounding mode stays to nearest, so every radius is computed with the bound
-n u / (1 - n u) on a sum of n products, which holds for any order of summation and with fused
-multiply-adds (N. J. Higham, Accuracy and Stability, section 3.1).
-
-Proof that symmetric matrices are positive definite, from one floating-point Cholesky each.
-
-After S. M. Rump, "Verification of positive definiteness", BIT 46 (2006): if Cholesky's
-factorisation of fl(B - c I) runs to its end, then B is positive definite for a c computed
-from the diagonal. The factorisation is written out here, because its error bound (Higham,
-Accuracy and Stability, theorem 10.3) holds for the plain algorithm in any order of summation,
-but not for whatever a tuned library may do.
+Products are those of S. M. Rump, "Fast and parallel interval arithmetic", BIT 39 (1999), with the
+rounding mode left to nearest. Definiteness is proved after S. M. Rump, "Verification of positive
+definiteness", BIT 46 (2006): if Cholesky's factorisation of fl(B - c I) runs to its end, B is
+positive definite for a c computed from the diagonal. It is written out here, because its error
+bound (Higham, Accuracy and Stability, theorem 10.3) holds for the plain algorithm in any order of
+summation, but not for whatever a tuned library may do.
 """
 
 from __future__ import annotations

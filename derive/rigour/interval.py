@@ -1,22 +1,14 @@
 """Intervals, one step of rounding to the named side, and doubles around SymPy's real numbers.
 
 An interval is a pair ``(lo, hi)`` of arrays of equal or broadcastable shape, one element per box of
-a batch. The four operations and the square root are correctly rounded by IEEE 754, so that one
-step of ``nextafter`` encloses the exact result. Zeros that are exact stay exact, since a lower end
-of ``-5e-324`` in place of 0 would leave the domain of a square root.
+a batch, its ends one ``nextafter`` outside the exact result. Zeros that are exact stay exact, since
+a lower end of ``-5e-324`` in place of 0 would leave the domain of a square root. ``nan`` in either
+end stands for "nothing is known" and propagates until whoever reads the result makes the whole line
+of it; it comes from operands outside a domain and from divisions by an interval with zero inside.
+An infinite end stands for numbers without limit, never for infinity itself.
 
-``nan`` in either end stands for "nothing is known": it propagates through every operation here and
-is turned into the whole line by whoever reads the result. It arises from operands outside a domain
-and from a division by an interval with zero inside. An infinite end stands for numbers without
-limit, of which overflow makes some, never for infinity itself.
-
-Doubles rounded to a chosen side.
-
-The rounding mode is never changed. One operation is stepped outwards by one double (`down`, `up`);
-a formula with nonnegative terms only is multiplied by one factor above its accumulated rounding
-error (`raised`, `lowered`), which rests on the error n u / (1 - n u) of a sum of n products in any
-order, with or without fused multiply-adds (N. J. Higham, Accuracy and Stability of Numerical
-Algorithms, section 3.1).
+`raised` and `lowered` rest on the error n u / (1 - n u) of a sum of n products in any order, with
+or without fused multiply-adds (N. J. Higham, Accuracy and Stability, section 3.1).
 """
 
 import math

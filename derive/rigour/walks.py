@@ -1,8 +1,4 @@
-"""Walks over expressions that meet every different part once.
-
-SymPy's own walk through a part as often as it stands there written out, and a Runge-Kutta step has
-few different parts and many millions of them when it is written out.
-"""
+"""Walks over expressions that meet every different part once, where SymPy's own meet each copy."""
 
 from collections.abc import Mapping
 

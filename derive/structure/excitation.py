@@ -58,17 +58,11 @@ class FaultEffect:
 class Excitation:
     """What has to move for constant faults to be identified together.
 
-    Attributes
-    ----------
-    effects : tuple of FaultEffect
-        One per fault.
-    visible_at_rest : int
-        How many independent combinations of constant faults one operating point shows.
-    points : int or None
-        How many different operating points are needed for all of them; 1: constant signals are
-        enough; None: no number found is.
-    limit : int
-        Largest number of points that was tried.
+    effects: one per fault
+    visible_at_rest: how many independent combinations of constant faults one operating point shows
+    points: how many different operating points are needed for all of them; 1: constant signals are
+        enough; None: no number found is
+    limit: largest number of points that was tried
     """
 
     effects: tuple[FaultEffect, ...]

@@ -1,7 +1,7 @@
 """A plant frozen at points of its box: exact derivatives in 40 digits, ranks without doubt.
 
-A rank is a question about exact numbers. In doubles a column that depends on others by the
-equations differs from them by rounding; in 40 digits it is zero to 1e-35 or it is not.
+In doubles a column that depends on others by the equations differs from them by rounding; in 40
+digits it is zero to 1e-35 or it is not.
 """
 
 from collections.abc import Iterator, Sequence

@@ -20,23 +20,15 @@ _FREQUENCIES = (1.3717, -0.8391, 2.1173)
 class FaultIsolability:
     """What the outputs say about single faults.
 
-    Attributes
-    ----------
-    faults : tuple of str
-        Names of the faults.
-    unknown : tuple of str
-        Unknown inputs, of which the statements are independent.
-    detectable : ndarray of bool, shape (n_f,)
-        Whether some residual that no unknown input reaches sees the fault.
-    isolable : ndarray of bool, shape (n_f, n_f)
-        Row i, column j: whether some residual sees fault i but neither fault j nor the unknown
-        inputs. Symmetric for faults that are detectable.
-    groups : tuple of tuple of str
-        Detectable faults that cannot be told from each other; a fault on its own can be told from
-        every other one.
-    joint_rank, unknown_rank : int
-        Normal rank of the transfer matrix with all faults, and without: their difference is how
-        many faults can be estimated at the same time.
+    faults: names of the faults
+    unknown: unknown inputs, of which the statements are independent
+    detectable (n_f,): whether some residual that no unknown input reaches sees the fault
+    isolable (n_f, n_f): row i, column j: whether some residual sees fault i but neither fault j nor
+        the unknown inputs. Symmetric for faults that are detectable
+    groups: detectable faults that cannot be told from each other; a fault on its own can be told
+        from every other one
+    joint_rank, unknown_rank: normal rank of the transfer matrix with all faults, and without: their
+        difference is how many faults can be estimated at the same time
     """
 
     faults: tuple[str, ...]
@@ -58,19 +50,10 @@ class FaultIsolability:
         return self.joint_rank - self.unknown_rank
 
     def require(self, detect: Iterable[str] = (), isolate: Iterable[str] = ()) -> None:
-        """Refuse a specification that no residual generator can meet.
+        """Refuse a specification that no residual generator can meet, by a StructureError.
 
-        Parameters
-        ----------
-        detect : iterable of str
-            Faults to be seen in spite of the unknown inputs.
-        isolate : iterable of str
-            Faults to be told from each other and from all other faults.
-
-        Raises
-        ------
-        StructureError
-            A fault that is hidden, or a pair that cannot be told apart; ``symbols`` names them.
+        detect: faults to be seen in spite of the unknown inputs
+        isolate: faults to be told from each other and from all other faults
         """
         wanted = [str(name) for name in detect]
         apart = [str(name) for name in isolate]

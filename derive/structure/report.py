@@ -37,14 +37,9 @@ _MOST_VERTICES = 512
 class Check:
     """One line of a report.
 
-    Attributes
-    ----------
-    title : str
-        What was looked at.
-    passed : bool or None
-        Outcome; None for a line that only informs, or that could not be reached.
-    text : str
-        What was found, with names and numbers.
+    title: what was looked at
+    passed: outcome; None for a line that only informs, or that could not be reached
+    text: what was found, with names and numbers
     """
 
     title: str
@@ -56,16 +51,10 @@ class Check:
 class StructureReport:
     """What the structure of a plant allows, line by line.
 
-    Attributes
-    ----------
-    plant : str
-        Name of the plant.
-    checks : tuple of Check
-        In the order in which a design needs them.
-    split : Split or None
-        The split, where there is one.
-    bounds : JacobianBounds or None
-        The Jacobian bounds, where there are.
+    plant: name of the plant
+    checks: in the order in which a design needs them
+    split: the split, where there is one
+    bounds: the Jacobian bounds, where there are
     """
 
     plant: str

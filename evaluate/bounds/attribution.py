@@ -21,22 +21,16 @@ WIDER = 1e3
 class Attribution:
     """What of a record contradicts bounds, four ways of saying where.
 
-    Parameters
-    ----------
-    scale : (float, float)
-        Certified and attained: the factor of the bounds that explains the whole record. Above 1
-        the bounds are refuted.
-    first : int or None
-        Index of the first instant up to which the record contradicts the bounds for certain; None
-        where it does not.
-    before, after : (float, float)
-        Certified and attained factor up to the instant before the first, and up to it; of the
-        whole record where there is none.
-    excess : array (N, n_w)
-        By how much disturbances are past their bounds, least in sum: a share of the blame.
-    alone : Table
-        For every disturbance the factor of all others where it is free; among those that need no
-        more than 1, its own factor with all others at their bounds.
+    scale: certified and attained: the factor of the bounds that explains the whole record. Above 1
+        the bounds are refuted
+    first: index of the first instant up to which the record contradicts the bounds for certain;
+        None where it does not
+    before, after: certified and attained factor up to the instant before the first, and up to it;
+        of the whole record where there is none
+    excess (N, n_w): by how much disturbances are past their bounds, least in sum: a share of the
+        blame
+    alone: for every disturbance the factor of all others where it is free; among those that need no
+        more than 1, its own factor with all others at their bounds
     """
 
     scale: tuple[float, float]

@@ -20,14 +20,9 @@ CONFIDENCE = 0.95
 class Validation:
     """Factors of the bounds that single windows of the record need.
 
-    Parameters
-    ----------
-    factors : array (n,)
-        Attained, by window.
-    certified : array (n,)
-        No window needs less.
-    free : int
-        Number of bounds and parameters that were fitted.
+    factors (n,): attained, by window
+    certified (n,): no window needs less
+    free: number of bounds and parameters that were fitted
     """
 
     factors: FloatArray

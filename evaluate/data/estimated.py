@@ -29,14 +29,9 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 class Refutation:
     """Where a record and the assumptions of an observer cannot both be right.
 
-    Attributes
-    ----------
-    instant, time : int, float
-        The first such instant, in rows of the record and in seconds.
-    signals : tuple of str
-        The readings each of which makes the instant void; else the signals whose sets miss their
-        declared ranges. Empty where no single reading does.
-    why : str
+    instant, time: the first such instant, in rows of the record and in seconds
+    signals: the readings each of which makes the instant void; else the signals whose sets miss
+        their declared ranges. Empty where no single reading does
     """
 
     instant: int

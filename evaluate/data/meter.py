@@ -14,22 +14,13 @@ KINDS = (("rate",), ("level",))
 class Comparison:
     """A signal in units of the plant beside a channel in units of its own.
 
-    Attributes
-    ----------
-    signal, channel, kind : str
-    scale : float
-        Units of the signal in a unit of the channel: as given, or least squares of the middles.
-    scales : (float, float) or None
-        The scales with which every reading of the channel lies in its interval; None: none does.
-    inside : float
-        Share of instants at which the channel, times `scale`, lies in the interval.
-    false_alarms : int
-        Instants at which zero was outside of the interval and the channel was at zero.
-    first, known : int or None
-        First instant at which zero was outside and the channel was not at zero, and at which that
-        was known.
-    certain : float
-        Share of the instants at which the channel was not at zero that zero was outside at.
+    scale: units of the signal in a unit of the channel: as given, or least squares of the middles
+    scales: the scales with which every reading of the channel lies in its interval; None: none does
+    inside: share of instants at which the channel, times `scale`, lies in the interval
+    false_alarms: instants at which zero was outside of the interval and the channel was at zero
+    first, known: first instant at which zero was outside and the channel was not at zero, and at
+        which that was known
+    certain: share of the instants at which the channel was not at zero that zero was outside at
     """
 
     signal: str

@@ -1,11 +1,10 @@
 """Recognition of removable singularities: divisions by what may be zero that do no harm.
 
-sin(x)/x, (exp(x - y) - 1)/(x - y), x/tanh(x), log(x)/(x - 1), cos(x)/x - sin(x)/x**2: where all
-that is singular is a function of one quantity, the orders of the zeros of numerator and denominator
-are compared exactly, and the quotient becomes a member of `Quotients`. The Taylor patches of the
-named functions sinc, phi1 and tanhc are recognised too and taken for what they stand for.
-
-The bounds are those of the continuous function: what floating point makes of 0/0 is another matter.
+sin(x)/x, (exp(x - y) - 1)/(x - y), log(x)/(x - 1), cos(x)/x - sin(x)/x**2: where all that is
+singular is a function of one quantity, the orders of the zeros of numerator and denominator are
+compared exactly, and the quotient becomes a member of `Quotients`. So do the Taylor patches of
+sinc, phi1 and tanhc. The bounds are those of the continuous function, whatever floating point makes
+of 0/0.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

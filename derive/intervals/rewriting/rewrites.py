@@ -1,16 +1,9 @@
 """Rewrites with the same value wherever the original is defined, and a narrower range.
 
-Every function here takes the graph and the operands of an operation of CasADi and returns the node
-that stands for it.
-
-Factors that cancel: x**2/sqrt(x) is x sqrt(x), which has no division and is defined at zero.
-
-CasADi differentiates x**(5/2) = x**2 sqrt(x) by the product rule, and the quotient by a root that
-comes out of it has no bound where the root is zero. Products and quotients are therefore seen as
-powers, in halves, of what they are made of.
-
-Exponentials that saturate: e/(c + k e) with e = exp(z) is 1/(c exp(-z) + k), which is narrower and
-does not overflow. Derivatives of logistic functions are such products.
+Every function takes the graph and the operands of an operation of CasADi and returns the node that
+stands for it. Products and quotients are seen as powers, in halves, of what they are made of:
+x**2/sqrt(x) is x sqrt(x), which is defined at zero. e/(c + k e) with e = exp(z) is 1/(c exp(-z) +
+k), which is narrower and does not overflow: derivatives of logistic functions are such products.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 """Branch and bound over batches of boxes, breadth first, for many expressions at once.
 
 Every expression has two goals, its largest value and (as the largest value of its negative) its
-smallest one. A row of the batch is a box that belongs to one goal. In every sweep a row is bounded
-by the natural extension and by the mean-value form, shrunk to a facet in every variable in which
-the expression is monotone, used to look for a better attained value, and then closed or split. A
-variable that enters affinely is split into its two facets, never in the middle.
-
-What is still open after a few sweeps is looked at to second order: gradients get sharper, a
-variable in which the goal is convex is split into its facets as well, and a box over which the goal
-is concave is settled at once by the tangent at its top, however many boxes around the largest
-value the first order would need.
+smallest one. A row of the batch is a box that belongs to one goal. What a sweep does with it, to
+first and to second order, is told in docs/derivations.md.
 """
 
 from __future__ import annotations
