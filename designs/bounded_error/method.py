@@ -1,6 +1,6 @@
 """`BoundedErrorUIO`: options of the method, and the way from a model to an observer."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
@@ -242,11 +242,18 @@ class BoundedErrorUIO(Method):
         given = settle(given, model.split.proof.rounding)
         system, noise, weights = self._setting(model)
         gain = given.gain(self.error)
+
+        def solve(gamma: float) -> EllipsoidSolution:
+            return synthesise(system, gamma, noise, self.objective, weights, gain)
+
+        def complete(solution: EllipsoidSolution) -> tuple[UioDesign, bool]:
+            return self._complete(given, system, solution, noise, weights)
+
         if self.gamma is None:
-            solution = analyse_gain(system, gain, noise, weights)
-        else:
-            solution = synthesise(system, self.gamma, noise, self.objective, weights, gain)
-        return self._complete(given, system, solution, noise, weights)
+            return complete(analyse_gain(system, gain, noise, weights))[0]
+        return _at_or_explained(
+            self.gamma, solve, complete, lambda: largest_gamma(system, gain), system, gain
+        )
 
     def problem(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> Problem:
         """Return the design LMI at the given gamma, see `Problem.to_cvxpy`.
@@ -303,17 +310,31 @@ class BoundedErrorUIO(Method):
 
         else:
             solve, top = self._multiplier_form(model, weights)
-        solution = _solve_or_explain(solve, top, weights, self.gamma, system)
-        gain = solution.gain
         n, m = model.design.K.shape
         kept = model.design.kept(self.error)
-        K = np.zeros((n, m))
-        K[kept] = gain[: len(kept)]
-        F = gain[len(kept) :]
-        if self.error == "shifted":
-            K, F = K @ model.design.Pi, F @ model.design.Pi
-        given = replace(model.design, K=K, F=F, options=self.options())
-        return self._complete(given, system, solution, noise, weights)
+
+        def complete(solution: EllipsoidSolution) -> tuple[UioDesign, bool]:
+            K = np.zeros((n, m))
+            K[kept] = solution.gain[: len(kept)]
+            F = solution.gain[len(kept) :]
+            if self.error == "shifted":
+                K, F = K @ model.design.Pi, F @ model.design.Pi
+            given = replace(model.design, K=K, F=F, options=self.options())
+            return self._complete(given, system, solution, noise, weights)
+
+        if self.gamma is not None:
+            return _at_or_explained(self.gamma, solve, complete, top, system)
+        largest = top()
+        if largest <= 0:
+            raise InfeasibleDesign(
+                "no gamma is feasible: no gain makes the error contract at all vertices with one P",
+                [
+                    "the bounds of disturbances and rates do not matter here: they only scale P",
+                    "what helps: a smaller box of the states, or another measurement",
+                ],
+                largest_gamma=0.0,
+            )
+        return complete(search_gamma(solve, weights, largest))[0]
 
     def _multiplier_form(self, model: UioModel, weights: FloatArray) -> tuple[Any, Any]:
         from obsynth.designs.bounded_error.multipliers import (
@@ -345,8 +366,8 @@ class BoundedErrorUIO(Method):
         solution: EllipsoidSolution,
         noise: FloatArray | None,
         weights: FloatArray,
-    ) -> UioDesign:
-        """Attach the ellipsoids to a design with gains, backed off until they are proved."""
+    ) -> tuple[UioDesign, bool]:
+        """Attach the ellipsoids to a design with gains, backed off until they are proved or not."""
         gain = given.gain(self.error)
         solutions = [solution]
         if self.post == "per_component":
@@ -361,46 +382,51 @@ class BoundedErrorUIO(Method):
             bound = EllipsoidBound(self.error, P, gammas, rows, inverse_diagonal_bounds(P))
             design = replace(given, bound=bound)
             if all(claim.holds for claim in prove_ellipsoid(design)):
-                break
-        return design
+                return design, True
+        return design, False
 
 
 def _with_vertices(model: UioModel, vertices: FloatArray) -> Any:
     return replace(model.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices))
 
 
-def _solve_or_explain(
-    solve: Any, top: Any, weights: FloatArray, gamma: float | None, system: ErrorSystem
-) -> EllipsoidSolution:
-    """Solve at gamma, or search it; explain an infeasible one by the largest that is feasible."""
-    if gamma is None:
-        largest = top()
-        if largest <= 0:
-            raise InfeasibleDesign(
-                "no gamma is feasible: no gain makes the error contract at all vertices with one P",
-                [
-                    "the bounds of disturbances and rates do not matter here: they only scale P",
-                    "what helps: a smaller box of the states, or another measurement",
-                ],
-                largest_gamma=0.0,
-            )
-        return search_gamma(solve, weights, largest)
+def _at_or_explained(
+    gamma: float,
+    solve: Callable[[float], EllipsoidSolution],
+    complete: Callable[[EllipsoidSolution], tuple[UioDesign, bool]],
+    top: Callable[[], float],
+    system: ErrorSystem,
+    gain: FloatArray | None = None,
+) -> UioDesign:
+    """Design (with a gain (p, m): analyse) at gamma, or refuse by the largest that is feasible.
+
+    Little above it the solver may neither refuse nor solve: what it leaves has no proof.
+    """
+    trouble: InfeasibleDesign | SolverTrouble | None = None
     try:
-        solution: EllipsoidSolution = solve(gamma)
+        design, proved = complete(solve(gamma))
+        if proved:
+            return design
     except (InfeasibleDesign, SolverTrouble) as error:
-        largest = top()
-        if gamma < largest:
-            raise
-        lines, share = explain_infeasible(system, gamma)
+        trouble = error
+    largest = top()
+    told = f"the largest feasible gamma is about {largest:.5g}"
+    if gamma >= largest:
+        lines, share = explain_infeasible(system, gamma, gain)
         raise InfeasibleDesign(
-            f"gamma = {gamma:.6g} is infeasible",
+            f"gamma = {gamma:.6g} is infeasible"
+            + (" for the given gain" if gain is not None else ""),
             [
-                f"the largest feasible gamma is about {largest:.5g}",
+                told,
                 "the bounds of disturbances and rates do not enter feasibility: they only scale P",
                 *lines,
             ],
             gamma=gamma,
             largest_gamma=largest,
             largest_share=share,
-        ) from error
-    return solution
+        ) from trouble
+    if trouble is None:
+        return design
+    facts = {**trouble.facts, "largest_gamma": largest}
+    facts["details"] = (*facts["details"], f"{told}: ask for less")
+    raise type(trouble)(**facts) from trouble

@@ -207,13 +207,15 @@ def decay_problem(
     return problem, P
 
 
-def explain_infeasible(system: ErrorSystem, gamma: float) -> tuple[list[str], float | None]:
+def explain_infeasible(
+    system: ErrorSystem, gamma: float, gain: FloatArray | None = None
+) -> tuple[list[str], float | None]:
     """Say what binds at an infeasible gamma, and how much narrower the Jacobian set has to be."""
 
     def margin(share: float, explain: bool = False) -> Margin:
         middle = system.Abar.mean(axis=0)
         narrowed = replace(system, Abar=middle + share * (system.Abar - middle))
-        problem, P = decay_problem(narrowed, gamma)
+        problem, P = decay_problem(narrowed, gamma, gain)
         return largest_margin(problem, caps={"size": P << np.eye(P.shape[0])}, explain=explain)
 
     lines = margin(1.0, explain=True).lines()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import obsynth as ob
 from obsynth.symbolic.errors import ObsynthError
@@ -154,3 +155,34 @@ def test_no_fault_declared_is_a_plain_state_observer():
     assert observer.half_widths.shape == (4,)
     assert observer.gains["F"].shape == (0, 3)
     assert observer.certificate.valid
+
+
+@pytest.fixture(scope="module")
+def two_tanks():
+    """The level of the second is not measured: its error goes by 1 - Ts / (2 sqrt(h2)) a step."""
+    plant = ob.Plant("two tanks in a row")
+    h1, h2 = plant.states("h1 h2", range=(1, 9))
+    (v,) = plant.inputs("v", range=(0, 4))
+    plant.actuator_faults("f", of=v, rate=0.05)
+    (w,) = plant.disturbances("w", bound=0.04)
+    plant.dynamics([v - sp.sqrt(h1), sp.sqrt(h1) - sp.sqrt(h2)])
+    plant.outputs([h1 + w])
+    model = ob.split(plant.discretise("euler", Ts=0.1))
+    return model, ob.jacobian_bounds(model)
+
+
+# Of a design at gamma = 0.02.
+GAINS = {"K": [[0.18], [0.044]], "F": [[0.155]]}
+
+
+def test_a_gamma_little_above_the_largest_is_refused_by_it(two_tanks):
+    """There the solver ends at its last iteration with values that violate the inequality.
+
+    Mutant: such a design goes on to its certificate.
+    """
+    model, bounds = two_tanks
+    method = ob.BoundedErrorUIO(gamma=0.034)
+    for make in (method.design, lambda *given: method.analyse(model, GAINS, bounds)):
+        with pytest.raises(ob.InfeasibleDesign, match="largest feasible gamma is abo") as refusal:
+            make(model, bounds)
+        assert refusal.value.largest_gamma == pytest.approx(1 - (1 - 0.1 / 6) ** 2, rel=2e-3)
