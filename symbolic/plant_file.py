@@ -45,6 +45,7 @@ from obsynth.symbolic.errors import ObsynthError, PlantError
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, expand_names, is_name
 from obsynth.symbolic.text import TextError, read_text
+from obsynth.symbolic.unclosed import unclosed
 
 _FAULT = {"range", "rate", "constant", "unit"}
 _ROLES: Mapping[str, tuple[Role, set[str]]] = {
@@ -133,7 +134,12 @@ class PlantText:
                 lines = self.text.split("\n")[: int(found[1]) - 1]
                 place = sum(len(line) + 1 for line in lines) + int(found[2]) - 1
             message = str(error).split(" (at")[0]
-            self._fail_at(place, f"{message}; equations stand in quotes, tables in [brackets]")
+            if (open_one := unclosed(self.text)) is not None and open_one[1] < place:
+                line = self.text.count("\n", 0, place) + 1
+                message = f"the {open_one[0]} is not closed; noticed in line {line}: {message}"
+                place = open_one[1]
+            message += "; equations stand in quotes, tables in [brackets] or in a line of { }"
+            self._fail_at(place, message)
         self._places = self._index()
 
     def plant(self) -> Plant:

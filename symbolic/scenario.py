@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.taking import labelled
 
 _FIELDS = {
     "u": "inputs",
@@ -229,6 +230,8 @@ class Scenario:
         return self._array(field, value, shape)
 
     def _array(self, field: str, value: Any, shape: tuple[int | None, ...]) -> FloatArray:
+        if told := labelled(field, value):
+            raise PlantError(f"scenario {self.name!r}: {told}", field=field)
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError) as error:

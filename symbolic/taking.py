@@ -1,6 +1,6 @@
 """Front doors say what they take: arguments of another kind are refused by name."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from inspect import signature
 from typing import Any, ParamSpec, TypeVar
@@ -25,7 +25,8 @@ _MADE = {
     "Path": "the name of a file",
     "dict": "by label",
 }
-_OTHERS = {*_MADE, "Method", "list", "tuple", "str", "int", "float", "ndarray", "DataFrame"}
+_BUILTIN = {"list", "tuple", "str", "int", "float", "ndarray", "Series", "DataFrame", "Dataset"}
+_OTHERS = {*_MADE, "Method", *_BUILTIN}
 _SHOWN = {"dict": "mapping"}
 
 
@@ -62,6 +63,20 @@ def check_kind(where: str, name: str, known: str, value: Any) -> None:
     if isinstance(value, list | tuple) and value:
         kind += f" of {type(value[0]).__name__}"
     raise ObsynthError(f"{where} takes {name} as {wanted}; it was given {kind}", argument=name)
+
+
+def labelled(name: str, value: Any, wanted: Sequence[str] = ("...",)) -> str | None:
+    """Return what to give in place of a frame or series whose labels name signals, in any order."""
+    if not hasattr(value, "iloc"):
+        return None
+    for labels, pick in ((getattr(value, "columns", ()), ""), (value.index, ".loc")):
+        if any(isinstance(label, str) for label in labels):
+            pick = pick * hasattr(value, "columns")
+            return (
+                f"{name} is a {type(value).__name__} with the labels {list(labels)}, which are not "
+                f"read: give {name}{pick}[{list(wanted)}].to_numpy(), in the order of the plant"
+            )
+    return None
 
 
 def _an(kind: str) -> str:

@@ -127,9 +127,10 @@ class _Reader:
             return token
         return None
 
-    def _expect(self, text: str) -> None:
+    def _expect(self, text: str, opened: int | None = None) -> None:
         if self._take(text) is None:
-            self._fail(f"expected {text!r} in place of {self._now.text}")
+            told = "" if opened is None else f": {self.text[opened : opened + 20]!r} is not closed"
+            self._fail(f"expected {text!r} in place of {self._now.text}{told}")
 
     def _fail(self, message: str, position: int | None = None) -> NoReturn:
         where = self._now.position if position is None else position
@@ -267,7 +268,7 @@ class _Reader:
             return self._literal(token)
         if token.text == "(":
             inner = self._condition()
-            self._expect(")")
+            self._expect(")", token.position)
             return inner
         if token.kind != "name" or token.text in ("and", "or", "not"):
             self._fail(f"unexpected {token.text!r}", token.position)
@@ -302,7 +303,7 @@ class _Reader:
         arguments = [self._number(self._condition)]
         while self._take(","):
             self._another(arguments, self._number(self._condition))
-        self._expect(")")
+        self._expect(")", token.position)
         if not least <= len(arguments) <= (len(arguments) if most is None else most):
             self._fail(f"{token.text} does not take {len(arguments)} arguments", token.position)
         try:

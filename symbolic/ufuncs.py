@@ -1,11 +1,13 @@
-"""NumPy's functions of expressions: ``np.sqrt(h)`` is ``sp.sqrt(h)``, or says what to write."""
+"""What Python and NumPy make of expressions: ``np.sqrt(h)`` is ``sp.sqrt(h)``, or what to write."""
 
 import operator
 from collections.abc import Callable
+from functools import cache, wraps
 from typing import Any
 
 import numpy as np
 import sympy as sp
+from sympy.core.relational import Relational
 
 from obsynth.symbolic.functions import ALIASES, BY_NAME
 
@@ -39,6 +41,45 @@ def _apply(_: sp.Expr, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: A
         ) from error
 
 
+class Refused(TypeError):
+    """What SymPy refuses, with its mend; SymPy itself catches many, so the words come when read."""
+
+    def __str__(self) -> str:
+        error, expression, mend = self.args
+        return mend.format(expression) if expression.free_symbols else str(error)
+
+
+_NUMBER = (
+    "{0} is an expression and no number, which math.sqrt, float and their like take: write NumPy's "
+    "function (np.sqrt) or SymPy's (sp.sqrt); obsynth.lookup in place of np.interp"
+)
+_CHOICE = (
+    "{0} is neither true nor false while equations are written, so that if, and, min and np.where "
+    "cannot choose: write both cases, sp.Piecewise((a, {0}), (b, True)), or sp.Min, sp.Max, "
+    "obsynth.sat"
+)
+
+
+def _told(method: Callable[[Any], Any], mend: str) -> Callable[[Any], Any]:
+    """Return a method of SymPy that says what to write where it refuses."""
+
+    @wraps(method)
+    def call(self: Any) -> Any:
+        try:
+            return method(self)
+        except TypeError as error:
+            raise Refused(error, self, mend) from None
+
+    return call
+
+
+@cache
 def allow() -> None:
-    """Let expressions answer NumPy, which else looks for methods that they do not have."""
+    """Let expressions answer NumPy, and tell the mend where they are no numbers or conditions."""
     sp.Expr.__array_ufunc__ = _apply
+    for kind, method, mend in (
+        (sp.Expr, "__float__", _NUMBER),
+        (sp.Expr, "__int__", _NUMBER),
+        (Relational, "__bool__", _CHOICE),
+    ):
+        setattr(kind, method, _told(getattr(kind, method), mend))

@@ -15,6 +15,7 @@ from obsynth.designs.core.equations import curved_states
 from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.taking import labelled
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ class Start:
 
 def read_vector(value: Any, what: str, names: tuple[str, ...], finite: bool = True) -> FloatArray:
     """Return one number for each name, finite unless said otherwise."""
-    array = _numbers(value)
+    array = _unlabelled(value, what, names)
     fits = array is not None and array.shape == (len(names),)
     if array is None or not fits or (finite and not np.isfinite(array).all()):
         word = "finite numbers" if finite else "numbers"
@@ -305,7 +306,7 @@ def read_vector(value: Any, what: str, names: tuple[str, ...], finite: bool = Tr
 
 def read_box(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
     """Return a finite pair (lower, upper) for each name, shape (n, 2)."""
-    array = _numbers(value)
+    array = _unlabelled(value, what, names)
     if array is not None and array.size == 0 and not names:
         return np.zeros((0, 2))
     if (
@@ -320,6 +321,13 @@ def read_box(value: Any, what: str, names: tuple[str, ...]) -> FloatArray:
             option=what,
         )
     return array
+
+
+def _unlabelled(value: Any, what: str, names: tuple[str, ...]) -> FloatArray | None:
+    """Return an array of numbers, None where it is none; labels, in any order, are refused."""
+    if told := labelled(what, value, names):
+        raise ObsynthError(told, option=what)
+    return _numbers(value)
 
 
 def read_gains(

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.taking import labelled
 
 _KINDS = {"u": "inputs", "y": "outputs", "theta": "measured scheduling variables"}
 
@@ -60,15 +61,8 @@ class StepFunction(ca.Function):
             )
 
     def _shape(self, name: str, value: Any) -> tuple[int, ...]:
-        order = value.index if hasattr(value, "iloc") else ()
-        if any(isinstance(label, str) for label in order):
-            wanted = list(self.labels.get(name, ("...",)))
-            raise ObsynthError(
-                f"step: {name} is a {type(value).__name__} with the labels {list(order)}, which a "
-                f"step does not read: give {name}[{wanted}].to_numpy(), in the order of the "
-                f"{self._told(name)}",
-                argument=name,
-            )
+        if told := labelled(name, value, self.labels.get(name, ("...",))):
+            raise ObsynthError(f"step: {told}", argument=name)
         try:
             numbers = np.asarray(value)
             if numbers.dtype.kind not in "biuf":

@@ -98,6 +98,14 @@ def test_every_way_of_declaring():
         ("pull = ", "v = ", (32, 1), "a definition has a name of its own"),
         ('y1 = { is = "v + w2", unit = "m/s" }', "y1 = true", (40, 1), "text in quotes, not True"),
         ('v = { range = [5, 40], nominal = 20, unit = "m/s" }', "v = 3", (18, 1), "is a table"),
+        ("[5, 40]", "[5, 40", (18, 15), r"the \[ is not closed; noticed in line 18"),
+        ("[5, 40]", "[5,\n 40", (18, 15), r"the \[ is not closed; noticed in line 19"),
+        ("[5, 40]", "5, 40]", (18, 20), "^((?!not closed).)*in a line of { }"),
+        ("[5, 40]", "[5, fast]", (18, 19), "Invalid value; equations"),
+        ('20, unit = "m/s" }', '20, unit = "m/s"', (18, 5), "the { is not closed"),
+        ("[states]", "[states", (17, 1), r"the \[ is not closed"),
+        ('v = "(pull', "v = '(pull", (37, 5), "the ' is not closed"),
+        ("[outputs]", '[outputs]\nz = """v', (40, 5), 'the """ is not closed; noticed in line 4'),
     ],
 )
 def test_mistakes_are_told_by_line_and_column(what, into, place, message):
@@ -121,7 +129,7 @@ def test_what_is_no_text(tmp_path):
     with pytest.raises(ob.PlantError, match="at most 1000000"):
         ob.read_plant(file)
     file.write_text('name = "x')
-    with pytest.raises(ob.PlantError, match=r"line 1, column 10") as caught:
+    with pytest.raises(ob.PlantError, match=r'line 1, column 8: the " is not closed') as caught:
         ob.read_plant(file)
     assert caught.value.line == 1
 

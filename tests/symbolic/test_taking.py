@@ -1,5 +1,6 @@
 """Front doors refuse what they do not take, and tuples of symbols are no expressions."""
 
+import math
 import operator
 import pickle
 
@@ -54,6 +55,26 @@ def test_functions_of_numpy_take_expressions():
     for function in (np.cbrt, lambda x: np.hypot(x, 1)):
         with pytest.raises(TypeError, match="has no form for the expression h: write it in SymPy"):
             function(h)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (math.sqrt, r"^h is an expression and no number, .* function \(np.sqrt\) or SymPy's \(sp"),
+        (lambda h: math.exp(-h / 2), "^-h/2 is an expression and no number, which math.sqrt"),
+        (int, "^h is an expression and no number"),
+        (lambda h: np.interp(h, [0, 1], [2, 3]), "obsynth.lookup in place of np.interp"),
+        (lambda h: 1 if h > 0 else 2, r"^h > 0 is neither true .* sp.Piecewise\(\(a, h > 0\), \(b"),
+        (lambda h: 1 < 2 * h < 3, "^2\\*h > 1 is neither true nor false while equations are wri"),
+        (lambda h: min(h, 5), "^h > 5 is neither .* or sp.Min, sp.Max, obsynth.sat$"),
+        (lambda h: np.where(h > 5, 1, 2), "if, and, min and np.where cannot choose"),
+        (lambda h: float(sp.I), "^Cannot convert complex to float$"),
+    ],
+)
+def test_an_expression_is_no_number_and_no_condition(mistake, message):
+    (h,) = ob.Plant("tank").states("h", range=(1, 2))
+    with pytest.raises(TypeError, match=message):
+        mistake(h)
 
 
 def tank(rows=lambda h, v: [v - h]):
@@ -151,6 +172,48 @@ def test_a_step_takes_as_many_numbers_as_there_are_signals(observer, given, mess
         observer.step(memory, *given)
     with pytest.raises(ob.ObsynthError, match=r"entries of the memory \(observer.memory0"):
         pickle.loads(pickle.dumps(observer)).step(memory[1:], [2.0], [5.0, 10.0])
+
+
+def scenario(**given):
+    return ob.Scenario("s", 1, **{"x0": [5.0], "guess": [5.0], "inputs": [[2.0]] * 2, **given})
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda o: o.memory0(pd.Series({"level": 5.0})),
+            r"'level'\].* give guess\[\['h'\]\].to_nu",
+        ),
+        (
+            lambda o: o.memory0([5.0], x_range=pd.DataFrame({"low": [1.0], "high": [9.0]})),
+            r"x_range is a DataFrame with the labels \['low', 'high'\], .* x_range\[\['h'\]\]",
+        ),
+        (
+            lambda o: o.memory0([5.0], x_range=pd.DataFrame([[1.0, 9.0]], index=["h"])),
+            r"labels \['h'\], which are not read: give x_range.loc\[\['h'\]\].to_numpy\(\)",
+        ),
+        (
+            lambda o: scenario(x0=pd.Series({"h": 5.0})),
+            r"scenario 's': x0 is a Series .* give x0\[",
+        ),
+        (
+            lambda o: scenario(inputs=pd.DataFrame({"v": [2.0, 2.0]})),
+            r"inputs is a DataFrame with the labels \['v'\].* inputs\[\['...'\]\].to_numpy",
+        ),
+        (
+            lambda o: ob.simulate(o.model, o, pd.Series([2.0])),
+            r"takes scenario as a Scenario \(made by ob.Scenario\(...\), .* given a Series",
+        ),
+    ],
+)
+def test_labels_are_not_read_in_whatever_order_they_have(observer, call, message):
+    """Mutant: labels that no axis looks at."""
+    with pytest.raises(ob.ObsynthError, match=message):
+        call(observer)
+    plain = observer.memory0(pd.Series([5.0]), x_range=pd.DataFrame([[1.0, 9.0]]))
+    assert np.array_equal(plain, observer.memory0([5.0], x_range=[[1.0, 9.0]]))
+    assert scenario(inputs=pd.DataFrame([[2.0], [2.0]])).inputs.shape == (2, 1)
 
 
 CAR = ob.plants.cruise_control
