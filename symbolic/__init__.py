@@ -27,4 +27,4 @@ from obsynth.symbolic.sxmodel import check_parity as check_parity
 from obsynth.symbolic.tape import from_tape as from_tape
 from obsynth.symbolic.text import TextError as TextError
 from obsynth.symbolic.text import read_text as read_text
-from obsynth.symbolic.text import write_text as write_text
+from obsynth.symbolic.written import write_text as write_text

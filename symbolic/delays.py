@@ -51,13 +51,31 @@ def delayed(
     >>> plant.rhs.T
     Matrix([[T/2 + v_late2, v, v_late1]])
     """
-    found = next((s for s in plant.signals if s.name == str(signal)), None)
-    if found is None or found.role not in (Role.STATE, Role.INPUT):
-        known = ", ".join((*plant.names("x"), *plant.names("u")))
-        raise PlantError(f"delayed takes a state or an input ({known}), not {signal!r}")
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise PlantError(f"{found.name} is delayed by {steps!r}; give a number of steps from 1")
-    names = [f"{found.name}_late{k + 1}" for k in builtins.range(steps)]
-    limits = range or ((found.lower, found.upper) if found.bounded else None)
-    chain = plant.states(names, range=limits, unit=found.unit, nominal=found.nominal)
-    return chain[-1], [found.symbol, *chain[:-1]]
+    delays = Delays(plant)
+    return delays(signal, steps, range), delays.rows
+
+
+class Delays:
+    """The states that hold signals of a plant back, as many as are asked for, and their rows."""
+
+    def __init__(self, plant: "Plant") -> None:
+        self.plant = plant
+        self.rows: list[sp.Expr] = []
+        self._chains: dict[str, list[sp.Symbol]] = {}
+
+    def __call__(self, signal: Any, steps: Any, range: Any = None) -> sp.Symbol:
+        """Return the signal of so many calls ago."""
+        plant = self.plant
+        found = next((s for s in plant.signals if s.name == str(signal)), None)
+        if found is None or found.role not in (Role.STATE, Role.INPUT):
+            known = ", ".join((*plant.names("x"), *plant.names("u")))
+            raise PlantError(f"delayed takes a state or an input ({known}), not {signal!r}")
+        if isinstance(steps, bool) or not isinstance(steps, int | sp.Integer) or steps < 1:
+            raise PlantError(f"{found.name} is delayed by {steps!r}; give a number of steps from 1")
+        chain = self._chains.setdefault(found.name, [found.symbol])
+        names = [f"{found.name}_late{k}" for k in builtins.range(len(chain), int(steps) + 1)]
+        if names:
+            limits = range or ((found.lower, found.upper) if found.bounded else None)
+            chain += plant.states(names, range=limits, unit=found.unit, nominal=found.nominal)
+            self.rows += chain[-len(names) - 1 : -1]
+        return chain[int(steps)]

@@ -1,6 +1,6 @@
 """Tables of values and saturations, written in functions whose bounds and slopes are known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -89,10 +89,15 @@ def _exact(item: Any, what: str) -> sp.Rational:
         raise PlantError(f"{what}: {item!r} is no finite number") from error
 
 
-def _lookup_of_pairs(x: Any, *pairs: Any) -> sp.Expr:
-    """Return the table that text writes as ``lookup(x, knot, value, knot, value, ...)``."""
-    return lookup(x, pairs[::2], pairs[1::2])
+def _lookup_of_text(x: Any, *table: Any) -> sp.Expr:
+    """Return the table of ``lookup(x, [knots], [values])`` or ``lookup(x, knot, value, ...)``."""
+    lists = [isinstance(part, tuple) for part in table]
+    if any(lists) and lists != [True, True]:
+        raise PlantError(f"lookup of {x}: write lookup(x, [knot, knot, ...], [value, value, ...])")
+    return lookup(x, *(table if any(lists) else (table[::2], table[1::2])))
 
 
-COMPOSED = {"sat": (sat, 3, 3), "lookup": (_lookup_of_pairs, 5, None)}
-"""By the name in text: what makes the expression, and how many arguments it takes."""
+Made = tuple[Callable[..., sp.Expr], int, int | None]
+"""What makes an expression of a function's arguments, and how many it takes; None: any number."""
+COMPOSED: dict[str, Made] = {"sat": (sat, 3, 3), "lookup": (_lookup_of_text, 3, None)}
+"""By the name in text."""

@@ -41,7 +41,9 @@ from typing import Any, NoReturn
 
 import sympy as sp
 
+from obsynth.symbolic.delays import Delays
 from obsynth.symbolic.errors import ObsynthError, PlantError
+from obsynth.symbolic.pieces import Made
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, expand_names, is_name
 from obsynth.symbolic.text import TextError, read_text
@@ -141,6 +143,7 @@ class PlantText:
             message += "; equations stand in quotes, tables in [brackets] or in a line of { }"
             self._fail_at(place, message)
         self._places = self._index()
+        self._more: dict[str, Made] = {}
 
     def plant(self) -> Plant:
         """Return the plant that the text says."""
@@ -157,12 +160,15 @@ class PlantText:
             if table in _ROLES:
                 self._declare(plant, table)
         symbols: dict[str, sp.Expr] = {signal.name: signal.symbol for signal in plant.signals}
+        delays = Delays(plant)
+        self._more = {"delayed": (delays if "Ts" in self.data else _no_steps, 2, 2)}
         for name, text in self.data.get("definitions", {}).items():
             path = ("definitions", name)
             if not is_name(name) or name in symbols:
                 self.fail(path, f"a definition has a name of its own, not {name!r}")
             symbols[name] = self.expression(path, text, symbols)
-        self._equations(plant, symbols)
+        self._equations(plant, symbols, delays)
+        self._more = {}
         step = self.data.get("discretise")
         if step is None:
             return plant
@@ -199,12 +205,13 @@ class PlantText:
         units = [e.get("unit", "") if isinstance(e, dict) else "" for e in entries]
         return units if units else ""
 
-    def _equations(self, plant: Plant, symbols: Mapping[str, sp.Expr]) -> None:
-        """State dynamics and outputs."""
+    def _equations(self, plant: Plant, symbols: Mapping[str, sp.Expr], delays: Delays) -> None:
+        """State dynamics and outputs; what they delay are states behind the others."""
         for table in ("dynamics", "outputs"):
             if not self.data.get(table):
                 self.fail((table,), f"the plant has no [{table}]")
         rows, states = self.data["dynamics"], plant.names("x")
+        states = states[: len(states) - len(delays.rows)]
         for name in rows:
             if name not in states:
                 self.fail(("dynamics", name), f"{name} is no state{_close(name, states)}")
@@ -212,9 +219,6 @@ class PlantText:
             if name not in rows:
                 self.fail(("dynamics",), f"the state {name} has no equation in [dynamics]")
         found = [self.expression(("dynamics", name), rows[name], symbols) for name in states]
-        Ts = self.data.get("Ts")
-        step = None if Ts is None else self._number(("Ts",), Ts)
-        self.tried(("Ts",) if Ts is not None else ("dynamics",), plant.dynamics, found, Ts=step)
         names, texts, units, ranges = [], [], [], []
         for name, entry in self.data["outputs"].items():
             path = ("outputs", name)
@@ -227,6 +231,10 @@ class PlantText:
             names.append(name)
             units.append(fields.get("unit", ""))
             ranges.append(fields.get("range"))
+        Ts = self.data.get("Ts")
+        step = None if Ts is None else self._number(("Ts",), Ts)
+        found += delays.rows
+        self.tried(("Ts",) if Ts is not None else ("dynamics",), plant.dynamics, found, Ts=step)
         self.tried(("outputs",), plant.outputs, texts, names=names, unit=units, range=ranges)
 
     def _fields(self, path: Keys, entry: Mapping[str, Any], words: Collection[str]) -> Any:
@@ -250,7 +258,7 @@ class PlantText:
         if not isinstance(text, str):
             self.fail(path, f"an equation is text in quotes, not {text!r}")
         try:
-            return read_text(text, symbols)
+            return read_text(text, symbols, self._more)
         except TextError as error:
             start = self.text.find(text, self._place(path)) if text else -1
             message = str(error).rsplit(", at position", 1)[0]
@@ -328,6 +336,13 @@ class PlantText:
             line=line,
             column=column,
         )
+
+
+def _no_steps(signal: sp.Expr, steps: sp.Expr) -> sp.Expr:
+    raise PlantError(
+        f"delayed({signal}, {steps}) counts steps, and these equations are derivatives: write "
+        "those of next values, with Ts = ... below the name and no [discretise]"
+    )
 
 
 def _close(name: str, known: Collection[str]) -> str:

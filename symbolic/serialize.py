@@ -9,7 +9,8 @@ import sympy as sp
 from obsynth.symbolic.discretise import PREFIX
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.signals import Role, Signal, is_name
-from obsynth.symbolic.text import read_text, write_text
+from obsynth.symbolic.text import read_text
+from obsynth.symbolic.written import write_text
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant

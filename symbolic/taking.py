@@ -120,8 +120,8 @@ class Symbols(tuple[Any, ...]):
         return tuple(self) + tuple(other) if isinstance(other, tuple) else self._refuse()
 
     def __radd__(self, other: Any) -> Any:
-        """Return a sum, which is none."""
-        return self._refuse()
+        """Return a sum, which is none; a list may be extended."""
+        return NotImplemented if isinstance(other, list) else self._refuse()
 
 
 converter[Symbols] = lambda symbols: SymbolTuple(*symbols)

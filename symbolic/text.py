@@ -1,4 +1,4 @@
-"""Expressions as text and back: a small language of our own, read without evaluation.
+"""Expressions as text: a small language of our own, read without evaluation; `written` writes it.
 
 ::
 
@@ -9,7 +9,8 @@
     sum        = ["-" | "+"] product {("+" | "-") product}
     product    = factor {("*" | "/") factor}
     factor     = ("-" | "+") factor | atom ["**" factor]
-    atom       = number | name | name "(" condition {"," condition} ")" | "(" condition ")"
+    atom       = number | name | name "(" argument {"," argument} ")" | "(" condition ")"
+    argument   = condition | "[" condition {"," condition} "]"
     piecewise  = "piecewise(" "(" sum "," condition ")" {"," "(" sum "," condition ")"} ")"
 
 Integers are exact, a quotient of integers is an exact rational, a number with a point or
@@ -27,8 +28,8 @@ from sympy.core.relational import Relational
 from sympy.logic.boolalg import And, BooleanFalse, BooleanFunction, BooleanTrue, Not, Or
 
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.functions import ALIASES, BY_CLASS, BY_NAME
-from obsynth.symbolic.pieces import COMPOSED
+from obsynth.symbolic.functions import ALIASES, BY_NAME
+from obsynth.symbolic.pieces import COMPOSED, Made
 
 WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piecewise"})
 """Words of the language that cannot name a symbol."""
@@ -36,11 +37,10 @@ WORDS = frozenset({"and", "or", "not", "True", "False", "pi", "piecewise", "Piec
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
-    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>]))"
+    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>\[\]]))"
 )
-_COMPARE = {"<": sp.Lt, "<=": sp.Le, ">": sp.Gt, ">=": sp.Ge, "==": sp.Eq, "!=": sp.Ne}
-_SIGNS = {relation: sign for sign, relation in _COMPARE.items()}
-_CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
+COMPARE = {"<": sp.Lt, "<=": sp.Le, ">": sp.Gt, ">=": sp.Ge, "==": sp.Eq, "!=": sp.Ne}
+CONDITIONS = (Relational, BooleanFunction, BooleanTrue, BooleanFalse)
 _DEEPEST = 100
 _LONGEST = 100_000
 # SymPy compares the arguments of Max, Or and Piecewise with each other.
@@ -52,9 +52,14 @@ class TextError(PlantError):
     """Text that is no expression; ``position`` is the offset of the first wrong character."""
 
 
-def read_text(text: str, symbols: Mapping[str, sp.Symbol]) -> sp.Expr:
-    """Read an expression with names of symbols in it; TextError says where it is none."""
-    return _Reader(text, symbols).read()
+def read_text(
+    text: str, symbols: Mapping[str, sp.Symbol], more: Mapping[str, Made] | None = None
+) -> sp.Expr:
+    """Read an expression with names of symbols in it; TextError says where it is none.
+
+    more: functions beside those of every text, as in ``pieces.COMPOSED``
+    """
+    return _Reader(text, symbols, {**COMPOSED, **(more or {})}).read()
 
 
 def undeclared(name: str, declared: Mapping[str, object]) -> str:
@@ -74,7 +79,9 @@ class _Token:
 class _Reader:
     """Recursive descent; every method reads one rule of the grammar."""
 
-    def __init__(self, text: str, symbols: Mapping[str, sp.Symbol]) -> None:
+    def __init__(
+        self, text: str, symbols: Mapping[str, sp.Symbol], composed: Mapping[str, Made]
+    ) -> None:
         if not isinstance(text, str):
             raise TextError(f"an expression is text, not {text!r}", position=0)
         if len(text) > _LONGEST:
@@ -85,6 +92,7 @@ class _Reader:
             )
         self.text = text
         self.symbols = symbols
+        self.composed = composed
         self.depth = 0
         self.index = 0
         self.tokens = self._split()
@@ -154,7 +162,7 @@ class _Reader:
         return self._as_number(self._now.position, rule())
 
     def _as_number(self, position: int, value: sp.Basic) -> sp.Expr:
-        if isinstance(value, _CONDITIONS):
+        if isinstance(value, CONDITIONS):
             self._fail(f"the condition {value} stands where a number is needed", position)
         return value
 
@@ -162,7 +170,7 @@ class _Reader:
         return self._as_truth(self._now.position, rule())
 
     def _as_truth(self, position: int, value: sp.Basic) -> sp.Basic:
-        if not isinstance(value, _CONDITIONS):
+        if not isinstance(value, CONDITIONS):
             self._fail(f"{value} stands where a condition is needed", position)
         return value
 
@@ -190,12 +198,12 @@ class _Reader:
             return Not(inner)
         position = self._now.position
         left = self._sum()
-        operator = self._take(*_COMPARE)
+        operator = self._take(*COMPARE)
         if operator is None:
             return left
-        if isinstance(left, _CONDITIONS):
+        if isinstance(left, CONDITIONS):
             self._fail(f"the condition {left} cannot be compared", position)
-        return _COMPARE[operator.text](left, self._number(self._sum))
+        return COMPARE[operator.text](left, self._number(self._sum))
 
     def _sum(self) -> sp.Basic:
         position = self._now.position
@@ -237,7 +245,7 @@ class _Reader:
             position = self._now.position
             result = self._atom()
             if self._take("**"):
-                if isinstance(result, _CONDITIONS):
+                if isinstance(result, CONDITIONS):
                     self._fail(f"the condition {result} has no power", position)
                 result = self._power(result, self._number(self._factor), position)
         self.depth -= 1
@@ -293,16 +301,16 @@ class _Reader:
         if token.text in ("piecewise", "Piecewise"):
             return self._piecewise(token)
         known = BY_NAME.get(ALIASES.get(token.text, token.text))
-        if known is None and token.text not in COMPOSED:
-            names = ", ".join(sorted({*BY_NAME, *COMPOSED}))
+        if known is None and token.text not in self.composed:
+            names = ", ".join(sorted({*BY_NAME, *self.composed}))
             told = f"the function {token.text} is not supported; supported are {names}, piecewise"
             self._fail(told, token.position)
         own = known and (known.sympy, known.least, known.most)
-        make, least, most = own or COMPOSED[token.text]
+        make, least, most = own or self.composed[token.text]
         self._expect("(")
-        arguments = [self._number(self._condition)]
+        arguments = [self._argument(token.text)]
         while self._take(","):
-            self._another(arguments, self._number(self._condition))
+            self._another(arguments, self._argument(token.text))
         self._expect(")", token.position)
         if not least <= len(arguments) <= (len(arguments) if most is None else most):
             self._fail(f"{token.text} does not take {len(arguments)} arguments", token.position)
@@ -311,6 +319,17 @@ class _Reader:
         except PlantError as error:
             self._fail(str(error), token.position)
         return self._finite(made, token.position)
+
+    def _argument(self, function: str) -> Any:
+        """Read a number, or the list of numbers that a table has."""
+        opening = self._take("[") if function == "lookup" else None
+        if opening is None:
+            return self._number(self._condition)
+        items = [self._number(self._condition)]
+        while self._take(","):
+            self._another(items, self._number(self._condition))
+        self._expect("]", opening.position)
+        return tuple(items)
 
     def _piecewise(self, token: _Token) -> sp.Expr:
         pairs: list[Any] = []
@@ -327,123 +346,3 @@ class _Reader:
         if pairs[-1][1] != sp.true:
             self._fail("the last case of piecewise needs the condition True", token.position)
         return sp.Piecewise(*pairs)
-
-
-# How strongly the outermost operator of a text binds.
-_OR, _AND, _NOT, _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(8)
-
-
-def write_text(expression: sp.Basic) -> str:
-    """Write an expression so that `read_text` gives it back."""
-    return _write(expression, _OR)
-
-
-def _write(node: sp.Basic, level: int) -> str:
-    """Write a node, in parentheses when it binds more weakly than ``level``."""
-    text, own = _text(node)
-    return text if own >= level else f"({text})"
-
-
-def _text(node: sp.Basic) -> tuple[str, int]:
-    """Return the text of a node and the level of its outermost operator."""
-    if isinstance(node, sp.Symbol):
-        return str(node), _ATOM
-    if isinstance(node, sp.Number):
-        return _number_text(node)
-    if node in (sp.pi, sp.E):
-        return ("pi" if node == sp.pi else "exp(1)"), _ATOM
-    if isinstance(node, sp.Add):
-        return _add_text(node), _SUM
-    if isinstance(node, sp.Mul):
-        return _mul_text(node)
-    if isinstance(node, sp.Pow):
-        return _pow_text(node)
-    if isinstance(node, sp.Piecewise):
-        cases = [f"({_write(e, _OR)}, {_write(c, _OR)})" for e, c in node.args]
-        return f"piecewise({', '.join(cases)})", _ATOM
-    if isinstance(node, _CONDITIONS):
-        return _condition_text(node)
-    function = BY_CLASS.get(node.func)
-    if function is None:
-        raise PlantError(
-            f"the function {node.func.__name__} in {node} has no text form",
-            function=node.func.__name__,
-        )
-    arguments = list(node.args)
-    if isinstance(node, sp.Max | sp.Min):
-        arguments.sort(key=sp.default_sort_key)
-    if isinstance(node, sp.Heaviside) and arguments[1] == sp.Rational(1, 2):
-        arguments.pop()
-    return f"{function.name}({', '.join(_write(a, _OR) for a in arguments)})", _ATOM
-
-
-def _number_text(node: sp.Number) -> tuple[str, int]:
-    if isinstance(node, sp.Float):
-        text = repr(float(node))
-        if sp.Float(float(node)) != node or not text.lstrip("-")[0].isdigit():
-            raise PlantError(f"the number {node} is not a double", number=node)
-        return text, _SUM if text.startswith("-") else _ATOM
-    if not isinstance(node, sp.Rational) or not node.is_finite:
-        raise PlantError(f"{node} is not a finite real number", number=node)
-    if node < 0:
-        return str(node), _SUM
-    return str(node), _ATOM if isinstance(node, sp.Integer) else _PRODUCT
-
-
-def _add_text(node: sp.Add) -> str:
-    text = ""
-    for term in node.as_ordered_terms():
-        part = _text(term)[0]
-        if not text:
-            text = part
-        elif part.startswith("-"):
-            text += f" - {part[1:]}"
-        else:
-            text += f" + {part}"
-    return text
-
-
-def _mul_text(node: sp.Mul) -> tuple[str, int]:
-    top, bottom = [], []
-    negative = False
-    for factor in sorted(node.args, key=sp.default_sort_key):
-        if isinstance(factor, sp.Number):
-            negative = bool(factor < 0)
-            size = abs(factor)
-            if not isinstance(size, sp.Rational):
-                top.append(_write(size, _POWER))
-                continue
-            if size.p != 1:
-                top.append(str(size.p))
-            if size.q != 1:
-                bottom.append(str(size.q))
-        elif isinstance(factor, sp.Pow) and factor.exp.is_Rational and factor.exp < 0:
-            bottom.append(_write(1 / factor, _POWER))
-        else:
-            top.append(_write(factor, _POWER))
-    text = "*".join(top or ["1"]) + "".join(f"/{divisor}" for divisor in bottom)
-    return (f"-{text}", _SUM) if negative else (text, _PRODUCT)
-
-
-def _pow_text(node: sp.Pow) -> tuple[str, int]:
-    if node.exp == sp.Rational(1, 2):
-        return f"sqrt({_write(node.base, _OR)})", _ATOM
-    if node.exp.is_Rational and node.exp < 0:
-        return f"1/{_write(1 / node, _POWER)}", _PRODUCT
-    return f"{_write(node.base, _ATOM)}**{_write(node.exp, _ATOM)}", _POWER
-
-
-def _condition_text(node: sp.Basic) -> tuple[str, int]:
-    if isinstance(node, BooleanTrue | BooleanFalse):
-        return str(node), _ATOM
-    if isinstance(node, Relational):
-        left, right = _write(node.lhs, _SUM), _write(node.rhs, _SUM)
-        return f"{left} {_SIGNS[node.func]} {right}", _COMPARISON
-    arguments = sorted(node.args, key=sp.default_sort_key)
-    if isinstance(node, Not):
-        return f"not {_write(arguments[0], _COMPARISON)}", _NOT
-    if isinstance(node, And):
-        return " and ".join(_write(a, _NOT) for a in arguments), _AND
-    if isinstance(node, Or):
-        return " or ".join(_write(a, _AND) for a in arguments), _OR
-    raise PlantError(f"the condition {node} has no text form")

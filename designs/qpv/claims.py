@@ -29,7 +29,7 @@ from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.record import ASSUMED, FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.designs.qpv.rounding import needed
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.text import write_text
+from obsynth.symbolic.written import write_text
 
 EXACT = "the worst ones also by exact rational LDL'"
 

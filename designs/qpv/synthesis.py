@@ -36,7 +36,7 @@ from obsynth.designs.qpv.model import QPVModel
 from obsynth.designs.qpv.record import FASTEST, Norm, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
-from obsynth.symbolic.text import write_text
+from obsynth.symbolic.written import write_text
 
 # Part of the largest margin that phase 2 keeps; the objective loses about as much, relatively.
 FRACTION = 1e-5

@@ -15,7 +15,8 @@ from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.functions import BY_NAME, phi1, tanhc
 from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
 from obsynth.symbolic.tape import from_tape
-from obsynth.symbolic.text import read_text, write_text
+from obsynth.symbolic.text import read_text
+from obsynth.symbolic.written import write_text
 
 NAMES = {name: sp.Symbol(name, real=True) for name in ("x", "y", "z")}
 X, Y, Z = NAMES.values()

@@ -44,6 +44,10 @@ def test_tuples_of_symbols_are_tuples():
     plant = ob.Plant("tanks")
     x, u = plant.states("x1:3", range=(0, 1)), plant.inputs("u", range=(0, 1))
     assert x + u == (*x, *u) and type(x + u) is tuple
+    (both := list(x)).extend(u)
+    grown = [*x]
+    grown += u
+    assert grown == both
     assert sp.Matrix(x).shape == (2, 1) and isinstance(x, tuple) and len(x) == 2
 
 

@@ -5,7 +5,8 @@ import time
 import pytest
 import sympy as sp
 
-from obsynth.symbolic.text import TextError, read_text, write_text
+from obsynth.symbolic.text import TextError, read_text
+from obsynth.symbolic.written import write_text
 
 NAMES = {name: sp.Symbol(name, real=True) for name in ("h1", "v", "x", "E", "I", "lambda")}
 H, V, X = NAMES["h1"], NAMES["v"], NAMES["x"]
