@@ -51,16 +51,20 @@ def narrow(design, spread=1.0, faults=5.0, correction=0.2):
 
 
 def test_four_tanks_have_the_bounds_of_the_table(tanks):
-    """Within 2 % of what an independent analysis found, and close to what is seen.
+    """Between half of what an independent analysis found and it, and close to what is seen.
+
+    That analysis takes u |value| for a rounding; half the distance of numbers at it is up to half.
 
     Mutants: Sterbenz left out (fhat a hundred times), known outputs left out.
     """
     box, known = narrow(tanks)
     single = rounding_bound(equations(tanks), box, "single", known)
     table = np.array([6.77e-5, 6.73e-5, 1.82e-5])
-    np.testing.assert_allclose(single["z_next"].error[[0, 1, 3]], table, rtol=0.02)
+    found = single["z_next"].error[[0, 1, 3]]
+    assert np.all((table / 2 < found) & (found < table))
+    np.testing.assert_allclose(found, [6.17e-5, 6.14e-5, 1.16e-5], rtol=1e-3)
     double = rounding_bound(equations(tanks), box, "double", known)
-    assert double["z_next"].error.max() == pytest.approx(1.29e-13, rel=0.02)
+    assert double["z_next"].error.max() < 1.29e-13
     rng = np.random.default_rng(0)
     count = 100_000
     x = rng.uniform(*tanks.plant.box("x").T[:, :, None], (4, count))
@@ -86,7 +90,7 @@ def test_four_tanks_have_the_bounds_of_the_table(tanks):
     limits = np.concatenate([part.error for part in single.values()])
     assert np.all(seen <= limits)
     z_next = slice(4 + 3 + 4, 4 + 3 + 8)
-    assert np.all(limits[z_next][[0, 1, 3]] < np.array([1.3, 1.3, 1.9]) * seen[z_next][[0, 1, 3]])
+    assert np.all(limits[z_next][[0, 1, 3]] < np.array([1.2, 1.2, 1.2]) * seen[z_next][[0, 1, 3]])
 
 
 def test_the_allowance_of_the_tanks_is_proved_and_small(tanks):
