@@ -152,7 +152,7 @@ def results_of(core: ca.Function, records: np.ndarray, machine: Any) -> np.ndarr
     for row in records:
         found = machine(*np.split(row, np.cumsum([core.numel_in(0), core.numel_in(1)])))
         told = dict(zip(STEP_OUTPUTS, found, strict=True))
-        rows.append(np.concatenate([told[n] for n in (*OUTPUTS, "status", "memory")]))
+        rows.append(np.concatenate([told[n] for n in (*OUTPUTS, "status", "memory_next")]))
     return np.array(rows)
 
 

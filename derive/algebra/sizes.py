@@ -20,6 +20,7 @@ LARGEST_SUM = 20_000
 """Terms up to which products are multiplied out."""
 _ENDLESS = 10**12
 _LONGEST = 300
+_DIGITS = 12
 
 
 def size(expression: Any) -> int:
@@ -97,6 +98,9 @@ def simplified(expression: sp.Expr) -> sp.Expr:
 
 
 def text(expression: sp.Expr) -> str:
-    """Write what is short; tell of the rest how long it is."""
+    """Write what is short, fractions of many digits with six; tell of the rest how long it is."""
     parts = size(expression)
-    return str(expression) if parts <= _LONGEST else f"(an expression of {parts:,} parts)"
+    if parts > _LONGEST:
+        return f"(an expression of {parts:,} parts)"
+    long = {r: sp.Float(r, 6) for r in expression.atoms(sp.Rational) if len(str(r)) > _DIGITS}
+    return str(expression.xreplace(long))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.algebra.zero_test import FormProof, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
@@ -181,8 +182,8 @@ class VaryingForm(Blocks):
             free = tuple(sorted(map(str, entry.free_symbols)))
             if free:
                 raise StructureError(
-                    f"{name}[{i + 1},{j + 1}] = {entry} varies with {', '.join(free)}; a constant "
-                    f"{name} is needed here: fix {', '.join(free)}, or use vertices()",
+                    f"{name}[{i + 1},{j + 1}] = {text(entry)} varies with {', '.join(free)}; a "
+                    f"constant {name} is needed here: fix {', '.join(free)}, or use vertices()",
                     entry=(i, j),
                     symbols=free,
                     condition="constant block",

@@ -7,6 +7,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from obsynth.derive import Split, StructureError
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.forms.measured import Reading, readings
 from obsynth.derive.jacobian.slope_signs import Monotone, exact_slope, with_ranges
 from obsynth.derive.rigour import round_number, substitute
@@ -160,7 +161,7 @@ def _faults(plant: Plant, rhs: list[sp.Expr], outputs: list[int]) -> tuple[list[
         if not slope.is_number or slope.is_zero:
             raise StructureError(
                 f"the fault {fault.name} enters the equation of {names[entered[0]]} with the "
-                f"factor {slope}; the bank needs a constant",
+                f"factor {text(slope)}; the bank needs a constant",
                 symbol=fault.name,
                 condition="constant factors",
             )

@@ -105,8 +105,9 @@ def attempt(method: Method, model: Plant, run: Callable[[Any], Run | Estimate]) 
         means = core is not None and core.mean_fault
         return Try(name, seconds, observer, run(observer), means=means)
     except Exception as error:  # one that is no refusal is a bug, and no reason to stop the others
+        told = str(getattr(error, "headline", error))
         word = "" if isinstance(error, ObsynthError) else f"{type(error).__name__}: "
-        return Try(name, time.perf_counter() - start, reason=word + first_sentence(str(error)))
+        return Try(name, time.perf_counter() - start, reason=word + first_sentence(told))
 
 
 def in_time(name: str, job: Callable[[], Try], limit: float | None) -> Try:

@@ -12,7 +12,7 @@ from gallery import TIMES
 
 import obsynth as ob
 from obsynth.evaluate.choosing.choice import Choice
-from obsynth.evaluate.choosing.tries import METHODS, Try, first_sentence, in_time, named
+from obsynth.evaluate.choosing.tries import METHODS, Try, attempt, first_sentence, in_time, named
 
 PLANT = ob.plants.leaking_tanks()
 
@@ -175,6 +175,15 @@ def test_names_and_reasons_are_short():
         == "It fails: x = 3.5 is too large"
     )
     assert len(first_sentence("word " * 100)) == 120
+
+
+def test_the_reason_of_a_refusal_is_its_headline():
+    class Refusing(ob.HinfUIO):
+        def design(self, plant):
+            raise ob.InfeasibleDesign("no gain was found with |L| <= 3", ["the smallest is 8"])
+
+    found = attempt(Refusing(), ob.plants.dc_motor(), print)
+    assert found.reason == "no gain was found with |L| <= 3"
 
 
 def test_every_observer_sees_the_same_noise_and_the_model_that_is_its_own():

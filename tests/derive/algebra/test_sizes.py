@@ -143,3 +143,8 @@ def test_long_rows_are_bounded_without_their_exact_derivatives(watched):
 def test_a_long_row_with_a_fault_is_refused_with_its_length(watched):
     with pytest.raises(StructureError, match=r"row of x has \d+,\d{3} parts, too many .* fault f"):
         split(long_plant(fault=True), ([0, 0], []))
+
+
+def test_a_refusal_shows_no_fraction_of_sixteen_digits():
+    long = sp.Rational(-3832850746698295, 18014398509481984) * X + sp.Rational(1, 3) * Y
+    assert sizes.text(long) == "-0.212766*x + y/3"
