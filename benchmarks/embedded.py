@@ -159,7 +159,7 @@ def results_of(core: ca.Function, records: np.ndarray, machine: Any) -> np.ndarr
 def header(core: ca.Function, name: str, real: Real) -> str:
     """Return a header with the structs of a step and its prototype."""
     size = {**dict(zip(STEP_OUTPUTS, map(core.numel_out, range(core.n_out())), strict=True))}
-    size |= {"u": core.numel_in(1), "y": core.numel_in(2)}
+    size |= {name: core.numel_in(i) for i, name in enumerate(("memory", "u", "y"))}
     lines = [f"typedef {real.c} {name}_real_t;"]
     for kind, parts in (("state", ["memory"]), ("in", ["u", "y"]), ("out", OUTPUTS)):
         fields = " ".join(f"{real.c} {part}[{size[part]}];" for part in parts)
