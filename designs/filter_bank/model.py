@@ -23,8 +23,7 @@ CLASS = PlantClass(
     time="continuous",
     discretised=True,
     forbids={
-        "d": " has no bound that the bank could use; declare it as a disturbance with bound=, or "
-        "as a fault",
+        "d": ": the bank decouples none; declare one with a range as a disturbance, or as a fault",
     },
     finite={"f": _NO_RANGE, "w": _NO_RANGE, "p": _NO_RANGE},
     needs={"f": "the bank bounds faults"},

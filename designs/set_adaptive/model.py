@@ -21,8 +21,8 @@ CLASS = PlantClass(
     time="continuous",
     discretised=True,
     forbids={
-        "d": " has no bound that this method could use; declare it as a disturbance with bound=, "
-        "or as a fault",
+        "d": ": this method decouples none; declare one with a range as a "
+        "disturbance, or as a fault",
     },
     finite={
         "x": " has no range, and the bounds of A x are those of ranges, even where it enters "
