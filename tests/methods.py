@@ -13,6 +13,8 @@ from luenberger.method import Luenberger
 from obsynth.designs.general.method import GeneralUIO
 
 # Gains of the last row of the comparison in the peak-bound analysis, exact decimals.
+SINGLE = ", single"
+"""Behind the name of a method: designed for single precision."""
 PEAK_GAINS = {
     "K": np.array([[0.3279, 0.0012, 0], [0.0023, 0.2659, 0], [0, 0, 0], [0.2222, 0.0008, 0]]),
     "F": np.array([[0.6766, 0.0023, 0], [-0.0042, 0.6263, 0]]),
@@ -257,8 +259,12 @@ METHODS = {
 
 @functools.cache
 def observer_of(name: str) -> ob.Observer:
-    """The design of a method's entry, made once."""
-    return METHODS[name].method.design(METHODS[name].plant())
+    """The design of a method's entry, made once; in the precision that stands behind its name."""
+    entry = METHODS[name.removesuffix(SINGLE)]
+    method: Any = entry.method
+    if name.endswith(SINGLE):
+        method = replace(method, precision="single")
+    return method.design(entry.plant())
 
 
 @functools.cache

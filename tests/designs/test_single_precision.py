@@ -1,6 +1,5 @@
 """Every method in single precision: its step in NumPy's float32 beside plants in doubles."""
 
-from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -10,7 +9,7 @@ import sympy as sp
 from singles import constants, follow, mean_widths, numpy_step, outside, truth
 
 import obsynth as ob
-from methods import METHODS, observer_of, two_tanks
+from methods import METHODS, SINGLE, observer_of, two_tanks
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.rigour import inward
 from obsynth.designs.core.boxes import Ends, cut_box
@@ -53,9 +52,8 @@ SLOW = {*WIDER} - {"luenberger"}
 NAMES = [pytest.param(name, marks=[pytest.mark.long] * (name in SLOW)) for name in WIDER]
 
 
-@cache
 def single_of(name):
-    return replace(METHODS[name].method, precision="single").design(METHODS[name].plant())
+    return observer_of(name + SINGLE)
 
 
 @cache

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,10 @@ from boards import (  # noqa: E402
 )
 
 import obsynth as ob  # noqa: E402
-from methods import METHODS, tank  # noqa: E402
+from methods import METHODS, SINGLE, observer_of, tank  # noqa: E402
 from obsynth.codegen.folder import MANIFEST  # noqa: E402
 
-TANKS, SINGLE, DETECTOR = "four tanks, peak", ", single", ", detector"
+TANKS, DETECTOR = "four tanks, peak", ", detector"
 LIBRARY_ULPS = 64
 """By how much results may differ where sin, cos, ... are the library's: 8 units each, and what a
 step makes of them."""
@@ -77,13 +77,12 @@ def observers() -> Iterator[str]:
 
 def make(what: str) -> Any:
     """Return the observer, or the detector, of that name."""
-    of = what.removesuffix(DETECTOR).removesuffix(SINGLE)
-    entry = METHODS.get(of)
-    method: Any = entry.method if entry else ob.BoundedErrorUIO(bounds="peak")
-    plant = entry.plant if entry else tank
-    if SINGLE in what:
-        method = replace(method, precision="single")
-    observer = method.design(plant())
+    of = what.removesuffix(DETECTOR)
+    if of.removesuffix(SINGLE) == TANKS:
+        precision: Any = "single" if SINGLE in of else "double"
+        observer = ob.BoundedErrorUIO(bounds="peak", precision=precision).design(tank())
+    else:
+        observer = observer_of(of)
     return ob.FaultDetector(observer, window=5) if DETECTOR in what else observer
 
 

@@ -22,15 +22,17 @@ sys.path[:0] = [str(HERE), str(HERE.parent.parent / "tests")]
 from checks import Project, Said, compilers, eva, fuzz, misra, numbers  # noqa: E402
 
 import obsynth as ob  # noqa: E402
-from methods import METHODS, observer_of  # noqa: E402
+from methods import METHODS, SINGLE, observer_of  # noqa: E402
 from obsynth.codegen.description import describe  # noqa: E402
 from obsynth.codegen.drive import Drive  # noqa: E402
-from obsynth.codegen.kernel import Machine  # noqa: E402
+from obsynth.codegen.single import machine_of  # noqa: E402
 
 DETECTOR = "detector with window"
 PLANTED = "luenberger"
 FUZZED = ("bounded_error_uio", "interval_observer", DETECTOR)
 """Those that `make prove` fuzzes; --long fuzzes all."""
+SINGLES = ("bounded_error_uio", "set_adaptive_observer")
+"""Those that `make prove` takes in single precision too; --long takes all."""
 SEEDS = 64
 # Over the box no operation gives NaN, which Eva shows of these.
 NUMBERS = frozenset(
@@ -72,14 +74,15 @@ def generated(what: str, place: Path) -> Project:
     name = re.sub(r"\W+", "_", f"p_{what}")
     ob.generate_c(observer, place / "project", name=name, backend="tape", vectors=100)
     description, rng = describe(observer), np.random.default_rng(0)
-    step, drive, rows = Machine(observer.step), Drive(description, rng), []
+    step = machine_of(observer.step, description.real)
+    drive, rows = Drive(description, rng), list[np.ndarray]()
     memory = drive.begin(SEEDS)
     memory = description.start if memory is None else memory
     for k in range(SEEDS):
         inputs = drive.sample(k)
         rows.append(np.concatenate([memory, *inputs]))
         memory = step(memory, *inputs)[0]
-    return Project(place / "project", name, np.array(rows))
+    return Project(place / "project", name, np.array(rows, dtype=description.real.type))
 
 
 def checked(what: str, long: bool, seconds: int) -> Iterator[tuple[str, str, Said, bool]]:
@@ -152,7 +155,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--fuzz", type=int, default=10, help="seconds of the fuzzer")
     args = parser.parse_args()
-    names = [what for what in (*METHODS, DETECTOR, *PLANTS) if any(p in what for p in args.parts)]
+    singles = [name + SINGLE for name in (METHODS if args.long else SINGLES)]
+    known = (*METHODS, *singles, DETECTOR, *PLANTS)
+    names = [what for what in known if any(part in what for part in args.parts)]
     # those that take longest first
     jobs = sorted(names, key=lambda what: ("set" not in what, "detector" not in what))
     begun, rows = time.monotonic(), list[Row]()

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from obsynth.designs.core.limits import LIMITS
+
 HERE = Path(__file__).parent
 
 ADVISORY = frozenset({"2.3", "2.5", "12.1"})
@@ -39,6 +41,11 @@ class Project:
     def manifest(self) -> dict:
         """What the project says of itself."""
         return json.loads((self.folder / "manifest.json").read_text())
+
+    @property
+    def precision(self) -> str:
+        """Of its numbers."""
+        return "single" if self.seeds.dtype == np.float32 else "double"
 
     @property
     def include(self) -> list[str]:
@@ -159,11 +166,12 @@ def fuzz(project: Project, seconds: int) -> Said:
     for i in range(len(project.seeds) - STEPS):
         later = project.seeds[i + 1 : i + STEPS, sizes["memory"] :]
         (corpus / str(i)).write_bytes(project.seeds[i].tobytes() + later.tobytes())
-    flags = [f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", *project.include]
+    finite = f"-DFINITE={LIMITS[project.precision].finite!r}"
+    flags = [finite, f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", *project.include]
     build = ran(["clang-14", "-std=c99", "-g", "-O1", *flags, str(driver), "-o", str(place), "-lm"])
     if "[exit 0]" not in build:
         return Said(-1, build[-2000:])
-    longest = 8 * (project.seeds.shape[1] * STEPS)
+    longest = project.seeds.itemsize * (project.seeds.shape[1] * STEPS)
     said = ran(
         [
             str(place),

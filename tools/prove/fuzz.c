@@ -5,7 +5,6 @@
 
 #include "NAME.c"
 
-#define FINITE 1e90
 #define STEPS 3
 #define REQUIRE(condition) \
     do { \
