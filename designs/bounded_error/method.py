@@ -267,7 +267,7 @@ class BoundedErrorUIO(Method):
             raise ObsynthError("the LMI is linear only for a fixed gamma: give gamma=")
         model: UioModel = self._checked(given, bounds)
         if self.form in ("printed", "repaired"):
-            from obsynth.designs.bounded_error.multipliers import box_vertices, multiplier_problem
+            from obsynth.designs.bounded_error.printed import box_vertices, multiplier_problem
 
             data = _with_vertices(model, box_vertices(model.bounds))
             noise, weights = self._noise(model, 3), self._weights(model)
@@ -337,7 +337,7 @@ class BoundedErrorUIO(Method):
         return complete(search_gamma(solve, weights, largest))[0]
 
     def _multiplier_form(self, model: UioModel, weights: FloatArray) -> tuple[Any, Any]:
-        from obsynth.designs.bounded_error.multipliers import (
+        from obsynth.designs.bounded_error.printed import (
             box_vertices,
             largest_multiplier_gamma,
             refuse_printed,

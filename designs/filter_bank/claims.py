@@ -4,12 +4,21 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
+from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.slope_signs import with_ranges
+from obsynth.derive.rigour import substitute
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.guard import Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import within
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign, BankModel
-from obsynth.designs.filter_bank.widths import steady_half_widths
+from obsynth.symbolic.arrays import FloatArray
+
+# far above the rounding of the sums below
+_UP = 1.0 + 1e-9
 
 
 def claims(design: BankDesign) -> Iterator[Claim]:
@@ -107,3 +116,99 @@ def guarantee(design: BankDesign) -> Guarantee:
     if plant.w:
         assumptions.append(f"{within(plant.w)} [monitored in part: status bit 8]")
     return Guarantee(tuple(claims), tuple(assumptions))
+
+
+def steady_half_widths(design: BankDesign) -> tuple[FloatArray, FloatArray] | None:
+    """Return bounds of the half widths of states, (n,), and of faults by filters, (n_f, n_l).
+
+    Of sets that are N calls old or more, N the horizon. None where a slope has no bound over the
+    region, as at a flow sqrt(z) through zero, or where the unmeasured states may drive each other
+    apart.
+
+    With slopes |df_i/dx_j| <= s_ij, own slopes of the unmeasured states <= -d_i and speeds at most
+    R_i, the envelope of a step is wider than the sets by 2 Ts R_i. The widths w of the unmeasured
+    states are at most S^-1 of what the other widths feed in, S = diag(d) - s, plus (I - Ts S)^k
+    times what they exceed it by k calls before; that is no more than a multiple of S^-1 1, which
+    falls with k. The interval of a fault has the width (w_y + v) / N, with v the width of a filter,
+    v' = s e + l (e_y - v), and e the widths of the envelopes.
+    """
+    found = _slopes(design)
+    if found is None:
+        return None
+    lower, upper, speed, drift = found
+    n, hidden, Ts = len(design.plant.x), design.hidden, design.Ts
+    slope = np.maximum(np.abs(lower), np.abs(upper))
+    width, declared = np.zeros(n), np.diff(design.region)[:, 0]
+    magnitude = np.abs(design.region).max(axis=1)
+    rounding = 4.0 * design.rounding * magnitude
+    for k, i in enumerate(design.outputs.tolist()):
+        width[i] = float(design.noise[k, 1] - design.noise[k, 0]) / float(design.scale[k])
+        width[i] += rounding[i]
+    moved = 2.0 * (Ts * speed + rounding)
+    own = -upper[hidden, hidden]
+    if np.any(own * Ts >= 1.0):
+        return None
+    coupling = slope[np.ix_(hidden, hidden)].copy()
+    np.fill_diagonal(coupling, 0.0)
+    others = slope[hidden].copy()
+    others[np.arange(len(hidden)), hidden] = 0.0
+    fed = others @ (width + moved) + drift[hidden]
+    fed += 2.0 * slope[hidden, hidden] * Ts * speed[hidden]
+    fed += 2.0 * rounding[hidden] / Ts
+    S = np.diag(own) - coupling
+    if hidden and np.linalg.eigvals(S).real.min() <= 0.0:
+        return None
+    width[hidden] = np.linalg.solve(S, fed)
+    even = np.linalg.solve(S, np.ones(len(hidden)))
+    excess = even * np.max((declared[hidden] - width[hidden]) / even, initial=0.0)
+    envelope, fades = width + moved, np.eye(len(hidden)) - Ts * S
+    calls = Watch.of(design.options).calls
+    faults = np.zeros((len(design.gain), len(design.filters)))
+    for j, (i, gain) in enumerate(zip(design.fault_rows.tolist(), design.gain, strict=True)):
+        for k, rate in enumerate(design.filters.tolist()):
+            decay, gathered = np.exp(-rate * Ts), -np.expm1(-rate * Ts) / rate
+            lost = 2.0 * design.rounding * (4.0 * magnitude[i] + Ts * speed[i]) / (rate * gathered)
+            drive = float(slope[i] @ envelope) + float(drift[i]) + rate * float(envelope[i])
+            # what the unmeasured states exceed, the width of the filter, one
+            step = np.eye(len(hidden) + 2)
+            step[:-2, :-2] = fades
+            step[-2] = [*(gathered * slope[i, hidden]), decay, gathered * drive]
+            ended = np.linalg.matrix_power(step, calls) @ [*excess, declared[i], 1.0]
+            response = abs(float(gain)) * -np.expm1(-rate * Ts * calls) / rate
+            faults[j, k] = (width[i] + lost + ended[-2]) / response
+    width[hidden] += np.linalg.matrix_power(fades, calls) @ excess
+    range_f = np.diff(design.plant.box("f"))
+    return (
+        0.5 * np.minimum(width * _UP, declared),
+        0.5 * np.minimum(faults * _UP, range_f),
+    )
+
+
+def _slopes(
+    design: BankDesign,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return bounds of the Jacobian, of speeds, and of what unknown disturbances span."""
+    regional = with_ranges(design.plant, design.region)
+    if regional.p or any(not s.measured for s in regional.rho):
+        return None
+    values = regional.constant_values
+    rows = [sp.expand(substitute(row, values)) for row in regional.rhs]
+    drift = np.zeros(len(rows))
+    for i, row in enumerate(rows):
+        for signal in regional.w:
+            factor = sp.diff(row, signal.symbol)
+            if not factor.is_number:
+                return None
+            drift[i] += abs(float(factor)) * (signal.upper - signal.lower)
+    try:
+        jacobian = jacobian_bounds(regional)
+        entries = matrix_entries({(i, 0): row for i, row in enumerate(rows)}, regional)
+        ranges = entries.ranges(1e-3, "fast", "speed")
+    except (UnboundedError, DerivationError):
+        return None
+    speed = np.zeros(len(rows))
+    for position, (i, _) in enumerate(entries.places):
+        speed[i] = max(-float(ranges.lower[position]), float(ranges.upper[position]), 0.0)
+    if not np.isfinite(speed).all():
+        return None
+    return jacobian.min, jacobian.max, speed, drift

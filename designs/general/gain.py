@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.errors import SolverTrouble
-from obsynth.designs.general.peak import spectral_radius
+from obsynth.designs.general.peak import absolute_sums, spectral_radius
 from obsynth.designs.general.record import GeneralDesign
-from obsynth.designs.general.responses import absolute_sums
 from obsynth.designs.general.system import error_system
 from obsynth.symbolic.arrays import FloatArray, IntArray
 

@@ -18,7 +18,6 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.claims import claims, covers, guarantee, numbers
 from obsynth.designs.general.fading import fade
-from obsynth.designs.general.frozen import attained_gain
 from obsynth.designs.general.gain import find_gain
 from obsynth.designs.general.model import CLASS, GeneralModel, of, read_again
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
@@ -32,7 +31,7 @@ from obsynth.designs.general.step import (
     memory_sizes,
     settling,
 )
-from obsynth.designs.general.storage import with_ellipsoid, with_energy
+from obsynth.designs.general.storage import attained_gain, with_ellipsoid, with_energy
 from obsynth.designs.general.synthesis import Units, solve_ellipsoid, solve_energy, units
 from obsynth.designs.general.system import error_system, extra_inputs
 from obsynth.symbolic import Plant

@@ -30,8 +30,7 @@ from obsynth.designs.hinf.lmis import (
 )
 from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
-from obsynth.designs.hinf.sector import build_sector, covers_sector
-from obsynth.designs.hinf.system import Arithmetic, FilterData, lift
+from obsynth.designs.hinf.system import Arithmetic, FilterData, build_sector, covers_sector, lift
 from obsynth.designs.lmi.problem import he
 from obsynth.designs.lmi.proof import RUMP
 from obsynth.symbolic.arrays import FloatArray

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.hinf.sector import Sector
-from obsynth.designs.hinf.system import Arithmetic, Filter, FilterData, lift
+from obsynth.designs.hinf.system import Arithmetic, Filter, FilterData, Sector, lift
 from obsynth.designs.lmi.problem import symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 

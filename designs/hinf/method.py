@@ -25,7 +25,6 @@ from obsynth.designs.hinf.claims import (
 )
 from obsynth.designs.hinf.model import CLASS, HinfModel, read, read_again
 from obsynth.designs.hinf.record import Bound, HinfDesign
-from obsynth.designs.hinf.sector import Multipliers, SectorForm
 from obsynth.designs.hinf.step import build_core, first_memory, memory_sizes
 from obsynth.designs.hinf.synthesis import (
     CAP,
@@ -38,7 +37,7 @@ from obsynth.designs.hinf.synthesis import (
     state_problem,
     unstable_vertex,
 )
-from obsynth.designs.hinf.system import Filter
+from obsynth.designs.hinf.system import Filter, Multipliers, SectorForm
 from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError

@@ -8,8 +8,7 @@ from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, maj
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.hinf.record import Bound, HinfDesign
-from obsynth.designs.hinf.sector import ROOM, SectorForm, build_sector
-from obsynth.designs.hinf.system import Filter
+from obsynth.designs.hinf.system import ROOM, Filter, SectorForm, build_sector
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

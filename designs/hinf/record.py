@@ -13,8 +13,7 @@ from obsynth.derive.rigour import Enclosure
 from obsynth.derive.split import LinearForm
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.record import Design, Record
-from obsynth.designs.hinf.sector import Sector, SectorForm
-from obsynth.designs.hinf.system import Filter, FilterData
+from obsynth.designs.hinf.system import Filter, FilterData, Sector, SectorForm
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

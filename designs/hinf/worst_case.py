@@ -1,5 +1,7 @@
 """How bad can it get: disturbances and operating points that make the fault error large."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import casadi as ca
@@ -9,14 +11,184 @@ from numpy.typing import NDArray
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.hinf.method import HinfUIO
-from obsynth.designs.hinf.operating_points import OperatingPoints, frozen_gain, search_points
 from obsynth.designs.hinf.record import HinfDesign
+from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
+ComplexArray = NDArray[np.complex128]
+FREQUENCIES = 48
+REFINEMENTS = 6
+NEWTON = 30
+ROUNDS = 12
+# Where a signal has no range, operating points are looked for within so many units of zero.
+REACH = 10.0
+# Distance kept from the ends of a range, as a share of its width: w moves the plant a little.
+DISTANCE = 1e-3
+Functions = tuple[ca.Function, ca.Function]
 CHUNK = 500
 # A longer disturbance is tried until the gain is this close to that of the linearisation.
 CLOSE = 1.0 - 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoints:
+    """Points (x, u, v) with x = f(x, u, v): v are the faults and unknown inputs that hold them.
+
+    x, u, v (N, n), (N, n_u), (N, s)
+    jacobian (N, n, n): of the right-hand side by x
+    """
+
+    x: FloatArray
+    u: FloatArray
+    v: FloatArray
+    jacobian: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def take(self, index: NDArray[np.intp]) -> OperatingPoints:
+        """Return some of the points."""
+        return OperatingPoints(self.x[index], self.u[index], self.v[index], self.jacobian[index])
+
+    def joined(self, other: OperatingPoints) -> OperatingPoints:
+        """Return the points of both."""
+        pairs = ((getattr(self, k), getattr(other, k)) for k in ("x", "u", "v", "jacobian"))
+        return OperatingPoints(*(np.concatenate(pair) for pair in pairs))
+
+
+def _functions(model: Plant) -> Functions:
+    """(x, u, v) -> rhs and its Jacobian by (x, u, v)."""
+    n, n_u, n_f, n_d = (len(model.names(kind)) for kind in ("x", "u", "f", "d"))
+    x, u, v = ca.SX.sym("x", n), ca.SX.sym("u", n_u), ca.SX.sym("v", n_f + n_d)
+    quiet = [ca.DM(noise_centre(model)), *(ca.DM.zeros(len(model.names(k))) for k in ("p", "rho"))]
+    value = model.function()(x, u, v[n_f:], v[:n_f], *quiet)[0]
+    slopes = ca.densify(ca.jacobian(value, ca.vertcat(x, u, v)))
+    return ca.Function("rhs", [x, u, v], [value]), ca.Function("slopes", [x, u, v], [slopes])
+
+
+def _batch(function: ca.Function, *arguments: FloatArray) -> FloatArray:
+    count = len(arguments[0])
+    rows, columns = function.size_out(0)
+    value = np.array(function.map(count)(*(a.T for a in arguments)))
+    return np.moveaxis(value.reshape(rows, count, columns), 1, 0)
+
+
+def hold_points(
+    model: Plant, x: FloatArray, u: FloatArray, functions: Functions | None = None
+) -> OperatingPoints:
+    """Move points to the nearest at which faults and unknown inputs can hold the plant.
+
+    Gauss-Newton on x = f(x, u, v), steps of least norm; what does not converge or ends outside
+    the ranges of x and u is left out.
+
+    Shapes: x, u (N, n), (N, n_u).
+    """
+    rhs, slopes = functions or _functions(model)
+    n, n_u = x.shape[1], u.shape[1]
+    z = np.hstack([x, u, np.zeros((len(x), rhs.size_in(2)[0]))])
+    boxes = np.vstack([_inner(model.box("x")), model.box("u")])
+    # v costs next to nothing, so that x and u stay where they were wanted if they can.
+    weight = np.concatenate([np.ones(n + n_u), np.full(z.shape[1] - n - n_u, 1e4)])
+    selector = np.eye(n, z.shape[1])
+
+    def parts(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return points[:, :n], points[:, n : n + n_u], points[:, n + n_u :]
+
+    for _ in range(NEWTON):
+        residual = _batch(rhs, *parts(z))[:, :, 0] - z[:, :n]
+        matrix = (_batch(slopes, *parts(z)) - selector) * weight
+        usable = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
+        z, matrix, residual = z[usable], matrix[usable], residual[usable]
+        if not len(z):
+            break
+        step = weight * (np.linalg.pinv(matrix) @ residual[:, :, None])[:, :, 0]
+        z = z - step
+        z[:, : n + n_u] = np.clip(z[:, : n + n_u], boxes[:, 0], boxes[:, 1])
+        if np.abs(step).max(initial=0.0) < 1e-13 * max(1.0, np.abs(z).max(initial=0.0)):
+            break
+    residual = _batch(rhs, *parts(z))[:, :, 0] - z[:, :n] if len(z) else np.zeros((0, n))
+    size = 1.0 + np.abs(z).max(axis=1, initial=0.0)
+    z = z[np.abs(residual).max(axis=1, initial=0.0) < 1e-10 * size]
+    jacobian = _batch(slopes, *parts(z))[:, :, :n] if len(z) else np.zeros((0, n, n))
+    return OperatingPoints(*parts(z), jacobian)
+
+
+def frozen_gain(
+    design: HinfDesign, jacobian: FloatArray, refinements: int = REFINEMENTS
+) -> tuple[FloatArray, FloatArray, ComplexArray]:
+    """Return the peak gain from w to f - fhat of the error linearised with given Jacobians.
+
+    Shapes: jacobian (N, n, n), gain (N,), frequency (N,), direction (N, n_w).
+    """
+    gains, C, W = design.gains, design.C, design.W
+    kept = np.eye(len(C.T)) - gains.F @ C
+    loop = kept @ jacobian - gains.K @ C
+    output = gains.H @ C @ jacobian + gains.D @ C
+    modes = np.linalg.eigvals(loop)
+    unstable = np.abs(modes).max(axis=1) >= 1.0
+    common = np.linspace(0.0, np.pi, FREQUENCIES)
+    grid = np.hstack([np.broadcast_to(common, (len(loop), FREQUENCIES)), np.abs(np.angle(modes))])
+    eye = np.eye(loop.shape[-1])
+    spacing = np.pi / (FREQUENCIES - 1)
+    rows = np.arange(len(loop))
+    for round_number in range(refinements + 1):
+        z = np.exp(1j * grid)[:, :, None, None]
+        response = np.linalg.solve(z * eye - loop[:, None], (kept @ W).astype(complex))
+        transfer = output[:, None] @ response + gains.H @ C @ W
+        # n_f is small, so the squares of the singular values are quicker than these.
+        squares = np.linalg.eigvalsh(transfer @ np.conj(np.swapaxes(transfer, -1, -2)))[..., -1]
+        best = np.argmax(squares, axis=1)
+        peak = grid[rows, best]
+        if round_number < refinements:
+            width = spacing * 0.2**round_number
+            grid = np.clip(peak[:, None] + np.linspace(-width, width, 11), 0.0, np.pi)
+    _, sizes, right = np.linalg.svd(transfer[rows, best])
+    return np.where(unstable, np.inf, sizes[:, 0]), peak, right[:, 0].conj()
+
+
+def search_points(
+    design: HinfDesign, count: int = 256, seed: int = 0, keep: int = 4
+) -> OperatingPoints:
+    """Find the operating points with the largest frozen gains: samples, then a random ascent."""
+    rng = np.random.default_rng(seed)
+    model, functions = design.plant, _functions(design.plant)
+    boxes = [_finite(model.box(kind)) for kind in ("x", "u")]
+    draws = [rng.uniform(b[:, 0], b[:, 1], (count, len(b))) for b in boxes]
+    found = hold_points(model, draws[0], draws[1], functions)
+    rest = [np.zeros((1, len(b))) for b in boxes]
+    origin = hold_points(model, rest[0], rest[1], functions)
+    found = found.joined(origin)
+    if not len(found):
+        return found
+    gain = frozen_gain(design, found.jacobian, 1)[0]
+    spread = 0.1
+    for _ in range(ROUNDS):
+        top = np.argsort(-gain, kind="stable")[:keep]
+        found, gain = found.take(top), gain[top]
+        near = [
+            np.repeat(value, 16, axis=0)
+            + spread * (b[:, 1] - b[:, 0]) * rng.standard_normal((16 * len(found), len(b)))
+            for value, b in zip((found.x, found.u), boxes, strict=True)
+        ]
+        inside = [np.clip(v, b[:, 0], b[:, 1]) for v, b in zip(near, boxes, strict=True)]
+        more = hold_points(model, inside[0], inside[1], functions)
+        found = found.joined(more)
+        gain = np.concatenate([gain, frozen_gain(design, more.jacobian, 1)[0]])
+        spread *= 0.5
+    return found.take(np.argsort(-gain, kind="stable")[:keep])
+
+
+def _inner(box: FloatArray) -> FloatArray:
+    width = box[:, 1] - box[:, 0]
+    kept = np.where(np.isfinite(width), DISTANCE * width, 0.0)
+    return np.column_stack([box[:, 0] + kept, box[:, 1] - kept])
+
+
+def _finite(box: FloatArray) -> FloatArray:
+    lower = np.where(np.isfinite(box[:, 0]), box[:, 0], np.minimum(box[:, 1], 0.0) - REACH)
+    upper = np.where(np.isfinite(box[:, 1]), box[:, 1], np.maximum(lower, 0.0) + REACH)
+    return np.column_stack([lower, upper])
 
 
 @dataclass(frozen=True, eq=False)

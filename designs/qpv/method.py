@@ -16,7 +16,6 @@ from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.qpv.claims import claims, covers, prove_rounding
-from obsynth.designs.qpv.defaults import default_sets, takes_rate
 from obsynth.designs.qpv.guarantee import guarantee, numbers
 from obsynth.designs.qpv.model import (
     CLASS,
@@ -24,6 +23,7 @@ from obsynth.designs.qpv.model import (
     check_faults,
     check_polytope,
     cover,
+    default_sets,
     reach,
     read_again,
     read_apart,
@@ -31,6 +31,7 @@ from obsynth.designs.qpv.model import (
     read_noise,
     read_performance_output,
     read_region,
+    takes_rate,
     unit_shape,
 )
 from obsynth.designs.qpv.printed import printed_refusal

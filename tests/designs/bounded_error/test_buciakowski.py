@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.bounded_error.infeasibility import find_fixed_point, verify_fixed_point
 from obsynth.designs.bounded_error.lmis import plain_error
-from obsynth.designs.bounded_error.multipliers import box_vertices, largest_multiplier_gamma
+from obsynth.designs.bounded_error.printed import (
+    box_vertices,
+    find_fixed_point,
+    largest_multiplier_gamma,
+    verify_fixed_point,
+)
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import first_bound
 from obsynth.designs.bounded_error.synthesis import largest_gamma

@@ -16,9 +16,16 @@ import obsynth as ob
 from obsynth.derive.rigour import Enclosure, ExactMatrix
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.general.fading import fade, prove_fading, recursion
+from obsynth.designs.general.fading import (
+    block_norms,
+    contracts,
+    enclosed_inverse,
+    fade,
+    prove_fading,
+    recursion,
+    single,
+)
 from obsynth.designs.general.method import bound_peak
-from obsynth.designs.general.modal import block_norms, contracts, enclosed_inverse, single
 from obsynth.designs.general.model import read
 from obsynth.designs.general.record import Modes
 from obsynth.designs.general.step import running, start_bound

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.rigour import Enclosure
-from obsynth.designs.general.peak import small_gain_solution
-from obsynth.designs.general.responses import absolute_sums, power_sum, response
+from obsynth.designs.general.peak import absolute_sums, power_sum, response, small_gain_solution
 
 
 def exact_inverse(matrix: list[list[Fraction]]) -> list[list[Fraction]]:

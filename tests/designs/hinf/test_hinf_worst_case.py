@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.hinf.operating_points import frozen_gain, hold_points
-from obsynth.designs.hinf.worst_case import _half_sine, _Loop, worst_case
+from obsynth.designs.hinf.worst_case import _half_sine, _Loop, frozen_gain, hold_points, worst_case
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "hinf_worst_case.py"
 

@@ -7,10 +7,9 @@ import pytest
 
 import obsynth as ob
 from obsynth.designs.core.errors import CertificateError
-from obsynth.designs.filter_bank.claims import claims, covers
+from obsynth.designs.filter_bank.claims import claims, covers, steady_half_widths
 from obsynth.designs.filter_bank.model import read
 from obsynth.designs.filter_bank.record import BankDesign
-from obsynth.designs.filter_bank.widths import steady_half_widths
 
 
 @pytest.fixture(scope="module")
