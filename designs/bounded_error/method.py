@@ -9,23 +9,16 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
-from obsynth.designs.bounded_error.claims import (
-    claims,
-    covers,
-    guarantee,
-    inverse_diagonal_bounds,
-    numbers,
-    prove_ellipsoid,
-)
+from obsynth.designs.bounded_error import claims, model, step
+from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
 from obsynth.designs.bounded_error.lmis import (
     ErrorKind,
     ErrorSystem,
     build_error_system,
 )
-from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read, read_again
+from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
-from obsynth.designs.bounded_error.step import build_core, first_memory, memory_sizes, settling
 from obsynth.designs.bounded_error.synthesis import (
     EllipsoidSolution,
     Objective,
@@ -115,19 +108,13 @@ class BoundedErrorUIO(Method):
 
     CLASS = CLASS
     SPLITS = True
-    CONTRACT = Contract(
-        name="bounded_error_uio",
-        record=UioDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
+    CONTRACT = Contract.of(
+        "bounded_error_uio",
+        UioDesign,
+        claims,
+        model,
+        step,
         quiet=True,
-        settle=settling,
-        core=build_core,
         shared=("z", "fhat", "prediction"),
     )
 

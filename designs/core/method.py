@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import partial
 from inspect import signature
+from types import ModuleType
 from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
 import casadi as ca
@@ -70,14 +71,14 @@ class Contract(Generic[D]):
     covers: proofs that the stored numbers speak of the stored plant, from what was read of it
     guarantee: what is promised, and under which assumptions
     numbers: gains, performance and half widths for people to read
-    memory: parts of the core's memory and their sizes
-    first: parts of it for a first set; further keywords are those of the method. In discrete time
-        the shared ones are enough, since a core begins from the first sets
-    core: what the method knows from call to call, see `guard`
+    memory_sizes: parts of the core's memory
+    first_memory: parts of it for a first set; further keywords are those of the method. In discrete
+        time the shared ones are enough, since a core begins from the first sets
+    build_core: what the method knows from call to call, see `guard`
     shared: parts of the memory that estimates are made of, or a function of the design
-    ode: right-hand side for the core's memory, of methods in continuous time
+    build_ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`; the former may be a function of the design
-    settle: of a design, half widths of the sets that its core begins from, and a number of calls
+    settling: of a design, half widths of the sets that its core begins from, and a number of calls
         or None: how many calls its bounds take to settle, or that number, and its half widths from
         then on, all infinite where they cannot begin from such sets; None without any bounds
     quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
@@ -91,15 +92,21 @@ class Contract(Generic[D]):
     covers: Callable[[D, Any], Iterable[Claim]]
     guarantee: Callable[[D], Guarantee]
     numbers: Callable[[D], Numbers]
-    memory: Callable[[D], Mapping[str, int]]
-    first: Callable[..., Mapping[str, ArrayLike]]
-    core: Callable[[D], Core]
+    memory_sizes: Callable[[D], Mapping[str, int]]
+    first_memory: Callable[..., Mapping[str, ArrayLike]]
+    build_core: Callable[[D], Core]
     shared: tuple[str, ...] | Callable[[D], tuple[str, ...]] = ()
-    ode: Callable[[D], ca.Function] | None = None
+    build_ode: Callable[[D], ca.Function] | None = None
     fault_delay: int | Callable[[D], int] = 0
     step_covered: bool = False
-    settle: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
+    settling: Callable[[D, FloatArray, int | None], tuple[int, FloatArray] | None] | None = None
     quiet: bool = False
+
+    @classmethod
+    def of(cls, name: str, record: type[D], *files: ModuleType, **more: Any) -> "Contract[D]":
+        """Return the contract of functions that stand in files of a method under the names here."""
+        found = [(one.name, vars(file).get(one.name)) for one in fields(cls) for file in files]
+        return cls(name, record, **{k: value for k, value in found if callable(value)} | more)
 
     def to_record(self, design: Any) -> dict[str, Any]:
         """Return a design as JSON-able data with the header that `load` reads."""
@@ -125,7 +132,7 @@ class Contract(Generic[D]):
         design: Any = certificate.require().design
         plant: Plant = design.plant
         numbers, guard = self.numbers(design), self.guard(design)
-        core, layout = self.core(design), guard.layout()
+        core, layout = self.build_core(design), guard.layout()
         performance = dict(numbers.performance)
         if numbers.half_widths is not None:
             performance["core_half_widths"] = numbers.half_widths
@@ -133,7 +140,7 @@ class Contract(Generic[D]):
         if guard.delay and guard.discrete and told not in performance:
             performance[told] = guard.widths(numbers.half_widths, nominal=True)
             searched = (*searched, told)
-        ode = None if self.ode is None else self.ode(design)
+        ode = None if self.build_ode is None else self.build_ode(design)
         return Observer(
             method=self.name,
             model=plant if plant.Ts is not None else plant.discretise("rk4", design.Ts),
@@ -157,12 +164,12 @@ class Contract(Generic[D]):
         plant: Plant = getattr(design, "assumed", design.plant)
         return Guard(
             plant,
-            self.memory(design),
+            self.memory_sizes(design),
             Watch.of(design.options),
             self.fault_delay(design) if callable(self.fault_delay) else self.fault_delay,
             plant.Ts if plant.Ts is not None else design.Ts,
             self.shared(design) if callable(self.shared) else self.shared,
-            None if self.settle is None else partial(self.settle, design),
+            None if self.settling is None else partial(self.settling, design),
         )
 
     def start(
@@ -175,14 +182,14 @@ class Contract(Generic[D]):
         **options: Any,
     ) -> FloatArray:
         """Return the memory for the first call of the step, see `Observer.memory0`."""
-        known = [*signature(self.first).parameters][2:]
+        known = [*signature(self.first_memory).parameters][2:]
         for option in set(options) - set(known):
             more = ", ".join(("guess, x_range, f_range, y0", *known))
             raise ObsynthError(
                 f"memory0 of {self.name} takes {more}; it knows no {option!r}", option=option
             )
         given = Start.read(design.plant, guess, x_range, f_range, y0)
-        guard, parts = self.guard(design), self.first(design, given, **options)
+        guard, parts = self.guard(design), self.first_memory(design, given, **options)
         f_box = given.f if self.quiet or f_range is not None else design.plant.box("f")
         return fill(guard.layout(), guard.first(parts, given.x, f_box))
 

@@ -28,9 +28,9 @@ class Handed(property):
 def core_of(observer: Any) -> Core | None:
     """Return the core of an observer's step; None for a stand-in without a certificate."""
     contract = getattr(getattr(observer, "certificate", None), "contract", None)
-    if contract is None or contract.core is None:
+    if contract is None or contract.build_core is None:
         return None
-    core: Core = contract.core(observer.certificate.design)
+    core: Core = contract.build_core(observer.certificate.design)
     return core
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from obsynth.derive import Split
 from obsynth.designs.core.given import POSITIVE
 from obsynth.designs.core.method import Contract, Method
-from obsynth.designs.filter_bank.claims import claims, covers, guarantee, numbers
-from obsynth.designs.filter_bank.model import CLASS, read, read_again
+from obsynth.designs.filter_bank import claims, model, step
+from obsynth.designs.filter_bank.model import CLASS, read
 from obsynth.designs.filter_bank.record import BankDesign, BankModel
-from obsynth.designs.filter_bank.step import build_core, build_ode, first_memory, memory_sizes
 from obsynth.symbolic import Plant
 from obsynth.symbolic.errors import ObsynthError
 
@@ -81,20 +80,7 @@ class FilterBank(Method):
 
     CLASS = CLASS
     SPLITS = True
-    CONTRACT = Contract(
-        name="filter_bank",
-        record=BankDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        core=build_core,
-        ode=build_ode,
-        step_covered=True,
-    )
+    CONTRACT = Contract.of("filter_bank", BankDesign, claims, model, step, step_covered=True)
 
     filters: Annotated[tuple[float, ...], POSITIVE] = (0.1, 0.2, 0.3, 0.5)
     region: tuple[tuple[float, float], ...] | None = None

@@ -16,21 +16,14 @@ from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
-from obsynth.designs.general.claims import claims, covers, guarantee, numbers
+from obsynth.designs.general import claims, model, step
 from obsynth.designs.general.fading import fade
 from obsynth.designs.general.gain import find_gain
-from obsynth.designs.general.model import CLASS, GeneralModel, of, read_again
+from obsynth.designs.general.model import CLASS, GeneralModel, of
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import settle
-from obsynth.designs.general.step import (
-    Limits,
-    build_core,
-    fault_delay,
-    first_memory,
-    memory_sizes,
-    settling,
-)
+from obsynth.designs.general.step import Limits
 from obsynth.designs.general.storage import attained_gain, with_ellipsoid, with_energy
 from obsynth.designs.general.synthesis import Units, solve_ellipsoid, solve_energy, units
 from obsynth.designs.general.system import error_system, extra_inputs
@@ -59,21 +52,8 @@ class GeneralUIO(Method):
     """
 
     CLASS = CLASS
-    CONTRACT = Contract(
-        name="general_uio",
-        record=GeneralDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        quiet=True,
-        settle=settling,
-        core=build_core,
-        shared=("prediction",),
-        fault_delay=fault_delay,
+    CONTRACT = Contract.of(
+        "general_uio", GeneralDesign, claims, model, step, quiet=True, shared=("prediction",)
     )
 
     bounds: Literal["peak", "ellipsoid", "l2"] = "peak"

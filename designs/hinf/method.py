@@ -14,18 +14,10 @@ from obsynth.designs.core.given import Number, changed, read_gains, read_matrix,
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.hinf.claims import (
-    RESIDUAL,
-    claims,
-    covers,
-    decoupling_residual,
-    guarantee,
-    numbers,
-    prove_level,
-)
-from obsynth.designs.hinf.model import CLASS, HinfModel, read, read_again
+from obsynth.designs.hinf import claims, model, step
+from obsynth.designs.hinf.claims import RESIDUAL, decoupling_residual, prove_level
+from obsynth.designs.hinf.model import CLASS, HinfModel, read
 from obsynth.designs.hinf.record import Bound, HinfDesign
-from obsynth.designs.hinf.step import build_core, first_memory, memory_sizes
 from obsynth.designs.hinf.synthesis import (
     CAP,
     NOT_FOUND,
@@ -117,17 +109,12 @@ class HinfUIO(Method):
 
     CLASS = CLASS
     SPLITS = True
-    CONTRACT = Contract(
-        name="hinf_uio",
-        record=HinfDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        core=build_core,
+    CONTRACT = Contract.of(
+        "hinf_uio",
+        HinfDesign,
+        claims,
+        model,
+        step,
         shared=("prediction", "innovation", "running"),
         fault_delay=1,
     )

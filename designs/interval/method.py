@@ -18,17 +18,12 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.step import Step
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.interval.claims import claims, covers, guarantee, numbers
+from obsynth.designs.interval import claims, model, step
 from obsynth.designs.interval.decoupling import check_detectable, find_transformation
-from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read, read_again
+from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
-from obsynth.designs.interval.step import (
-    build_core,
-    first_memory,
-    half_widths_after,
-    memory_sizes,
-)
+from obsynth.designs.interval.step import build_core
 from obsynth.designs.interval.synthesis import (
     fitting_gains,
     given_gains,
@@ -101,20 +96,7 @@ class IntervalObserver(Method):
     """
 
     CLASS = CLASS
-    CONTRACT = Contract(
-        name="interval_observer",
-        record=IntervalDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        core=build_core,
-        fault_delay=1,
-        settle=half_widths_after,
-    )
+    CONTRACT = Contract.of("interval_observer", IntervalDesign, claims, model, step, fault_delay=1)
 
     gains: Any = "lp"
     centred: bool = True

@@ -13,9 +13,9 @@ from obsynth.derive.rigour import nearest
 from obsynth.designs.core.boxes import Ends, column
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
+from obsynth.designs.interval import widths
 from obsynth.designs.interval.record import SWEEPS, IntervalDesign
 from obsynth.designs.interval.rows import Rows
-from obsynth.designs.interval.widths import settling
 from obsynth.symbolic.arrays import FloatArray
 
 
@@ -34,7 +34,7 @@ def first_memory(design: IntervalDesign, start: Start) -> dict[str, ArrayLike]:
     return {}
 
 
-def half_widths_after(
+def settling(
     design: IntervalDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray] | None:
     """Return how many calls the sets take to settle, and their half widths from then on.
@@ -49,7 +49,7 @@ def half_widths_after(
         return None
     if not np.isfinite(first).all():
         return 0, np.full(box.shape, np.inf)
-    calls, e, w = settling(design.width_map, design.error, design.width, first, calls)
+    calls, e, w = widths.settling(design.width_map, design.error, design.width, first, calls)
     return calls, design.half_widths_of(e, w)
 
 

@@ -15,8 +15,8 @@ from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.qpv.claims import claims, covers, prove_rounding
-from obsynth.designs.qpv.guarantee import guarantee, numbers
+from obsynth.designs.qpv import claims, guarantee, model, step
+from obsynth.designs.qpv.claims import prove_rounding
 from obsynth.designs.qpv.model import (
     CLASS,
     QPVModel,
@@ -25,7 +25,6 @@ from obsynth.designs.qpv.model import (
     cover,
     default_sets,
     reach,
-    read_again,
     read_apart,
     read_form,
     read_noise,
@@ -38,15 +37,7 @@ from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
 from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.rounding import settle
-from obsynth.designs.qpv.step import (
-    SETTLED,
-    build_core,
-    build_ode,
-    first_memory,
-    found_again,
-    memory_sizes,
-    shared,
-)
+from obsynth.designs.qpv.step import SETTLED, found_again
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -133,21 +124,7 @@ class QPVObserver(Method):
     """
 
     CLASS = CLASS
-    CONTRACT = Contract(
-        name="qpv_observer",
-        record=QPVDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        quiet=True,
-        core=build_core,
-        shared=shared,
-        ode=build_ode,
-    )
+    CONTRACT = Contract.of("qpv_observer", QPVDesign, claims, guarantee, model, step, quiet=True)
 
     norm: Norm = "h2"
     region: Ellipsoid | None = None

@@ -14,9 +14,9 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.set_adaptive.claims import claims, covers, guarantee, numbers
+from obsynth.designs.set_adaptive import claims, equations, model, step
 from obsynth.designs.set_adaptive.coordinates import Coordinates, build_frame, read_coordinates
-from obsynth.designs.set_adaptive.equations import MONITORS, memory_sizes
+from obsynth.designs.set_adaptive.equations import MONITORS
 from obsynth.designs.set_adaptive.gain import (
     Gain,
     analyse_gain,
@@ -32,10 +32,9 @@ from obsynth.designs.set_adaptive.modal import (
     modal_coordinates,
     modes_of,
 )
-from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read, read_again
+from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read
 from obsynth.designs.set_adaptive.printed import printed_gain
 from obsynth.designs.set_adaptive.record import SetDesign, System
-from obsynth.designs.set_adaptive.step import build_core, build_ode, first_memory
 from obsynth.designs.set_adaptive.transition import uniformisation
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -115,19 +114,14 @@ class SetAdaptiveObserver(Method):
 
     CLASS = CLASS
     SPLITS = True
-    CONTRACT = Contract(
-        name="set_adaptive_observer",
-        record=SetDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        core=build_core,
+    CONTRACT = Contract.of(
+        "set_adaptive_observer",
+        SetDesign,
+        claims,
+        equations,
+        model,
+        step,
         shared=MONITORS,
-        ode=build_ode,
         step_covered=True,
     )
 

@@ -17,17 +17,10 @@ from obsynth.designs.core.step import Step
 from obsynth.designs.general import step as general
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.record import GeneralDesign
-from obsynth.designs.set_membership.claims import claims, covers, guarantee, numbers, read_again
+from obsynth.designs.set_membership import claims, step
 from obsynth.designs.set_membership.model import CLASS, SetMembershipModel, read
 from obsynth.designs.set_membership.record import MOST_COLUMNS, SetMembershipDesign
-from obsynth.designs.set_membership.step import (
-    build_core,
-    fault_delay,
-    first_memory,
-    memory_sizes,
-    settling,
-    shared,
-)
+from obsynth.designs.set_membership.step import build_core
 from obsynth.designs.set_membership.synthesis import (
     SHARES,
     Gain,
@@ -108,21 +101,7 @@ class SetMembershipObserver(Method):
     """
 
     CLASS = CLASS
-    CONTRACT = Contract(
-        name="set_membership",
-        record=SetMembershipDesign,
-        read_again=read_again,
-        claims=claims,
-        covers=covers,
-        guarantee=guarantee,
-        numbers=numbers,
-        memory=memory_sizes,
-        first=first_memory,
-        core=build_core,
-        shared=shared,
-        settle=settling,
-        fault_delay=fault_delay,
-    )
+    CONTRACT = Contract.of("set_membership", SetMembershipDesign, claims, step)
 
     columns: Annotated[int | None, COLUMNS] = None
     zonotopes: Annotated[int | None, COUNT] = None

@@ -6,12 +6,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from luenberger.model import LuenbergerModel
+from luenberger.model import LuenbergerModel, read
 from luenberger.record import LuenbergerDesign
 from luenberger.synthesis import compare
 from obsynth.derive.rigour import ExactMatrix
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
+
+
+def read_again(design: LuenbergerDesign) -> LuenbergerModel:
+    """Read the stored equations."""
+    return read(design.plant)
 
 
 def claims(design: LuenbergerDesign) -> Iterator[Claim]:

@@ -98,7 +98,7 @@ def test_bounds_that_are_too_small_are_noticed(carried):
     else:
         bound = replace(design.bound, b=0.1 * design.bound.b)
     own = contract.certify(design, "lmi").observer()
-    core = contract.core(replace(design, bound=bound))
+    core = contract.build_core(replace(design, bound=bound))
     mutant = Step(contract.guard(design), core).build()
     for step, wrong in ((own.step, False), (mutant, True)):
         told = [march(own, "switching", seed, 300, False, step) for seed in range(4)]

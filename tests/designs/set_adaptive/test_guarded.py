@@ -162,6 +162,8 @@ def test_means_of_two_memories_are_not_cut(monkeypatch):
 
     assert statuses() == [0] * (2 * N + 1)
     contract = FilterBank.CONTRACT
-    cut = replace(contract, core=lambda design: replace(contract.core(design), mean_fault=False))
+    cut = replace(
+        contract, build_core=lambda design: replace(contract.build_core(design), mean_fault=False)
+    )
     monkeypatch.setattr(FilterBank, "CONTRACT", cut)
     assert 8 in statuses()
