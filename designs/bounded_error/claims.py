@@ -153,10 +153,7 @@ def _prove_half_widths(bound: EllipsoidBound) -> Claim:
 
 
 def inverse_diagonal_bounds(shapes: FloatArray) -> FloatArray:
-    """Doubles just above ``(P^-1)_ii``, proved, component i from its own ellipsoid.
-
-    Shapes: shapes (s, p, p).
-    """
+    """Doubles just above ``(P^-1)_ii``, proved, component i from its own ellipsoid; P (s, p, p)."""
     every = np.broadcast_to(shapes, (shapes.shape[-1], *shapes.shape[1:]))
     return np.array([inverse_bounds(P, np.eye(len(P))[[i]])[0] for i, P in enumerate(every)])
 

@@ -1,8 +1,7 @@
 """The error recursion (16) at every vertex of the Jacobian set and its inequalities, once.
 
-``xi+ = (Abar_i - Kbar Cbar) xi + (Wbar_i - Kbar Vbar) v`` with the gain ``Kbar`` still free, in
-floats, enclosures or exact rationals. The inequalities are matrices that have to be positive
-definite; v is scaled by its boxes, so Q_v of the paper is a diagonal of weights that sum to 1.
+``xi+ = (Abar_i - Kbar Cbar) xi + (Wbar_i - Kbar Vbar) v``, ``Kbar`` free, in any arithmetic; v is
+scaled by its boxes, so Q_v of the paper is a diagonal of weights that sum to 1.
 """
 
 from __future__ import annotations
@@ -24,13 +23,10 @@ Arithmetic = Literal["float", "enclosure", "exact"]
 
 @dataclass(frozen=True, eq=False)
 class ModelData:
-    """Everything numeric that the error system is formed from.
+    """Everything numeric that the error system is formed from; E, T, Pi: of `Decoupling`.
 
-    A, B_f, C, W1, W2: shapes (n, n), (n, n_f), (m, n), (n, n_w), (m, n_w)
-    E, T, Pi: of `Decoupling`, shapes (n, m), (n, n), (m, m)
     vertices, vertex_radius (N, n, n): every Jacobian is a convex combination of matrices within the
         radius of the vertices
-    w_radius, rate (n_w,), (n_f,)
     """
 
     A: FloatArray
@@ -67,13 +63,9 @@ class ModelData:
 class ErrorSystem:
     """Matrices of the error recursion, arrays or enclosures, one member per vertex.
 
-    Abar (N, p, p)
-    Cbar (m, p)
-    Wbar (N, p, n_v) or (p, n_v): columns are scaled by the boxes, so that every component of v is
-        in [-1, 1]
-    Vbar (m, n_v)
-    basis (n, p - n_f): state errors are ``basis @ xi[:p - n_f] + E W2 w_k`` (shifted) or the first
-        n entries of xi (plain)
+    Abar (N, p, p), Cbar (m, p)
+    Wbar (N, p, n_v) or (p, n_v), Vbar (m, n_v): of v in units of its boxes
+    basis (n, p - n_f): state errors are ``basis @ xi[:p - n_f]``, and ``E W2 w_k`` where shifted
     blocks: 3 where v = (w_k, eps_k, w_{k+1}), 2 where v = (w_k, eps_k)
     """
 
@@ -130,11 +122,7 @@ def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:
 
 
 def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
-    """Error system of the paper, xi = (e, e_f), v = (w_k, eps_k, w_{k+1}).
-
-    Eqs. (16)-(18) with the third block of Wbar corrected to E W2: e_{k+1}
-    contains E y_{k+1}, and y_{k+1} contains W2 w_{k+1}.
-    """
+    """Error system (16)-(18), xi = (e, e_f), v = (w_k, eps_k, w_{k+1}), with E W2 put right."""
     n, n_f, m, n_w = data.sizes
     part = _parts(data, arithmetic)
 
@@ -155,15 +143,9 @@ def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSyste
 
 
 def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
-    """Error system in zeta = T x - z, which the noise w_{k+1} does not enter.
+    """Error system in zeta = T x - z, which the noise w_{k+1} does not enter: e = zeta + E W2 w_k.
 
-    With e = zeta + E W2 w_k,
-
-        zeta+ = (T (A + M) - K C) zeta + T B_f e_f
-                + (T (A + M) E W2 + T W1 - K Pi W2) w_k .
-
-    zeta stays in the range of the projector T, so it is written in coordinates
-    of that range.
+    Written in coordinates of the range of T, in which zeta stays; see the method's page.
     """
     n, n_f, m, n_w = data.sizes
     keep = kept_coordinates(data.T)
@@ -210,16 +192,13 @@ def build_error_system(
 
 
 def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:
-    """Quadratic boundedness at every vertex, without relaxation.
+    """Quadratic boundedness ``V+ <= (1 - gamma) V + gamma v'Q_v v`` at every vertex, not relaxed.
 
         [ keep P            *       *
           0                 noise   *
           P Abar - H Cbar   P Wbar - H Vbar   P ]  > 0
 
-    With ``keep = 1 - gamma`` and ``noise = gamma Q_v`` it says
-    ``V+ <= (1 - gamma) V + gamma v'Q_v v``, so V <= 1 is invariant.
-
-    Shapes: P, H (p, p), (p, m), keep (1, 1), noise (n_v, n_v).
+    Shapes: P, H (p, p), (p, m), keep = 1 - gamma (1, 1), noise = gamma Q_v (n_v, n_v).
     """
     X = P @ system.Abar - H @ system.Cbar
     Z = P @ system.Wbar - H @ system.Vbar
@@ -242,10 +221,7 @@ def multiplier_block(
     U: Any = None,
     arithmetic: Arithmetic = "float",
 ) -> Any:
-    """Inequality (51), as printed or repaired, times -1.
-
-    Shapes: P, H (n + n_f, n + n_f), (n + n_f, m), a, b (n, n), U (n, n).
-    """
+    """Inequality (51), as printed or repaired, times -1; H (n + n_f, m), a, b, U (n, n)."""
     base = plain_error(data.without_nonlinearity(), arithmetic)
     n, n_f, _, _ = data.sizes
     V = lift(np.eye(n, n + n_f), arithmetic)

@@ -169,10 +169,7 @@ class BoundedErrorUIO(Method):
     def _of_the_paper(
         self, model: Plant, bounds: JacobianBounds | None
     ) -> tuple[Split, JacobianBounds] | None:
-        """Split a plant of the paper's class with few vertices; None for others.
-
-        Options that speak of the paper's class alone keep it, and its refusals, in place.
-        """
+        """Split a plant of the paper's class with few vertices; None for others, unless asked."""
         named = changed(self, *IDLE)
         try:
             self.CLASS.check(model)

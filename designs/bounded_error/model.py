@@ -19,10 +19,9 @@ from obsynth.symbolic.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class NoiseBox:
-    """Boxes of the disturbances and of the fault increments.
+    """Boxes of the disturbances and of the fault increments per step.
 
-    w_centre, w_radius (n_w,): ``|w - w_centre| <= w_radius``, elementwise
-    rate (n_f,): ``|f_{k+1} - f_k| <= rate``, per step
+    w_centre, w_radius (n_w,), rate (n_f,)
     """
 
     w_centre: FloatArray
@@ -30,12 +29,9 @@ class NoiseBox:
     rate: FloatArray
 
     def equal_weights(self, blocks: int = 3) -> FloatArray:
-        """Weights of the scaled components of v, summing to 1 (errata 4 of the method).
+        """Weights of the components of v in units of its boxes, summing to 1 (see the errata).
 
-        ``v' Q_v v <= 1`` with ``Q_v = 1/3 diag(Q_w, Q_eps, Q_w)`` and the
-        ellipsoids that circumscribe the boxes, ``Q_w = diag(1/(n_w b_i^2))``,
-        ``Q_eps = diag(1/(n_f rate_j^2))``, in coordinates scaled by the boxes.
-        With ``blocks=2`` the last block (w_{k+1}) is absent.
+        Q_v = 1/3 diag(Q_w, Q_eps, Q_w) of circumscribed ellipsoids; no w_{k+1} where ``blocks=2``.
         """
         n_w, n_f = self.w_radius.size, self.rate.size
         parts = [np.full(n_w, 1.0 / max(n_w, 1)), np.full(n_f, 1.0 / max(n_f, 1))]
@@ -95,12 +91,10 @@ ROUNDING = 2.0**-40
 
 
 class Limits(NamedTuple):
-    """Where a bound goes on: boxes of states and their estimates, of faults, of inputs.
+    """Where a bound goes on: boxes of states and their estimates, of faults, of inputs, (., 2).
 
-    Shapes (n, 2), (n_f, 2), (n_u, 2). States on which a derivative depends keep to their ranges,
-    which the guarantee asks for anyway, as do inputs that do not enter with constant factors.
-    Others, and faults, may leave theirs by its width on either side, and where no range is declared
-    `LARGEST_SIGNAL` stands for it.
+    States on which a derivative depends keep to their ranges, as do inputs that do not enter with
+    constant factors; others may leave theirs by its width, `LARGEST_SIGNAL` where there is none.
     """
 
     x: FloatArray
@@ -125,10 +119,7 @@ class Derived:
 
 @dataclass(frozen=True, eq=False)
 class UioModel(Derived):
-    """A plant of the class (1)-(2) with everything derived from it.
-
-    design: complete except for gains and bound, which are zero
-    """
+    """A plant of the class; its design is complete except for gains and bound, which are zero."""
 
     design: UioDesign
 
@@ -177,11 +168,7 @@ def read_again(design: UioDesign) -> Derived:
 
 
 def rounding_allowance(model: Plant, residual: float = 0.0) -> FloatArray:
-    """Return an allowance for the rounding errors of one step, shape (n + n_f,), not proved.
-
-    2^-40 of the largest magnitude of the states (or 1), and the share of the
-    unknown input that rounding leaves in the error.
-    """
+    """Return 2^-40 of the largest state, and what is left of d, (n + n_f,), not proved."""
     size = max(1.0, float(np.abs(finite_box(model, "x")).max()))
     d_box = model.box("d")
     share = residual * float(np.abs(d_box).sum()) * 2.0 if residual > 0 else 0.0

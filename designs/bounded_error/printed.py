@@ -66,10 +66,8 @@ def multiplier_problem(
     weights: FloatArray,
     form: Literal["printed", "repaired"],
 ) -> Problem:
-    """State (51) with variables P, H, alpha, beta, U (printed) or P, H, a, b (repaired).
+    """State (51) with variables P, H, alpha, beta, U (printed) or P, H, a >= 0, b (repaired).
 
-    The multipliers a of the repaired form keep the sign that the paper gives to
-    alpha. (s = M e would allow any sign, which is a little less conservative.)
     As in `design_problem`, P and H stand for gamma times those of the paper.
     """
     problem = Problem(f"(51), {form}, at gamma = {gamma:.6g}")
@@ -145,11 +143,10 @@ def refuse_printed(data: ModelData, vertices: FloatArray, gamma: float) -> None:
 
 @dataclass(frozen=True)
 class FixedPoint:
-    """An error that no gain removes, in exact rational numbers.
+    """An error that no gain removes, in exact rational numbers, at a vertex by its number.
 
     e, e_f, s: state error (n,), fault error (n_f,) and value of the nonlinearity (n,)
     q1, q2: the two quadratic constraints of (51) at this point; both are >= 0
-    vertex: number of the vertex M at which they were evaluated
     """
 
     e: tuple[Fraction, ...]
@@ -215,13 +212,9 @@ def find_fixed_point(
     seed: int = 0,
     starts: int = 12,
 ) -> FixedPoint | None:
-    """Search every vertex for a fixed point that makes (51) infeasible.
+    """Search every vertex (N, n, n) for a fixed point that makes (51) infeasible.
 
-    Shapes: vertices (N, n, n).
-
-    The largest ``min(q1, q2)`` over the exact space of solutions is searched
-    numerically; its coordinates are then rounded to short rationals and the
-    conditions are checked in exact arithmetic.
+    ``min(q1, q2)`` is maximised over the exact space of solutions, rounded and checked exactly.
     """
     from scipy.optimize import minimize
 

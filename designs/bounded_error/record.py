@@ -53,15 +53,12 @@ class EllipsoidBound(Record):
 class UioDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
-    plant: the discrete plant
-    linear: how A was chosen, see `obsynth.split`
-    x_at, u_at: the point at which it was chosen
+    linear, x_at, u_at: how and at which point A was chosen, see `obsynth.split`
     A, B, B_f, C, D, W1, W2: the split
     family: the set of Jacobians of g
-    w_centre, w_radius, rate: boxes of disturbances and fault increments
+    w_centre, w_radius, rate: see `NoiseBox`
     E, T, Pi, K, F: the observer
     rounding: allowance for the rounding errors of one step
-    options: the options of the method, as given
     """
 
     plant: Plant

@@ -43,10 +43,7 @@ ROOM = 1.0 + 2.0**-10
 
 
 def _through(design: UioDesign, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Bound what readings off by delta (m,) add to xi in one step, and to x - xhat.
-
-    Shapes: (n + n_f,), (n,).
-    """
+    """Bound what readings off by delta (m,) add to xi in a step, (n + n_f,), and to x - xhat."""
     E, K, F, C = (np.abs(part) for part in (design.E, design.K, design.F, design.C))
     before = E @ delta
     seen = C @ before + delta
@@ -63,10 +60,7 @@ def _moved(design: UioDesign) -> FloatArray:
 
 
 def of_matrices(design: UioDesign, off: Mapping[str, FloatArray]) -> FloatArray:
-    """Bound what rounding the split's matrices adds in one step, (n + n_f,).
-
-    off: |exact - double| by the letters of the matrices
-    """
+    """Bound what rounding the matrices of the split, by `off`, adds in one step, (n + n_f,)."""
     plant = design.plant
     limits = Limits.of(plant, design.precision)
     x, f = (np.abs(box).max(axis=1, initial=0.0) for box in (limits.x, limits.f))
@@ -146,8 +140,7 @@ def _outward(box: FloatArray, share: float) -> FloatArray:
 def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
     """Return what the allowance has to hold of one step, (n + n_f,), and whether it is proved.
 
-    Where branches of several states meet, the bound may be of no use; 2^-40 of the largest state is
-    then assumed.
+    Where branches of several states meet, the bound may be of no use, and the allowance is assumed.
     """
     step = of_step(design)
     size = max(1.0, float(np.abs(finite_box(design.plant, "x")).max()))

@@ -31,10 +31,7 @@ def _component_map(design: UioDesign) -> list[int | None]:
 
 
 def running_bound(design: UioDesign) -> Running:
-    """Return the recursion of eq. (36) for every component, rounding errors of the step included.
-
-    An error of at most `UioDesign.rounding` per step is at most rho in the norm of P, see `shaken`.
-    """
+    """Return the recursion (36) for every component, rounding included as in `shaken`."""
     bound, components = design.bound, _component_map(design)
     n, n_f = design.A.shape[0], design.rate.size
     size = n + n_f
@@ -68,11 +65,7 @@ def check_range_of_T(design: UioDesign, z: FloatArray) -> None:
 def settling(
     design: UioDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray]:
-    """Return how many calls the bounds take to settle, and the largest from then on, see `settle`.
-
-    They begin from boxes of half widths `box`, around estimates that are as near as the limits say;
-    infinite where a box has no bound.
-    """
+    """Return how many calls bounds from boxes take to settle, and the largest then."""
     if not np.isfinite(box).all():
         return 0, np.full(box.shape, np.inf)
     bound, n = running_bound(design), len(design.A)
@@ -88,15 +81,8 @@ def settling(
 def equations(design: UioDesign) -> ca.Function:
     """(z, fhat, u, y) -> (xhat, innovation, next_state, z_next, fhat_next), y less W2 w_centre.
 
-    Equations (10)-(12) with N = T A - K C and L = K - N E are, with the
-    innovation nu_k = y_k - C xhat_k, the same as
-
-        z_{k+1}    = T f(xhat_k, u_k, fhat_k) + K nu_k ,
-        xhat_k     = z_k - E y_k ,
-        fhat_{k+1} = fhat_k + F nu_k ,
-
-    where f is the plant's own right-hand side without unknown input. This form
-    needs neither the split nor N, G, L, so nothing is lost by rounding them.
+    Equations (10)-(12) by the innovation and the plant's own rows without d: nothing is lost by
+    rounding the split, N, G or L (the method's page, Observer).
     """
     model, C = design.plant, ca.DM(design.C)
     sizes = {"z": len(model.x), "fhat": len(model.f), "u": len(model.u), "y": C.shape[0]}
@@ -130,11 +116,7 @@ def equations(design: UioDesign) -> ca.Function:
 
 
 def memory_sizes(design: UioDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
-
-    ``z`` (10), ``fhat`` (12), ``bound`` (the s of `Running`) and ``prediction`` (of the state,
-    which stands for a reading that is missing).
-    """
+    """Return the parts of the memory: z (10), fhat (12), s of `Running`, the predicted state."""
     n, n_f = len(design.A), len(design.rate)
     return {"z": n, "fhat": n_f, "bound": n + n_f, "prediction": n}
 
@@ -160,10 +142,7 @@ def shift(design: UioDesign, x: Ends) -> tuple[ca.SX, ca.SX]:
 
 
 def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
-    """Return an s that holds for a state and a fault in boxes, around given z and fhat.
-
-    It is the delta of (48), of which ``reach' |P| reach`` is an upper bound.
-    """
+    """Return an s, delta of (48), for a state and a fault in boxes, around given z and fhat."""
     middle, radius = shift(design, x)
     z, fhat, bound = kept["z"], kept["fhat"], design.bound
     up = above(design.precision, 4 * len(bound.P[0]))
@@ -181,8 +160,7 @@ def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
 def build_core(design: UioDesign) -> Core:
     """Build what the observer knows of its own: `equations`, with half widths around them.
 
-    The next half widths hold while the estimates lie where Jacobians and rounding were bounded. A
-    missing reading moves the estimates like its prediction, and the half widths begin anew.
+    A missing reading moves the estimates like its prediction, and the half widths begin anew.
     """
     bound, move = running_bound(design), equations(design)
     n, C, W2 = len(design.A), ca.DM(design.C), design.W2

@@ -32,12 +32,7 @@ SEARCH_RTOL = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidSolution:
-    """A solution of the design or analysis LMI.
-
-    gain (p, m)
-    P (p, p)
-    weights (n_v,): diagonal of Q_v for v scaled by its boxes
-    """
+    """A solution of the design or analysis LMI: gain (p, m), P (p, p), weights (n_v,)."""
 
     gain: FloatArray
     P: FloatArray
@@ -73,10 +68,7 @@ def _noise(weights: FloatArray | None, n_v: int, problem: Problem) -> Any:
 def set_objective(
     problem: Problem, P: Any, objective: Objective, weights: FloatArray, scale: FloatArray
 ) -> None:
-    """Set one of the size criteria of section 5 (and the two that serve it better).
-
-    Shapes: weights, scale (p,).
-    """
+    """Set a size criterion of section 5, or one of two that serve it better; scale (p,)."""
     back = np.diag(1.0 / scale)
     if objective == "trace_inverse":
         chosen = weights > 0
@@ -98,10 +90,7 @@ def design_problem(
     scale: FloatArray | None = None,
     gain: FloatArray | None = None,
 ) -> Problem:
-    """State the design LMI (or, with `gain`, the analysis LMI) at a fixed gamma.
-
-    Shapes: noise (n_v,) or None, weights (p,), scale (p,), gain (p, m).
-    """
+    """State the design LMI (or, with a gain, the analysis LMI) at a gamma; weights, scale (p,)."""
     p, m, n_v = system.sizes
     scale = np.ones(p) if scale is None else scale
     scaled = _scaled(system, scale)
@@ -185,10 +174,7 @@ def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:
 
 
 def largest_gamma(system: ErrorSystem, gain: FloatArray | None = None) -> float:
-    """Return the largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``.
-
-    Bounds of the noise do not enter: they only scale P.
-    """
+    """Return the largest gamma for which some P and gain satisfy ``X'P X < (1 - gamma) P``."""
     return largest_feasible(lambda gamma: decay_problem(system, gamma, gain))
 
 

@@ -1,14 +1,10 @@
 """Contraction of a box by what is known of nodes of a program: forward, then backward (HC4-revise).
 
 Every operation is enclosed over the box (`lifted`), met with what is known of it, and solved for
-each of its operands in reverse order, so that the box is cut to what can have led there. No point
-of the box whose nodes lie in what is told is lost, in floating point: every cut is rounded
-outwards, and an end that is not a number or infinite cuts nothing, as ``fmax`` and ``fmin`` of C99
-leave it out. Where an operation has no unique inverse its operands are left alone: beyond the
-branch of a circular function, where product and factor may both be zero, while a choice is open.
-
-An operation that may be undefined in the box is inverted only if a told node needs its value; below
-a choice it may be the branch that is not taken. Ends of `FAR` say nothing of an operand.
+each of its operands in reverse order. No point of the box whose nodes lie in what is told is lost,
+in floating point: cuts are rounded outwards, and an end that is not a number, infinite or `FAR`
+cuts nothing. Where an operation has no unique inverse its operands are left alone, and one that may
+be undefined is inverted only if a told node needs its value: below a choice it may not be taken.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,11 +33,7 @@ _OPEN = {"select": (1, 2), "if_else_zero": (1,), "meet": (0, 1)}
 def contract(
     program: Program, told: Mapping[int, Lifted], variables: Sequence[Lifted], rounding: Rounding
 ) -> tuple[list[Lifted], ca.SX]:
-    """Return the variables cut to what nodes are told to be, and 1 where something told is empty.
-
-    told: intervals in which nodes (``program.outputs[k]``) are known to lie; their numbers `low`
-        and `high` hold, whatever the ends are
-    """
+    """Return the variables cut by intervals of nodes, and 1 where something told is empty."""
     nodes = needed(program, list(told))
     found = dict(zip(nodes, lift(program, nodes, variables, rounding), strict=True))
     found |= {index: _meet(found[index], known, rounding) for index, known in told.items()}

@@ -18,10 +18,7 @@ _NUMBER = 2.0**120
 def cut_box(
     box: FloatArray, cells: int, along: Sequence[int] | None = None, most: int = 16
 ) -> Interval:
-    """Cut sides of a box, (n, 2), alike, into about so many cells in all: their ends, (n, N).
-
-    along: which sides, all by default; most: pieces of a side
-    """
+    """Cut sides of a box, (n, 2), into about so many cells in all: ends (n, N), `most` per side."""
     sides = [*range(len(box))] if along is None else [*along]
     pieces = max(1, min(most, int(cells ** (1.0 / max(len(sides), 1)))))
     edges = np.linspace(box[sides, 0], box[sides, 1], pieces + 1)

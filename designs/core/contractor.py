@@ -1,20 +1,8 @@
 """What the data say whatever the method: strips, image, inversion for faults, rates and ranges.
 
-With X', F' the sets of the instant before and u' its input, for a discrete plant x+ = Phi(x, u, f,
-d, w) with y = C x + W2 w:
-
-- strips: ``x_j`` lies in ``(y_i - W2_i W - sum_{l != j} C_il X_l) / C_ij``;
-- image: ``x_i`` lies in ``Phi_i(X', u', F', W)``, taken at the corners that the proved signs of
-  the derivatives name; variables of open sign stay intervals, cut with the mean value form;
-- inversion: ``f'_j`` lies in ``(X_i - Phi_i(X', u', F' with f_j = 0, W)) / J_ij`` (mean value in
-  f_j alone) where zero is not in the range of J_ij over the sets;
-- rates: ``f_j`` lies in ``F'_j +- r_j``, and everything in its declared range.
-
-- sweeps: every operation of the equations inverted, over two instants (see `sweeps`).
-
-Each keeps every point that the plant's equations and ranges allow. A row with an unbounded unknown
-input or disturbance has no image and no inversion. A plant in continuous time has strips, ranges
-and rates alone. States are held to a range only if some derivative depends on them.
+Each cut keeps every point that the plant's equations and ranges allow; docs/step.md says what each
+is. A row with an unbounded unknown input or disturbance has no image and no inversion; in
+continuous time there are strips, ranges and rates alone.
 """
 
 from collections.abc import Sequence
@@ -54,13 +42,7 @@ class Strip:
 
 @dataclass(frozen=True, eq=False)
 class Contractor:
-    """The cuts that a plant allows.
-
-    plant: in the time of the method
-    Ts: from one call to the next
-    cuts: parts that are used
-    precision: of the step
-    """
+    """The cuts that a plant in the time of the method allows; Ts: from one call to the next."""
 
     plant: Plant
     Ts: float

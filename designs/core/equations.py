@@ -23,10 +23,9 @@ MOST_NODES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """What is known of an instant: sets of states and faults, inputs and scheduling, and the rest.
+    """What is known of an instant: sets of states and faults, inputs and scheduling.
 
-    rest: sets of unknown inputs, disturbances, parameters and scheduling that is not measured; by
-        default their ranges
+    rest: sets of what else is unknown, see `Equations`; by default their ranges
     """
 
     states: Ends
@@ -312,8 +311,7 @@ def symbols(plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, FloatArray]:
 def curved_states(plant: Plant, noise: bool = False) -> BoolArray:
     """Return on which states a derivative by a state or a fault depends, (n,).
 
-    What multiplies a disturbance or a parameter does so whatever the size of the state.
-    noise: whether derivatives by these count too
+    noise: whether derivatives by disturbances and parameters count too
     """
     v, _, rows, outputs, _ = symbols(plant)
     n, n_f = len(plant.x), len(plant.f)

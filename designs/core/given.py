@@ -20,10 +20,7 @@ from obsynth.symbolic.taking import labelled
 
 @dataclass(frozen=True)
 class Number:
-    """What a number among the options has to satisfy, every entry of a sequence alike.
-
-    because: how a refusal goes on after "gamma is 1.5; "
-    """
+    """What every number of an option has to satisfy; because: how "gamma is 1.5; " goes on."""
 
     above: float = -np.inf
     below: float = np.inf
@@ -47,9 +44,7 @@ MATRIX = "matrix"
 def check_options(method: Any) -> None:
     """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
 
-    Literals, bool, int, float, tuples of floats or of pairs and their unions with None are
-    checked, numbers also by a `Number` in ``Annotated``, one number or a tuple of them too, and
-    what is a `MATRIX`; whatever else a method takes it checks by itself.
+    What `read_option` does not know a method checks by itself.
     """
     hints = get_type_hints(type(method), include_extras=True)
     for option in fields(method):
@@ -171,7 +166,6 @@ class PlantClass:
     """What a plant has to be for a method; each refusal is a clause after the symbols' names.
 
     who: the method as a refusal calls it, "the bounded-error observer"
-    time: in which the method works
     discretised: whether a discretisation stands for the continuous plant that it was made from
     forbids: kind of signal -> why the method has none of it and what to do instead
     finite: kind of signal -> why each of it needs a finite range and how to declare it
@@ -249,11 +243,7 @@ class PlantClass:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What `Observer.memory0` is given, checked.
-
-    guess (n,)
-    x_range, f_range (n, 2), (n_f, 2), y0 (m,): where they are given; a reading may be missing
-    """
+    """What `Observer.memory0` is given, checked: None where it is not."""
 
     plant: Plant
     guess: FloatArray

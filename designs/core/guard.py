@@ -1,23 +1,9 @@
 """The step of every method: ``guard(core cut with contractor)``.
 
-A method gives a `Core`: how its memory moves, and how it begins anew from a box of states and
-faults. Everything else that a step does is here, once: which readings are used, what is void, where
-sets start again, how long anything is remembered, and the status word.
-
-**Guarantee.** If the equations, ranges and rates held at all instants after the last void one (or
-the first), up to k, and between them, the returned set holds x_k and f_k. By induction from the
-declared ranges: every cut keeps each point that the assumptions allow, and a core is begun from
-a set that holds the truth.
-
-**Void.** A set that is empty, or a reading that the declared ranges exclude, shows that an
-assumption failed since the last void instant. The declared ranges are returned, and no reading or
-input up to k enters the sets that follow.
-
-**Finite memory.** Two copies of sets and bounds are carried: the older is given up at the age of
-2 N calls, the younger takes its place at the age N and a new one begins from the declared ranges.
-Whatever happened up to an instant v, noticed or not, the returned sets are right after v + 2 N if
-the assumptions hold after v. Until then a violation that contradicts nothing may go unnoticed.
-
+A method gives a `Core`. Everything else that a step does is here, once: which readings are used,
+what is void, where sets start again, how long anything is remembered, and the status word. What
+that guarantees is Theorems 1 and 2 of docs/step.md: two copies of sets and bounds are carried, of
+which the older is given up at the age of 2 N calls and the younger takes its place at the age N.
 Estimates need no second copy: a core is begun around whatever its estimate is.
 """
 
@@ -55,13 +41,9 @@ YOUNG = "_2"
 
 @dataclass(frozen=True)
 class Watch:
-    """Options of the guard, the same for every method.
+    """Options of the guard, the same for every method, see `Method`.
 
-    horizon: N, calls after which a copy of sets and bounds takes over from an older one; None:
-        as many as the core's bounds take to settle
-    recovery: N_rec, calls for which the status says that the sets are recovering
-    cuts: parts of the contractor that are used
-    precision: of the step
+    horizon: None: as many calls as the core's bounds take to settle
     """
 
     horizon: int | None
@@ -97,12 +79,9 @@ class Watch:
 class Guard:
     """What watches over the core of a design: its memory, its horizon, what is returned in the end.
 
-    plant: in the time of the method
-    sizes: parts of the core's memory
+    sizes, shared, settle: parts of the core's memory and more, see `Contract`
     delay: of the fault interval, 0 or 1
     Ts: from one call to the next
-    shared: parts of the memory that estimates are made of, which both copies have in common
-    settle: of the method, see `Contract`
     """
 
     plant: Plant
@@ -146,10 +125,7 @@ class Guard:
     def first(
         self, parts: Mapping[str, ArrayLike], x: FloatArray, f: FloatArray
     ) -> dict[str, ArrayLike]:
-        """Return the first memory: the core's own first parts, and boxes of the first instant.
-
-        A discrete core begins at the first call from the boxes, cut with the first readings.
-        """
+        """Return the first memory: a discrete core begins at the first call, from boxes."""
         boxes = {"x": x, "f": f} if self.discrete else {"f": self.plant.box("f")}
         if self.sweeps is not None:
             boxes["rest"] = self.sweeps.declared[self.sweeps.carried]
@@ -183,8 +159,7 @@ class Guard:
     def settled(self) -> tuple[int, FloatArray | None, int]:
         """N, the half widths of a core that has settled, and the calls that the contractor has.
 
-        The older copy began N calls ago. Its core takes some of them to settle from where it
-        began, and what the contractor makes of the core's sets comes some calls after them.
+        The older copy began N calls ago; its core takes some of them to settle.
         """
         horizon = self.watch.horizon
         late = _LATE if horizon is None else min(_LATE, horizon - 1)
@@ -208,10 +183,7 @@ class Guard:
         return self.settled[0]
 
     def widths(self, core: FloatArray | None, nominal: bool = False) -> FloatArray | None:
-        """Return steady half widths of the returned sets from the core's; None without any.
-
-        nominal: predicted for a plant near its nominal point, not guaranteed
-        """
+        """Return steady half widths of the returned sets; nominal: predicted, not guaranteed."""
         _, own, passes = self.settled
         own = core if own is None else own
         own = np.full(len(self.plant.x) + len(self.plant.f), np.inf) if own is None else own
@@ -220,10 +192,7 @@ class Guard:
 
 
 def monitored(guarantee: Guarantee, guard: Guard, mean: bool) -> Guarantee:
-    """Add what the guard makes of a method's guarantee, and where it ends.
-
-    mean: whether fault intervals hold means, as the method's own claims say
-    """
+    """Add what the guard makes of a guarantee, and where it ends; mean: of means of faults."""
     plant, N = guard.plant, guard.horizon
     faults = "what is claimed of the faults" if mean else "the faults"
     single = guard.precision == "single"

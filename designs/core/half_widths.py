@@ -1,9 +1,7 @@
 """How wide the sets of a step are, at most: the contractor followed call by call, in half widths.
 
-One call maps the half widths of the states and of the faults that a copy carries, in the order of
-the step: the image ``sum_j max|J_ij| h_j``, strips, the core, the inversion, rates. The map is
-monotone. From an envelope that it maps into itself it falls with every call, so what p calls make
-of the envelope holds for every copy that began p calls ago or earlier.
+The map of one call, in the order of the step, is monotone: from an envelope that it maps into
+itself it falls with every call, so what p calls make of it holds for every copy that is as old.
 """
 
 from dataclasses import dataclass
@@ -30,7 +28,6 @@ _STEPS = 8.0
 class HalfWidths:
     """Half widths of the cut sets, states then faults, shape (n + n_f,), with all readings.
 
-    contractor: the cuts
     delay: of the fault interval, 0 or 1
     nominal: with the derivatives of the nominal point: what is to be expected near it, no promise
     """
@@ -79,10 +76,7 @@ class HalfWidths:
 
     @cached_property
     def envelope(self) -> FloatArray:
-        """What holds at every call of a copy that begins from the declared ranges.
-
-        Where a call would add to it, as in states that enter linearly, it has no bound.
-        """
+        """What holds at every call of a copy, infinite where a call would add to the ranges."""
         held = self.declared.copy()
         nothing = np.full(held.size, np.inf)
         while True:
@@ -95,8 +89,7 @@ class HalfWidths:
     def begun(self) -> FloatArray:
         """What a core begins from: what one instant says.
 
-        A fault without a declared range is known by the inversion one call late, to a core that
-        begins from what the call before left.
+        A fault without a declared range is known by the inversion one call late.
         """
         n = len(self.contractor.domain)
         waits = not np.isfinite(self.declared[n:]).all()
@@ -108,10 +101,7 @@ class HalfWidths:
         return found
 
     def steady(self, core: FloatArray, passes: int = MOST_PASSES) -> tuple[FloatArray, int]:
-        """Return half widths for a core of given ones, and by how many calls they lag behind it.
-
-        passes: of the lag; the copy that they speak of has had one call more
-        """
+        """Return half widths for a core of given ones, and by how many calls they lag behind it."""
         plant, held, taken = self.contractor.plant, self.envelope, 0
         while True:
             after, shown = self._call(held, core)

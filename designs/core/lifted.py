@@ -1,10 +1,9 @@
 """Interval arithmetic lifted into CasADi: ends are SX, every rounded operation steps outwards.
 
-A program of interval operations (`obsynth.derive.intervals`) is evaluated with symbols for ends, so
-that what comes out is code that encloses the range of the program for any ends it is given. Beside
-its symbols every interval carries the numbers between which they can lie, evaluated by the rules
-of the derivations; where these know a sign the formula is the short one, and an operation that
-has no lifted form is enclosed by these numbers alone.
+What comes out is code that encloses the range of a program for any ends. Beside its symbols every
+interval carries the numbers between which they can lie, by the rules of the derivations; where
+these know a sign the formula is the short one, and an operation that has no lifted form is enclosed
+by them alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence

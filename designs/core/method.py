@@ -49,10 +49,7 @@ VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What an observer shows of itself: gains by the paper's letters, performance, half widths.
-
-    searched: entries of the performance that a search found; no claim proves them
-    """
+    """What an observer shows of itself; searched: entries that no claim proves."""
 
     gains: Mapping[str, FloatArray]
     performance: Mapping[str, Any]
@@ -69,20 +66,16 @@ class Contract(Generic[D]):
     read_again: what was read of the plant, derived anew from the stored equations
     claims: proofs of what the guarantee rests on, from the stored numbers
     covers: proofs that the stored numbers speak of the stored plant, from what was read of it
-    guarantee: what is promised, and under which assumptions
-    numbers: gains, performance and half widths for people to read
     memory_sizes: parts of the core's memory
     first_memory: parts of it for a first set; further keywords are those of the method. In discrete
         time the shared ones are enough, since a core begins from the first sets
-    build_core: what the method knows from call to call, see `guard`
     shared: parts of the memory that estimates are made of, or a function of the design
     build_ode: right-hand side for the core's memory, of methods in continuous time
     fault_delay, step_covered: see `Observer`; the former may be a function of the design
     settling: of a design, half widths of the sets that its core begins from, and a number of calls
         or None: how many calls its bounds take to settle, or that number, and its half widths from
         then on, all infinite where they cannot begin from such sets; None without any bounds
-    quiet: whether a first set is for no fault at the start where `memory0` is not told of any;
-        without, the declared ranges hold
+    quiet: whether a first set is for no fault where `memory0` is not told of any, not the ranges
     """
 
     name: str

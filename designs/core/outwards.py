@@ -1,10 +1,7 @@
-"""Intervals of code, and how their rounded ends step outwards in a precision.
+"""Intervals of code, and how their rounded ends step outwards in a precision (docs/step.md).
 
-One rounded operation is exact up to half a unit in the last place, so ``l - 2 u |l|``, u the unit
-roundoff, is below the exact result: l minus one unit is a number of the format and not above it.
-Products and quotients may underflow as well, which `tiny` covers. What the mathematics library
-returns is stepped by `ULPS` units. There are no infinities: among numbers `FAR` stands for them, in
-code `Rounding.far` for signals and `Rounding.largest` for nodes.
+There are no infinities: among numbers `FAR` stands for them, in code `Rounding.far` for signals and
+`Rounding.largest` for nodes.
 """
 
 from dataclasses import dataclass, replace

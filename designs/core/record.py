@@ -1,8 +1,7 @@
 """Stored designs: dataclasses whose annotations say the shapes, written and read by one reader.
 
-An array says its shape in its annotation, ``K: Annotated[FloatArray, "n m"]``. The letters stand
-for the numbers of the plant's signals (`sizes_of`); sums like ``n+n_f-1`` are allowed, and any
-other letter stands for the length that it meets first. The plant comes before them.
+In ``K: Annotated[FloatArray, "n m"]`` letters stand for numbers of the plant's signals, see
+`sizes_of`, or for the length that they meet first; sums like ``n+n_f-1`` are allowed.
 """
 
 import re

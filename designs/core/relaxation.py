@@ -1,16 +1,9 @@
 """Affine enclosures of the nodes of a program over a box, in code.
 
-A node is ``sum_j slopes[j] v_j + centre + err`` with ``|err| <= error`` for all v in the box. Sums
-are exact, a product is ``ac b + bc a - ac bc +- ra rb`` with middles and radii of its factors, a
-function g of one variable on [l, h] its chord of slope m, between
-
-    g(l) - m l - max(g'', 0) (h - l)^2 / 8    and    g(l) - m l + max(-g'', 0) (h - l)^2 / 8,
-
-g'' enclosed over [l, h]; square and root have their exact remainders, the absolute value the secant
-through its ends, and minimum, maximum and a choice that is open weigh their operands. Whatever has
-no such form, and a chord that is worse, is its interval: slope zero. Slopes are the numbers of the
-code: what they, the centre and the error itself lose by rounding is in the error, every slope's
-part times the size of its variable.
+A node is ``sum_j slopes[j] v_j + centre + err`` with ``|err| <= error`` for all v in the box, by
+the rules of docs/methods/set_membership_observer.md, Step, 2. Whatever has no such form, and a
+chord that is worse, is its interval: slope zero. Slopes are the numbers of the code: what they, the
+centre and the error itself lose by rounding is in the error.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -27,10 +27,7 @@ MOST_CALLS = 100_000
 
 
 def above(precision: str, terms: int) -> float:
-    """Return a factor above what rounding takes of a formula of nonnegative terms in code.
-
-    terms: how often one of its numbers is rounded, constants and sums among them
-    """
+    """Return a factor above what rounding numbers of nonnegative terms that often takes in code."""
     return max(UP, 1.0 + (terms + 8) * Rounding(precision).step)
 
 
@@ -51,7 +48,6 @@ class Running:
     """One recursion of s (k,): decay (k, k), offset (k,), reach (N, k), add (N,).
 
     root: the half widths are ``sqrt(reach s) + add``, for ellipsoids, where s bounds V
-    precision: of the code, whose numbers are above these by `more`
     """
 
     decay: FloatArray
@@ -63,10 +59,7 @@ class Running:
 
     @property
     def more(self) -> float:
-        """A factor above what rounding takes of a formula of these in code; 1 in doubles.
-
-        There the numbers have it already.
-        """
+        """A factor above what rounding takes of these in code; 1 in doubles: they have it."""
         return 1.0 if self.precision == "double" else above(self.precision, len(self.decay))
 
     @property

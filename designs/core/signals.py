@@ -54,8 +54,7 @@ def _pushes(plant: Plant, kind: str) -> FloatArray:
 def held_in_single(plant: Plant) -> Plant:
     """Return a plant whose ranges single precision holds, or refuse it by name.
 
-    Ends of inputs and scheduling that are measured, which a step compares with, become numbers of
-    single precision outside of them.
+    Ends of what is measured, which a step compares with, become numbers of it outside of them.
     """
     limit = LIMITS["single"].huge
     ends: dict[str, tuple[float, float]] = {}

@@ -85,11 +85,9 @@ class Step:
         return Ends.unbounded(n, self.precision)
 
     def _signals(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Make inputs and scheduling finite, and tell whether they are covered.
+        """Make inputs and scheduling finite, and tell whether they are covered: in their ranges.
 
-        Covered are measured scheduling variables inside of their ranges, and inputs inside of
-        theirs where they do not enter with constant factors: elsewhere their size does not matter
-        to what was derived.
+        Inputs that enter with constant factors need no range: their size does not matter.
         """
         plant = self.plant
         measured = [s for s in plant.rho if s.measured]

@@ -38,11 +38,7 @@ def fill(layout: Mapping[str, slice], parts: Mapping[str, ArrayLike]) -> FloatAr
 
 
 def largest_level(P: FloatArray, lower: FloatArray, upper: FloatArray) -> float:
-    """Return an upper bound of ``xi'P xi`` over a box: the delta of eq. (48).
-
-    Exact up to rounding at the corners for up to 14 components, by the sum of
-    ``|P_ij| r_i r_j`` beyond.
-    """
+    """Bound ``xi'P xi`` over a box, delta of (48): exact up to rounding for up to 14 components."""
     reach = np.maximum(np.abs(lower), np.abs(upper))
     rounding = 2.0**-40 * float(reach @ np.abs(P) @ reach)
     if len(P) > MOST_CORNERS:
@@ -113,8 +109,7 @@ def extended(
 ) -> ca.Function:
     """Return a right-hand side for the guarded memory from one for the core's own.
 
-    Both copies of a part move alike, since they began alike; what is the guard's stands still, as
-    does a memory that was not initialised.
+    What is the guard's stands still, as does a memory that was not initialised.
     """
     names = ode.name_in()
     ports = [ca.SX.sym(name, ode.numel_in(i)) for i, name in enumerate(names)]

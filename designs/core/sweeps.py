@@ -1,10 +1,6 @@
 """Contraction over the equations in both directions, of two instants at a time.
 
-With v = (x, f, rest) of the instant before and v' of this one, where rest are unknown inputs,
-disturbances, parameters and scheduling that is not measured: v' is cut with y = h(v'), v with
-x' = F(v), each operation of the equations inverted in turn (`backward`), and what is found of one
-instant is handed to the other. Unknown inputs without a range get one where a row shows them. What
-enters both h and F is remembered from one call to the next, as are parameters that stand still.
+With v = (x, f, rest) of the instant before and v' of this one: docs/step.md, The contractor, 6.
 """
 
 from collections.abc import Sequence
@@ -23,12 +19,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Boxes of two instants.
-
-    before: states, faults and rest of the instant before
-    now: the same of this one
-    empty: 1 where the readings contradict them
-    """
+    """Boxes of the instant before and of this one; empty: 1 where the readings contradict them."""
 
     before: Before
     now: Before
@@ -36,10 +27,7 @@ class Pair:
 
 
 class Sweeps:
-    """What the equations say in both directions.
-
-    contractor: rows, ranges and rates
-    """
+    """What the equations say in both directions, by rows, ranges and rates of a contractor."""
 
     def __init__(self, contractor: Contractor) -> None:
         self.contractor = contractor
@@ -83,10 +71,7 @@ class Sweeps:
     def run(
         self, before: Before, now: Before, have: ca.SX, y: ca.SX, used: Sequence[ca.SX]
     ) -> Pair:
-        """Cut the boxes of two instants with the equations and the readings.
-
-        have: 1 where there was an instant before
-        """
+        """Cut the boxes of two instants with equations and readings; have: 1 if there were two."""
         now = replace(now, rest=self._still(before, now))
         empty = ca.SX(0)
         for _ in range(SWEEPS):

@@ -166,11 +166,7 @@ def compare(
     status: NDArray[np.int64],
     persistence: Sequence[int],
 ) -> Detection:
-    """Compare alarms with the true faults.
-
-    Shapes: alarm (N + 1, n_f) bool, truth (N + 1, n_f), t (N + 1,), width (N + 1, n_f), valid (N +
-    1,), status (N + 1,).
-    """
+    """Compare alarms (N + 1, n_f) with the true faults, instants t (N + 1,), of a run."""
     void = (status & VOID) != 0
     # An alarm that stands when a void instant sets the counters to zero, from its beginning.
     ended = np.zeros_like(alarm)

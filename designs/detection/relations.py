@@ -1,12 +1,7 @@
-"""Relations between states and faults of which sums over time are narrow.
+"""Relations between states and faults of which sums over time are narrow (docs/step.md, Means).
 
-For weights c of the rows of ``x+ = F(x, u, f, ...)`` and a fault with slope g in ``c'F``, let
-
-    P = c'x / g,    D = (c'F - c'x) / g - f,    so that    P_{j+1} - P_j = f_j + D_j
-
-and in a sum over j all P but two cancel. D is simplified as text before it is enclosed: what x, f
-and ``c'F`` have in common is gone and widens nothing. Weights are rows alone, and pairs of rows in
-which a term that both have (a noise, an unknown input, another fault, a flow) cancels.
+D is simplified as text before it is enclosed: what x, f and ``c'F`` have in common is gone and
+widens nothing. Weights c are rows alone, and pairs of rows in which a term that both have cancels.
 """
 
 from itertools import combinations
@@ -33,9 +28,7 @@ def relations(
 ) -> tuple[list[int], Equations | None]:
     """Return the faults of the relations that should be narrowest over m instants, and their rows.
 
-    half_widths: of states and faults that are to be expected, (n + n_f,); ranges by default
-
-    Rows are D of every relation, then P of every relation.
+    half_widths (n + n_f,): to be expected, ranges by default; rows: D of all relations, then P
     """
     n, n_f, hidden = len(plant.x), len(plant.f), [s for s in plant.rho if not s.measured]
     unknown = (*plant.x, *plant.f, *plant.d, *plant.w, *plant.p, *hidden)

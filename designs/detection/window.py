@@ -1,17 +1,9 @@
 """The mean of every fault over the last m instants, for any course of the fault.
 
-At call k, with X_j the returned sets of the states, F_j those of the faults, and P and D of a
-relation (`relations`), the mean of f over j = k-m..k-1 lies in
-
-    (P(X_k) - P(X_{k-m}) - sum_j D(X_j, u_j, F_j, W)) / m,
-
-met over the relations, with the mean of the F_j and with the declared range. Every operation is
-rounded outwards, and sums are formed anew at every call from what is remembered of m-1 instants.
-
-The mean is valid (bit 16 of its status not set) once m transitions in a row may be used: those
-between two calls that are initialised and not void, the first with an input that is finite and in
-its range where that matters. Its other bits are those of the m+1 calls together. A mean that is
-empty contradicts the assumptions: it is void, and the window begins anew.
+The mean lies in (P(X_k) - P(X_{k-m}) - sum_j D(X_j, u_j, F_j, W)) / m for every relation, and in
+the mean of the F_j: docs/step.md, Means of faults over a window. Every operation is rounded
+outwards, and sums are formed anew at every call from what is remembered of m-1 instants. A mean
+that is empty contradicts the assumptions: it is void, and the window begins anew.
 """
 
 from functools import cached_property, reduce
@@ -34,10 +26,7 @@ _CHUNK = 512
 
 
 class Window:
-    """The recursion of the means over m instants, behind the step of an observer.
-
-    Where the observer is of a differential equation, rows are no truth and the F_j alone are used.
-    """
+    """The recursion of the means behind an observer's step; of the F_j alone with an ode."""
 
     def __init__(self, observer: Any, m: int) -> None:
         self.m, self.plant, self.delay = m, observer.model, observer.fault_delay
@@ -132,7 +121,7 @@ class Window:
         return Ends(ca.vertcat(*(e.lower for e in ends)), ca.vertcat(*(e.upper for e in ends)))
 
     def over(self, *columns: Any) -> list[FloatArray]:
-        """Return the means of a run: mean_lower, mean_upper (N + 1, n_f), mean_status (N + 1,).
+        """Return mean_lower, mean_upper (N + 1, n_f), mean_status (N + 1,) of a run.
 
         columns: u, theta (or nothing), x_lower, x_upper, f_lower, f_upper, status, (N + 1, ...)
         """

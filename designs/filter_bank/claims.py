@@ -70,11 +70,7 @@ def covers(design: BankDesign, fresh: BankModel) -> Iterator[Claim]:
 
 
 def numbers(design: BankDesign) -> Numbers:
-    """Return the rates of the filters, the slowest as decay, and steady half widths.
-
-    ``mean_half_widths`` are those of the faults' intervals by filters, (n_f, n_l); any of them may
-    be returned.
-    """
+    """Return rates, steady half widths, and those of the faults by filters, `mean_half_widths`."""
     performance: dict[str, Any] = {"decay": float(design.filters.min())}
     found, half = steady_half_widths(design), None
     if found is not None:
@@ -122,15 +118,13 @@ def steady_half_widths(design: BankDesign) -> tuple[FloatArray, FloatArray] | No
     """Return bounds of the half widths of states, (n,), and of faults by filters, (n_f, n_l).
 
     Of sets that are N calls old or more, N the horizon. None where a slope has no bound over the
-    region, as at a flow sqrt(z) through zero, or where the unmeasured states may drive each other
-    apart.
+    region, as at a flow sqrt(z) through zero, or the unmeasured states may drive each other apart.
 
     With slopes |df_i/dx_j| <= s_ij, own slopes of the unmeasured states <= -d_i and speeds at most
     R_i, the envelope of a step is wider than the sets by 2 Ts R_i. The widths w of the unmeasured
     states are at most S^-1 of what the other widths feed in, S = diag(d) - s, plus (I - Ts S)^k
-    times what they exceed it by k calls before; that is no more than a multiple of S^-1 1, which
-    falls with k. The interval of a fault has the width (w_y + v) / N, with v the width of a filter,
-    v' = s e + l (e_y - v), and e the widths of the envelopes.
+    times what they exceed it by k calls before, at most a multiple of S^-1 1, which falls with k. A
+    fault's interval has the width (w_y + v) / N, v' = s e + l (e_y - v), e those of envelopes.
     """
     found = _slopes(design)
     if found is None:

@@ -37,7 +37,6 @@ class Signs(Record):
 class BankModel(Record):
     """What the bank rests on, all derived from the plant and a region.
 
-    plant: continuous
     region: where the equations are monotone, and where the states are assumed to be
     outputs, scale: which state each output shows, and times what
     noise: range of what is added to scale * state
@@ -71,12 +70,7 @@ class BankModel(Record):
 
 @dataclass(frozen=True, eq=False)
 class BankDesign(BankModel, Design):
-    """Everything that is deployed and proved of the bank.
-
-    Ts: sample time of the step
-    filters: rates, the one of the returned intervals first
-    options: the options of the method, as given
-    """
+    """Everything that is deployed and proved; filters: rates, that of the intervals first."""
 
     Ts: float
     filters: Annotated[FloatArray, "n_l"]

@@ -23,11 +23,9 @@ _EXTRA = 1e-12
 
 
 def memory_sizes(design: BankDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
+    """Return the parts of the memory (the method's page); filters: faults first, then rates.
 
-    ``hidden`` are the two ends of the unmeasured states, ``filter`` those of the filters (faults
-    first, then rates: entry l + j * number of rates), ``response`` their response to a unit
-    fault, ``shown`` what the outputs' states are known to be if the next measurement is missing.
+    ``shown``: what the outputs' states are known to be if the next measurement is missing.
     """
     n_z, m = len(design.hidden), len(design.outputs)
     n_l = len(design.filters) * len(design.gain)
@@ -85,10 +83,7 @@ class Corners:
         own: ca.SX | None = None,
         faults: bool = True,
     ) -> ca.SX:
-        """Return the least (side 0) or largest (1) derivative of a state over a box of states.
-
-        Shapes: low, high (n, 1).
-        """
+        """Return the least (side 0) or largest (1) derivative of a state over a box of states."""
         design = self.design
         arguments = {}
         for kind in UNKNOWN:
@@ -119,14 +114,9 @@ class Corners:
 
 
 def build_core(design: BankDesign) -> Core:
-    """Build the bank.
+    """Build the bank: docs/methods/filter_bank.md, Equations of the step.
 
-    Over a step every state stays in an envelope X with X_0 + [0, Ts] f(X) inside X (checked each
-    time; without that check nothing is known). The unmeasured states then move by their own
-    equation, others at the worst end of the envelope: for a flow that falls with its own state,
-    z + Ts min(F(z), F(z + Ts F(z))) is below the true solution. Every filter gets the balance of
-    its state without fault, from below and from above, and its exact exponential. What the
-    envelope leaves of a measured state stands in for a reading that is missing.
+    What the envelope leaves of a measured state stands in for a reading that is missing.
     """
     outputs = design.outputs.tolist()
     box = outward(design.region, design.precision)
@@ -228,11 +218,7 @@ def _states(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> tuple
 
 
 def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) -> list[Ends]:
-    """Return the intervals of every filter, (n_f,) each: of means with the weights exp(-rate age).
-
-    ((y_low - z_upper) / N, (y_high - z_lower) / N), mirrored where the response N is negative; all
-    numbers while it is zero.
-    """
+    """Return the intervals of every filter, (n_f,) each; all numbers while N is zero."""
     outputs, rates = design.outputs.tolist(), len(design.filters)
     found, far = [], LIMITS[design.precision].far
     for number in range(rates):
@@ -256,9 +242,8 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
 def telling(found: Sequence[Ends]) -> Ends:
     """Return the first filter's intervals, for a fault that another one shows before it that one's.
 
-    Each encloses a mean of the fault since the filters began, with weights of its own. A fault that
-    was zero throughout has means of zero, so zero lies in all of them: one without it is a proof
-    of the fault, whatever the others say. The one farthest from zero is taken.
+    A fault that was zero throughout has means of zero, so one interval without it is a proof of the
+    fault, whatever the others say. The one farthest from zero is taken.
     """
     low, high = ca.SX(found[0].lower), ca.SX(found[0].upper)
     for j in range(low.numel()):
@@ -275,10 +260,7 @@ def telling(found: Sequence[Ends]) -> Ends:
 def _envelope(
     design: BankDesign, corners: Corners, low: ca.SX, high: ca.SX
 ) -> tuple[tuple[ca.SX, ca.SX], ca.SX]:
-    """Return a box that holds all states until the next sample, and whether that is proved.
-
-    Passes X -> X_0 + [0, Ts] f(X), widened; the last one has to lie in what it was made from.
-    """
+    """Return a box of all states until the next sample, and whether it is proved to hold them."""
     n = len(design.plant.x)
     region = ca.DM(outward(design.region, design.precision))
 

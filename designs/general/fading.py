@@ -1,14 +1,9 @@
 """How the first error fades from the peak bounds: a nonnegative recursion, and its proof.
 
-For the Jacobians that occur the error system is linear, so the responses to the disturbances
-(within the peak bounds) and to the first error add up. The latter obeys
-
-    e_q = T e_p,   e_c = M e_p - Z b delta' ...,   e_p+ = L T e_p + b delta ... - B b delta' ... ,
-
-with ``B = A0 Z + K`` and ``L = A0 - B C0``.
-
-Let Y be any regular matrix, eta = Y e_p, and mu_a = |eta_a|_2 over blocks of one or two coordinates
-(two for a complex pair). The triangle inequality in each block gives
+For the Jacobians that occur the error system is linear, so responses to disturbances and to the
+first error add up. The latter has e_q = T e_p, e_c = M e_p - Z b delta' ..., e_p+ = L T e_p +
+b delta ... - B b delta' ..., with B = A0 Z + K and L = A0 - B C0. Let Y be regular, eta = Y e_p,
+and mu_a = |eta_a|_2 over blocks of one or two coordinates (two for a complex pair). Then
 
     mu+ <= G mu,    |e_q| <= R_q mu,  |e_c| <= R_c mu,    mu_0 <= S |e_p| at the start,
     R_q = |T Y^-1|,   R_c = |M Y^-1| + |Z b| r R_q,   S = |Y|,
@@ -224,10 +219,7 @@ def exponential(system: ErrorSystem, decay: float) -> Recursion:
 
 
 def recursion(system: ErrorSystem, modes: Modes, room: float = 1.0) -> Recursion | None:
-    """Return G, R_c and S for a basis, rounded up; None where it is not regular.
-
-    room: by what the radii of the enclosures are multiplied
-    """
+    """Return G, R_c and S for a basis, rounded up, radii times room; None where Y is singular."""
     inverse = enclosed_inverse(modes)
     if inverse is None:
         return None

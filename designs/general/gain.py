@@ -1,12 +1,8 @@
-"""Gains that minimise the mean of the peak bounds themselves.
+"""Gains that minimise the mean of the peak bounds themselves, in units of ranges, bounds and noise.
 
-In units of half the ranges (states, faults), of the bounds (disturbances) and of the noise
-(readings). The starts are Riccati gains for the middle of the family with its channels as further
-noise; from there BFGS with the exact gradient of the sums, which copes with kinks (A. S. Lewis and
-M. L. Overton, Nonsmooth optimization via quasi-Newton methods, Mathematical Programming 141, 2013).
-Where no start has a small-gain matrix below one, the Jacobians' deviations are first made smaller
-by a factor kappa and let grow again along the way. Nothing rests on the search: what it finds is
-proved by `prove_peak`.
+The starts are Riccati gains with the channels as further noise; from there BFGS with the exact
+gradient of the sums, which copes with kinks (A. S. Lewis and M. L. Overton, Nonsmooth optimization
+via quasi-Newton methods, Mathematical Programming 141, 2013). Nothing that is proved rests on it.
 """
 
 from collections.abc import Iterator
@@ -52,9 +48,8 @@ SEARCHES = (
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """The error system in units of the ranges; see `ErrorSystem`.
+    """The error system in units x, v, y of the ranges; see `ErrorSystem`.
 
-    x, v, y: the units
     of_h, of_F: columns of the channels times their radii, in these units
     drives_h, drives_F: by which error a channel is driven, -1 for a disturbance
     free: outputs whose column of Z is free
@@ -135,11 +130,7 @@ class Value:
 
 
 class GainSearch:
-    """Evaluates the mean of the bounds, and its gradient, for gains in units of the ranges.
-
-    weights: of the N errors, in units of the ranges
-    kappa: share of the deviations of the Jacobians
-    """
+    """The mean of the bounds with weights (N,), and its gradient, for a share of the deviations."""
 
     def __init__(self, data: Scaled, weights: FloatArray, kappa: float = 1.0) -> None:
         self.data, self.kappa = data, kappa
@@ -300,10 +291,7 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
 
 
 def find_gain(design: GeneralDesign, weights: FloatArray, seed: int = 0) -> FloatArray:
-    """Return Z (N, m) for narrow peak bounds; weights (N,) of the errors in their own units.
-
-    SolverTrouble where the search ends without a small-gain matrix below one.
-    """
+    """Return Z (N, m) for narrow peak bounds, weights (N,) of the errors, or refuse."""
     data = scaled(design)
     m = design.L0.shape[1]
     if not data.free.size:

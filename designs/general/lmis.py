@@ -100,10 +100,9 @@ def closed_rows(loop: Loop, Z: FloatArray) -> Enclosure:
 def storage_block(
     P: Any, X: Any, keep: Any, noise: Any, tau: Any, z: Any, output: Any = None
 ) -> Any:
-    """Return the block above, in any arithmetic.
+    """Return the block above, in any arithmetic; noise, tau, output C'C None where there are none.
 
-    Shapes: P (N, N), X = P (E - Z Y) (N, K), keep (1, 1), noise (n_w, n_w) and tau (n_q, n_q) or
-    None where there are none, z (n_q, K), output C'C (N, N) or None.
+    Shapes: X = P (E - Z Y) (N, K), keep (1, 1), noise (n_w, n_w), tau (n_q, n_q), z (n_q, K).
     """
     first = P * keep if output is None else P * keep - output
     parts = [part for part in (first, noise, tau) if part is not None]

@@ -75,8 +75,7 @@ class GeneralUIO(Method):
     def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
         """Design, prove and return the observer.
 
-        Faults of which none has a rate are divided out where that can be. Where no gain is found
-        that follows the faults, peak bounds divide them out, or hold them for disturbances.
+        Where no gain follows the faults, or none has a rate, `WAYS` are tried.
         """
         followed = self.faults == "followed" and bool(model.f)
         loose = not any(s.rate is not None or s.constant for s in model.f)
@@ -120,9 +119,8 @@ class GeneralUIO(Method):
     def fix(self, model: GeneralModel, gains: Mapping[str, ArrayLike]) -> GeneralDesign:
         """Bound the errors of given gains.
 
-        ``L`` (n + n_f, m) corrects the state and the faults that are followed by the readings;
-        ``K`` (n, m) and ``F`` (n_f, m), where given, move their next prediction by what is left
-        of the innovation where unknown inputs are taken away.
+        ``L`` (n + n_f, m) corrects states and followed faults; ``K`` (n, m) and ``F`` (n_f, m) move
+        their next prediction by what is left of the innovation.
         """
         blank, n = model.design, len(model.design.plant.x)
         N, m = blank.L0.shape

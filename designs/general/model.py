@@ -23,10 +23,7 @@ CLASS = PlantClass(
 
 @dataclass(frozen=True, eq=False)
 class GeneralModel:
-    """What is read of a plant of the general class.
-
-    design: complete except for gain, rounding and bound, which are zero
-    """
+    """What is read of a plant; its design is complete except for gain, rounding and bound."""
 
     extended: Extended
     bounds: JacobianBounds

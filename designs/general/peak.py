@@ -38,8 +38,7 @@ SLACK = 2.0**-40
 class AbsoluteSums:
     """``sum_k |Q A^k B|`` over a number of steps, with what its derivative needs.
 
-    squares: A, A^2, A^4,
-    left, right: the factors after every doubling
+    squares: A, A^2, A^4, ...; left, right: the factors after every doubling
     responses: every ``Q A^k B``, as (left steps, n_o, right steps, n_i)
     """
 
@@ -102,11 +101,9 @@ def absolute_sums(A: FloatArray, B: FloatArray, Q: FloatArray, wanted: float) ->
 class PowerSum:
     """Powers of an enclosed Schur matrix with bounds of their sum and of their errors.
 
-    powers: X_k, the computed powers; zero is meant beyond the last
-    total: S, at least the sum of all ``|X_k|``
+    powers, total, error: X_k, S and a bound of ``|A^k - X_k|`` as above
     bound: at least ``sum_k |A^k|`` for every A of the enclosure
-    error: at least ``|A^k - X_k|`` for every k >= 0 and every such A
-    contraction: at least the largest row sum of R; below one, which proves that the matrix is Schur
+    contraction: at least the largest row sum of R
     """
 
     powers: FloatArray
@@ -123,12 +120,9 @@ class PowerSum:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Absolute impulse responses ``|Q A^k B|`` of every output to every input.
+    """Absolute impulse responses ``|Q A^k B|`` of every output to every input, total their sum.
 
-    terms: computed ``|Q X_k B|``
-    spread: ``|Q A^k B| <= terms[k] + spread`` for every k >= 0, with zero for the terms beyond the
-        last
-    total: at least ``sum_k |Q A^k B|``
+    terms, spread: ``|Q A^k B| <= terms[k] + spread``, terms zero beyond the last
     """
 
     terms: FloatArray
@@ -202,11 +196,7 @@ def _powers(matrix: FloatArray, most: int) -> FloatArray:
 
 
 def response(powers: PowerSum, outputs: FloatArray | Enclosure, B: Enclosure) -> Response:
-    """Bound the responses of some outputs to some inputs.
-
-    ``|Q A^k B| <= |Q X_k B| + |Q| |A^k - X_k| |B|``; the rounding of the two
-    products and the radii of B and Q are bounded in the same way.
-    """
+    """Bound ``|Q A^k B| <= |Q X_k B| + |Q| |A^k - X_k| |B|``, products and radii included."""
     Q = outputs if isinstance(outputs, Enclosure) else Enclosure.of(outputs)
     size = B.mid.shape[0]
     steps = powers.steps
@@ -287,10 +277,7 @@ def small_gain_solution(G: FloatArray, n: FloatArray) -> FloatArray:
 
 
 def contraction(G: FloatArray, b: FloatArray) -> float:
-    """Return max (G v)_i / v_i for a positive v, over the errors that feed back, rounded up.
-
-    Below one it proves that the spectral radius of G is below one.
-    """
+    """Bound the spectral radius of G by max (G v)_i / v_i over the errors that feed back."""
     coupled = np.flatnonzero(np.any(G, axis=0))
     if coupled.size == 0:
         return 0.0
@@ -306,9 +293,7 @@ class PeakProof:
 
     slack: lower bounds of ``b - n - G b``; none is negative
     small_gain: upper bound of the spectral radius of G, below one
-    remainder: upper bound of the remainder of the sums of powers, below one half, which proves that
-        the error system at the middle is Schur
-    steps: number of powers that were summed
+    remainder, steps: contraction and number of the powers that were summed
     """
 
     slack: FloatArray

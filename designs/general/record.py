@@ -20,12 +20,7 @@ _extended = lru_cache(maxsize=16)(extend)
 
 @dataclass(frozen=True, eq=False)
 class Modes(Record):
-    """Coordinates in which the first error fades.
-
-    basis: V, whose columns belong to blocks of one or two
-    inverse: Y, which takes errors to these coordinates
-    blocks: how many columns each block has
-    """
+    """Basis V in which the first error fades, its inverse Y, and the columns of every block."""
 
     basis: Annotated[FloatArray, "N N"]
     inverse: Annotated[FloatArray, "N N"]
@@ -46,8 +41,7 @@ class Modes(Record):
 class Fading(Record):
     """How the first error fades: at most ``reach G^k start |xi_0|`` is added to the peak bounds.
 
-    decay: lambda, at least the spectral radius of G
-    modes: coordinates of the recursion; without them it is the exponential c lambda^k
+    decay: at least the spectral radius of G; modes: none for an exponential
     """
 
     G: Annotated[FloatArray, "n_b n_b"]
@@ -59,11 +53,7 @@ class Fading(Record):
 
 @dataclass(frozen=True, eq=False)
 class PeakBound(Record):
-    """Guaranteed peak bounds.
-
-    b: of the errors before the last correction, then of those after it, shape (2 N,)
-    fading: what the first error adds to the latter
-    """
+    """Guaranteed peak bounds b of the errors before and after the last correction."""
 
     KIND = "peak"
 
@@ -123,7 +113,6 @@ class Rounding(Record):
 class GeneralDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
-    plant: the discrete plant
     unfollowed, divided: faults that count as disturbances, or are taken away, see `extend`
     v_centre, v_radius: box of the disturbances of the extended plant
     L0: what takes unknown inputs away
@@ -131,7 +120,6 @@ class GeneralDesign(Design):
     K: the gain of the innovation in the next prediction, which peak bounds alone can have
     family: Jacobians of the extended plant's rows and outputs by its states and disturbances
     rounding: allowances of one step
-    options: the options of the method, as given
     """
 
     plant: Plant

@@ -1,9 +1,8 @@
 """What rounding adds in one step, proved for the stored gains, stage by stage.
 
-Each stage of the step as it runs differs from its equation over real numbers, with the plant's own
-constants, by what `rounding_bound` says over the limits of estimates and inputs and all readings
-that an admissible plant shows there. What is left of the unknown inputs by a rounded L0 counts like
-rounding of the first stage. All of it is at most `GeneralDesign.rounding`.
+Each stage as it runs differs from its equation over real numbers by what `rounding_bound` says over
+the limits of estimates and inputs and all readings that an admissible plant shows there; what a
+rounded L0 leaves of the unknown inputs counts too. All is at most `GeneralDesign.rounding`.
 """
 
 import casadi as ca

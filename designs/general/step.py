@@ -36,8 +36,7 @@ from obsynth.symbolic.arrays import FloatArray
 class Limits:
     """Where estimates and inputs are followed: boxes (N, 2), (n_u, 2).
 
-    Inputs that enter in no constant way keep to their ranges. Everything else may leave its range
-    by its width on either side, and where none is declared `LARGEST_SIGNAL` stands for it.
+    Inputs that enter in no constant way keep to their ranges, all else may leave its by its width.
     """
 
     x: FloatArray
@@ -53,8 +52,7 @@ class Limits:
 def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return (xp, u, y) -> xq, (xq, u, y) -> (xc, nu) and (xc, u, nu) -> next xp.
 
-    Rows and outputs are the extended plant's own at v0, inside the box of the states on which a
-    slope depends, and go on outside with the middle of their slopes.
+    Outside the box of the states on which a slope depends they go on with the middle of the slopes.
     """
     plant, N = design.extended.plant, design.size
     m = len(plant.output_names)
@@ -116,10 +114,7 @@ def running(design: GeneralDesign) -> tuple[Running, ...]:
 
 
 def _running(design: GeneralDesign, bound: PeakBound | EllipsoidBound) -> Running:
-    """Return the recursion of a bound; underflow is far below what `add` counts twice.
-
-    In the norm of P, rounding is at most rho, see `shaken`.
-    """
+    """Return the recursion of a bound; underflow is far below what `add` counts twice."""
     if isinstance(bound, PeakBound):
         add, fading = bound.b[design.size :] * ROUND_UP, bound.fading
         still = np.zeros(len(fading.G))
@@ -176,10 +171,9 @@ def steady(design: GeneralDesign) -> FloatArray:
 def settling(
     design: GeneralDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray] | None:
-    """Return how many calls the bounds take to settle, and the largest from then on, see `settle`.
+    """Return how many calls bounds from boxes (n + n_f,) take to settle, and the largest then.
 
-    They begin from boxes of half widths `box` (n + n_f,), around estimates that are as near as the
-    limits say; infinite where a box has no bound. None of an energy gain.
+    Around estimates that are as near as the limits say; None of an energy gain.
     """
     bounds = running(design)
     if not bounds:
@@ -217,10 +211,7 @@ def first_memory(
 
 
 def build_core(design: GeneralDesign) -> Core:
-    """Build what the observer knows of its own.
-
-    A missing reading counts as expected, and the half widths begin anew after it.
-    """
+    """Build what the observer knows of its own; half widths begin anew after a missing reading."""
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
     limits, precision = Limits.of(plant, design.precision), design.precision

@@ -25,10 +25,7 @@ CORNERS, FREQUENCIES, REFINEMENTS = 48, 64, 4
 
 
 def with_ellipsoid(design: GeneralDesign, found: Found) -> GeneralDesign:
-    """Attach an ellipsoid to a design with a gain, backed off until it is proved.
-
-    A smaller P asks less of the disturbances' part of the block.
-    """
+    """Attach an ellipsoid to a design with a gain, P made smaller until it is proved."""
     design = design.changed(Z=found.Z)
     loop = error_loop(error_system(design))
     for loss in LOSSES:

@@ -1,24 +1,12 @@
-"""The error system of the general class, enclosed.
-
-The extended plant is ``x+ = F(x, u, v) + D0 phi, y = h(x, u, v)``, with rows F that know nothing
-of phi (see `extend`); the observer, in current form, with h and F continued affinely outside the
-box by the middle [A0 W0; C0 V0] of their Jacobians,
-
-    xq = xp + L0 (y - h(xp, u, v0)),   nu = y - h(xq, u, v0),
-    xc = xq + Z nu,                    xp+ = F(xc, u, v0) + K nu.
-
-Let e_p = x - xp, less what L0 takes away, and e_q, e_c alike, v less v0, T = I - L0 C. Averages of
-Jacobians along the way from an estimate to the state lie in the convex family, so
+"""The error system of the general class, enclosed: docs/methods/general_class.md, The observer.
 
     e_q  = T e_p - L0 V v ,    e_c  = e_q - Z nu ,
     nu   = C0 e_q + V0 v + sum_j b_j delta'_j [e_q; v]_(c_j) ,
     e_p+ = A0 e_c - K nu + W0 v + sum_j b_j delta_j [e_c; v]_(c_j) ,
 
-with ``|delta_j|, |delta'_j| <= r_j``, where delta of F and delta' of h are independent, but delta'
-is the same for both gains: an innovation moves ``back = A0 Z + K`` in all, e_p+ is ``A0 e_q - back
-nu`` and so on. One channel for every column of every direction: outside the box the state x in it
-satisfies ``x - sat(xhat) = Theta (x - xhat)`` with a diagonal 0 <= Theta <= 1, which each column of
-the deviation shrinks with.
+v less its middle, with ``|delta_j|, |delta'_j| <= r_j``, where delta of F and delta' of h are
+independent, but delta' is the same for both gains: an innovation moves ``back = A0 Z + K`` in all,
+e_p+ is ``A0 e_q - back nu`` and so on. There is one channel for every column of every direction.
 """
 
 from dataclasses import dataclass
@@ -125,10 +113,7 @@ class ErrorSystem:
 def split_columns(
     directions: FloatArray, radii: FloatArray, rows: slice, widths: FloatArray
 ) -> Channels:
-    """Take the directions of a family apart, column by column, where a column varies at all.
-
-    widths: of the variables by which the columns are derivatives; without width no deviation
-    """
+    """Take the directions of a family apart by columns that vary over variables of some width."""
     part = directions[:, rows]
     varies = np.any(part != 0.0, axis=1) & (radii > 0.0)[:, None] & (widths > 0.0)
     which, sources = np.nonzero(varies)

@@ -222,11 +222,7 @@ def numbers(design: HinfDesign) -> Numbers:
 
 
 def _gains(design: HinfDesign) -> dict[str, FloatArray]:
-    """Gains by the paper's letters, eqs. (16)-(19), and those of the general filter.
-
-    Z and Y are free only up to what Pi = I - C L (C L)^+ lets through, and are returned
-    projected: F = L (C L)^+ + Z, H = (C L)^+ + Y.
-    """
+    """Gains by the paper's letters, (16)-(19), and of the general filter, Z and Y projected."""
     data, gains = design.data, design.gains
     G, C = data.G, data.C
     base = data.standard_filter(gains.K)

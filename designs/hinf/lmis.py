@@ -20,11 +20,7 @@ from obsynth.symbolic.arrays import FloatArray
 class Loop:
     """The error system with P multiplied in, so that it is affine in the unknowns.
 
-    P (n, n)
-    PG (n, n): P (I - F C)
-    PKC (n, n): P K C
-    HC, DC (n_f, n)
-    A, W (n, n) or a family, (n, n_w)
+    PG, PKC (n, n): P (I - F C) and P K C; HC, DC (n_f, n); A (n, n) or a family
     """
 
     P: Any
@@ -71,7 +67,7 @@ def _weighted(sector: Sector, tau: Sequence[Any]) -> tuple[Any, Any]:
 def dissipation_block(
     loop: Loop, mu2: Any, sector: Sector | None = None, tau: Sequence[Any] = ()
 ) -> Any:
-    """V+ - V + |f - fhat|^2 < mu^2 |w|^2 for every value of the nonlinearity.
+    """V+ - V + |f - fhat|^2 < mu^2 |w|^2 for every value of the nonlinearity, mu2 (1, 1).
 
         [ P - sum tau_i R_i   *       *      *   *
           0                   T       *      *   *
@@ -79,11 +75,8 @@ def dissipation_block(
           X                   P G E   P G W  P   *
           H C A + D C         H C E   H C W  0   I ]  > 0
 
-    with G = I - F C. It is (26) with the signs put right, one multiplier per group of the
-    sector and P not multiplied by two; at every vertex, without multipliers, where there is no
-    sector.
-
-    Shapes: mu2 (1, 1).
+    with G = I - F C: (26) put right, one multiplier per group of the sector; at every vertex,
+    without multipliers, where there is no sector.
     """
     n_f, n_w = loop.HC.shape[0], loop.W.shape[1]
     c = loop.HC @ loop.A + loop.DC

@@ -30,10 +30,7 @@ RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """What follows from the equations: the split, and what bounds its g over the box.
-
-    majorant: where multipliers are asked for
-    """
+    """What follows from the equations: split, bounds of its g, majorant where asked for."""
 
     split: Split
     bounds: JacobianBounds
@@ -42,10 +39,7 @@ class Derived:
 
 @dataclass(frozen=True, eq=False)
 class HinfModel(Derived):
-    """A plant of the class (1)-(2) with everything derived from it.
-
-    design: complete except for gains and bound, which are zero
-    """
+    """A plant of the class; its design is complete except for gains and bound, which are zero."""
 
     design: HinfDesign
 
@@ -184,8 +178,7 @@ def _rank(matrix: FloatArray) -> int:
 def check_detectability(parts: Split, G: FloatArray, vertices: FloatArray) -> None:
     """Test the pair (G (A + M), C) at every vertex: the zeros of (A + M, L, C) have to be stable.
 
-    Observability of (A, C), which the paper asks for beside (15), is not enough: a zero is a
-    motion that the fault hides, however well the state could be seen without it.
+    Observability of (A, C), which the paper asks for, is not enough: a fault hides a zero's motion.
     """
     n = len(parts.A)
     names = parts.model.names("x")

@@ -26,10 +26,9 @@ class Bound(Record):
 
     mu: |f - fhat| <= mu |w| in the sense of energies, e_0 = 0
     P: V = e'Pe; with the printed form V = e'Pe + s'Qs
-    tau: multipliers, one per group; none with vertices or the printed form
+    tau, tau_decay: multipliers, one per group; none with vertices or the printed form
     printed (0,) or (2 + n n,): alpha, beta and Q of (45), by rows
     decay: V+ < decay V where w = 0
-    tau_decay: multipliers of the decay, one per group
     least_mu: the least level that the solver found, where none was given
     """
 
@@ -59,15 +58,11 @@ class Bound(Record):
 class HinfDesign(Design):
     """Everything that is deployed and proved, in doubles.
 
-    plant: the discrete plant
-    linear: how A was chosen, see `obsynth.split`
-    x_at, u_at: the point at which it was chosen
+    linear, x_at, u_at: how and at which point A was chosen, see `obsynth.split`
     A, B, C, L, W: the split; L stacks faults and unknown inputs
     A_radius, W_radius: distance of the plant's own coefficients from these doubles
     family: the set of Jacobians of g
-    sector_form: how the sector is made
     sector: what the multipliers weigh; None for the vertices of the family
-    options: the options of the method, as given
     """
 
     plant: Plant

@@ -15,11 +15,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 
 def memory_sizes(design: HinfDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
-
-    ``prediction`` (p of the state now), ``innovation`` (y - C xhat of the instant before) and
-    ``running`` (1 after the first sample).
-    """
+    """Return the parts: p of the state now, the innovation before, 1 after the first sample."""
     m, n = design.C.shape
     return {"prediction": n, "innovation": m, "running": 1}
 
@@ -32,8 +28,7 @@ def first_memory(design: HinfDesign, start: Start) -> dict[str, ArrayLike]:
 def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
     """Return A xhat + B u + g(c, u) with c the nearest point of the box of the states.
 
-    The right-hand side of the plant at c, with w at its middle, is A c + B u + g(c, u) and what
-    that w adds, so neither B nor g is needed, and inside the box nothing else is added.
+    The plant at c, w at its middle, is A c + B u + g(c, u) and what that w adds.
     """
     nearest = clip(xhat, model.box("x"))
     kinds = ("d", "f", "w", "p", "rho")
@@ -44,12 +39,7 @@ def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
 
 
 def build_core(design: HinfDesign) -> Core:
-    """Build the H-infinity filter, which gives estimates and no sets.
-
-    f_k shows in y_{k+1} only, so at instant k it gives xhat_k and fhat_{k-1}:
-
-        r = y_k - C p ,  fhat_{k-1} = H r + D r0 ,  xhat_k = p + F r + K r0 ,
-        r0 = y_k - C xhat_k ,  p = A xhat_k + B u_k + g(xhat_k, u_k) .
+    """Build the filter (18)-(19) (the method's page, Filter), which gives estimates and no sets.
 
     The first sample has no prediction behind it: xhat_0 is the guess. One missing entry of y
     leaves no innovation in any: the gains mix them.

@@ -60,12 +60,7 @@ GAP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A storage function that shows a level, in the plant's units.
-
-    P (n, n)
-    tau, tau_decay (n_groups,)
-    printed (0,) or (2 + n n,): alpha, beta and Q of (45)
-    """
+    """A storage function that shows a level, in the plant's units, with the letters of `Bound`."""
 
     P: FloatArray
     tau: FloatArray

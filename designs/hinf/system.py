@@ -1,11 +1,7 @@
 """The error system of the filter as numbers: what every inequality and proof is formed from.
 
-With q = A e + s + L f + W w, the part of x_{k+1} that the prediction p does not know, the filter
-
-    xhat+ = p + F (y+ - C p) + K (y - C xhat) ,   fhat = H (y+ - C p) + D (y - C xhat)
-
-has the errors e+ = (I - F C) q - K C e and f - fhat = f - H C q - D C e, and f drops out of both
-where (I - F C) L = 0 and H C L = I.
+With q = A e + s + L f + W w the errors are e+ = (I - F C) q - K C e, f - fhat = f - H C q - D C e
+(docs/methods/hinf_uio.md, Filter), and f drops out where (I - F C) L = 0 and H C L = I.
 """
 
 from __future__ import annotations
@@ -34,10 +30,8 @@ HORIZON = 60
 
 @dataclass(frozen=True, eq=False)
 class SectorForm:
-    """How a nonlinearity is bounded by a sector.
+    """How a nonlinearity is bounded by a sector, see the options of `HinfUIO`.
 
-    multipliers: how finely
-    drop_zero_rows: whether rows of g that are zero are left out
     given: diagonal of M'M where it is given and only proved
     """
 
@@ -50,8 +44,7 @@ class SectorForm:
 class Sector:
     """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
 
-    E: where every phi enters
-    group: group of every phi; one multiplier per group
+    group: of every phi; one multiplier per group
     """
 
     E: Annotated[FloatArray, "n k"]
@@ -123,14 +116,11 @@ class Filter:
 class FilterData:
     """Matrices of the plant and what bounds its nonlinearity.
 
-    A, C, L, W: shapes (n, n), (m, n), (n, s), (n, n_w); L stacks faults and unknown inputs
     H (s, m): (C L)^+ in doubles
     n_f: the first n_f columns of L are faults; only their estimates count
     null (m - s, m): rows that see no fault: null C L = 0
     A_radius, W_radius: how far the plant's own coefficients may be from the doubles
-    vertices (N, n, n): of the Jacobian of g; with multipliers and too many vertices, some matrices
-        of the set
-    vertex_radius (N, n, n)
+    vertices, vertex_radius (N, n, n): of the Jacobian of g; with too many, some matrices of the set
     sector: used in place of the vertices where it is there
     """
 
@@ -185,11 +175,7 @@ class FilterData:
 
 @dataclass(frozen=True, eq=False)
 class Units:
-    """Sizes of one unit of x, y, f and phi, powers of two, in which all numbers are about one.
-
-    x, y (n,), (m,)
-    phi (n_groups,)
-    """
+    """Sizes of one unit of x, y, f, phi, powers of two, in which all numbers are about one."""
 
     x: FloatArray
     y: FloatArray

@@ -35,7 +35,6 @@ CLOSE = 1.0 - 1e-6
 class OperatingPoints:
     """Points (x, u, v) with x = f(x, u, v): v are the faults and unknown inputs that hold them.
 
-    x, u, v (N, n), (N, n_u), (N, s)
     jacobian (N, n, n): of the right-hand side by x
     """
 
@@ -77,12 +76,9 @@ def _batch(function: ca.Function, *arguments: FloatArray) -> FloatArray:
 def hold_points(
     model: Plant, x: FloatArray, u: FloatArray, functions: Functions | None = None
 ) -> OperatingPoints:
-    """Move points to the nearest at which faults and unknown inputs can hold the plant.
+    """Move points x (N, n), u (N, n_u) to the nearest at which faults and d can hold the plant.
 
-    Gauss-Newton on x = f(x, u, v), steps of least norm; what does not converge or ends outside
-    the ranges of x and u is left out.
-
-    Shapes: x, u (N, n), (N, n_u).
+    Gauss-Newton on x = f(x, u, v); what does not converge or leaves the ranges is left out.
     """
     rhs, slopes = functions or _functions(model)
     n, n_u = x.shape[1], u.shape[1]
@@ -117,10 +113,7 @@ def hold_points(
 def frozen_gain(
     design: HinfDesign, jacobian: FloatArray, refinements: int = REFINEMENTS
 ) -> tuple[FloatArray, FloatArray, ComplexArray]:
-    """Return the peak gain from w to f - fhat of the error linearised with given Jacobians.
-
-    Shapes: jacobian (N, n, n), gain (N,), frequency (N,), direction (N, n_w).
-    """
+    """Return peak gain, frequency and w (N, n_w) of errors linearised with Jacobians (N, n, n)."""
     gains, C, W = design.gains, design.C, design.W
     kept = np.eye(len(C.T)) - gains.F @ C
     loop = kept @ jacobian - gains.K @ C
@@ -389,10 +382,7 @@ class _Loop:
 
 
 def holding_gain(jacobian: FloatArray, L: FloatArray) -> FloatArray:
-    """Return a feedback from x to the faults that keeps the plant near an operating point.
-
-    Zero where the plant stays there by itself, else that of a Riccati equation.
-    """
+    """Return a feedback from x to faults that keeps the plant near a point; zero where it stays."""
     if np.abs(np.linalg.eigvals(jacobian)).max() < 1.0 - 1e-3:
         return np.zeros((L.shape[1], len(L)))
     P: FloatArray = np.eye(len(L))

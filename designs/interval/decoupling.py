@@ -1,11 +1,7 @@
 """Decoupling of the faults by orthogonal transformations, made exact.
 
-The singular value decompositions give H and N in doubles, orthogonal only up to rounding. What the
-observer uses are rational matrices next to them for which the identities hold exactly:
-
-    T2 F = 0,    Phi C + W T2 = I,    F_left F = I,    N12 C = C2 T2 .
-
-In the letters of the paper T2 = H2', Phi = H1 E, W = H2 - H1 E Ct2 and F_left = K0 R0^-1 H1'.
+What the observer uses are rational matrices next to those of singular value decompositions, for
+which the identities of `Decoupled` hold exactly (docs/methods/interval_observer.md, Decoupling).
 """
 
 from __future__ import annotations
@@ -28,10 +24,7 @@ MODE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Transformation:
-    """F = H [R0; 0] K0' and C H1 = N [R1; 0] K1', Section 4 of the paper.
-
-    H, N: orthogonal
-    """
+    """F = H [R0; 0] K0' and C H1 = N [R1; 0] K1', Section 4 of the paper; H, N orthogonal."""
 
     H: Annotated[FloatArray, "n n"]
     R0: Annotated[FloatArray, "n_f+q n_f+q"]
@@ -43,12 +36,10 @@ class Transformation:
 
 @dataclass(frozen=True, eq=False)
 class Decoupled:
-    """The plant after the faults are taken away, exact.
+    """The plant after the faults are taken away, exact: T2 F = 0, F_left F = I.
 
-    T2: z2 = T2 x is free of the faults
-    N12: N12 y = C2 z2 + N12 W2 w
+    N12: N12 y = C2 z2 + N12 W2 w, z2 = T2 x
     Phi, W: x = Phi (y - W2 w) + W z2
-    F_left: left inverse of F
     """
 
     T2: Exact
@@ -63,13 +54,10 @@ class Decoupled:
 class Reduced:
     """The plant without its faults, in doubles, one matrix per vertex.
 
-    A: T2 A_i W
-    D: T2 A_i Phi
-    W1, W2: T2 W1, and W2
-    y_size: largest |y| over the declared boxes
+    A, D: T2 A_i W, T2 A_i Phi; W1: T2 W1
+    y_size: largest |y| over the declared boxes; signals: largest |x|, |u| and 1
     W: x = W z2 and a share that the measurement gives
     changes: T2 times what every scheduling scalar changes over its range in [A B o]
-    signals: largest |x|, |u| and 1
     """
 
     A: FloatArray

@@ -39,11 +39,9 @@ Prefer = Sequence[str] | Mapping[str, str] | None
 
 @dataclass(frozen=True, eq=False)
 class IntervalModel(Record):
-    """x+ = A(rho) x + B(rho) u + o(rho) + F (f, d) + W1 w and y = C x + W2 w.
+    """x+ = A(rho) x + B(rho) u + o(rho) + F (f, d) + W1 w and y = C x + W2 w, in discrete time.
 
-    plant: discrete
     family: the stacked matrix [A B o], affine in independent scalars
-    F: columns of the faults, then of the unknown inputs
     scheduled: states and inputs on whose declared range the family rests
     """
 

@@ -77,10 +77,7 @@ def divergence(design: IntervalDesign, headline: str = "the bounds diverge") -> 
 
 
 def refuse_printed(design: IntervalDesign) -> InfeasibleDesign:
-    """Return the refusal of (32) as printed, for gains whose bounds are stable.
-
-    Gains whose bounds diverge are refused before, with the numbers of Theorem 1.
-    """
+    """Return the refusal of (32) as printed, for gains whose bounds are stable."""
     chosen = design.transformation
     least = float(nearest(exact(chosen.K0) @ inverse(exact(chosen.R0))).min(initial=0.0))
     details = [

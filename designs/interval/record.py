@@ -49,9 +49,7 @@ class IntervalDesign(Design):
     """Everything that is deployed and proved.
 
     nominal: the A around which the paper's bound is taken
-    error, width: e* and w*: steady bounds of the errors and widths of r; empty before they are
-        known
-    options: the options of the method, as given
+    error, width: steady bounds e*, w* of the errors and widths of r; empty before they are known
     """
 
     model: IntervalModel
@@ -173,11 +171,7 @@ class IntervalDesign(Design):
 
     @property
     def spectral_radius(self) -> float:
-        """By what the errors of one step grow, without contraction.
-
-        Of ``max_i |M_i|`` for the vertex bound, ``|R| + sigma_upper+ + sigma_lower-`` for the
-        paper's.
-        """
+        """By what the errors of one step grow, without contraction."""
         return float(np.abs(np.linalg.eigvals(nearest(self.width_map.part.E))).max(initial=0.0))
 
     def _width_of(self, part: Part, rows: Rows) -> PartWidth:
@@ -190,10 +184,7 @@ class IntervalDesign(Design):
         return self.half_widths_of(self.error, self.width)
 
     def half_widths_of(self, e: FloatArray, w: FloatArray) -> FloatArray:
-        """Return half widths of states, then faults, for errors and widths of r, rounded upwards.
-
-        Of r at an instant and the one before.
-        """
+        """Return half widths of states, then faults, for errors and widths of r, rounded up."""
         share = row_widths(self._width_of(self.share, self.share_rows), e, w)
         size = self.share.size + exact(share)
         x = self._linear_widths(self.state_rows, w)

@@ -1,9 +1,7 @@
 """Guaranteed bounds as largest and smallest of finitely many linear functions.
 
-Every bound of the observer has the form upper = max_i U_i s, lower = min_i L_i s, with s a stack
-of what is known at run time (bounds of r, the measurement, the input, 1). The matrices are exact;
-`Rows.slack` says by how much a bound has to be widened so that it also holds when the coefficients
-are rounded and the sums are evaluated in floating point.
+upper = max_i U_i s, lower = min_i L_i s, with s a stack of what is known at run time (bounds of r,
+the measurement, the input, 1), exact; `Rows.slack` says by how much to widen in floating point.
 """
 
 from __future__ import annotations
@@ -27,9 +25,8 @@ SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """upper = max_i U_i s and lower = min_i L_i s.
+    """upper = max_i U_i s and lower = min_i L_i s; sizes: the parts of s in their order.
 
-    sizes: the parts of s in their order; ``"one"`` is the constant 1
     radius: what the matrices may be off, as a coefficient of |s|
     """
 
@@ -51,10 +48,8 @@ class Rows:
     def slack(self, precision: Precision) -> FloatArray:
         """Coefficients of |s| by which a bound is widened at run time, shape (rows, len(s)).
 
-        A sum of t products whose coefficients are rounded, and whose data are rounded to the
-        working precision first, is off by less than (t + 3) u times the sum of the absolute
-        terms, the addition of the widening included; three more units cover the rounding of the
-        widening itself and the terms of second order, for t up to about a thousand.
+        (t + 3) u for a sum of t products, and three units more for the widening itself and terms of
+        second order, for t up to about a thousand.
         """
         unit = UNIT[precision]
         every = np.stack([*self.upper, *self.lower])
@@ -79,12 +74,10 @@ def _stack(sizes: Mapping[str, int], count: int, parts: Mapping[str, Any]) -> Ex
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The quantity X (A x + B u + o + W1 w) + Y (N12 (y - W2 w) - C2 z2) of one instant.
+    """The quantity X (A x + B u + o + W1 w) + Y (N12 (y - W2 w) - C2 z2) of one instant, z2 = S r.
 
     With X = P T2 and Y = P L it is r of the next instant, with X = -F_left and Y = 0 the share of
     the fault that is known one instant before the rest.
-
-    S: z2 = S r
     """
 
     model: IntervalModel
@@ -153,10 +146,7 @@ class Part:
         return Remainder.of(self, nominal)
 
     def paper_rows(self, nominal: Exact) -> Rows:
-        """Bound of (13)-(15) and (32): every term apart, positive and negative parts of r and y.
-
-        The input matrix and the offset have to be constant.
-        """
+        """Bound of (13)-(15) and (32), term by term; input matrix and offset constant."""
         _, b, o = self.model.columns
         names = ("r_upper+", "r_upper-", "r_lower+", "r_lower-", "r_upper", "r_lower")
         sizes = _sizes(self, (*names, "y+", "y-", "u", "one"))
@@ -200,10 +190,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """Nominal coefficients of a `Part` and elementwise bounds of what varies, (14)-(15).
-
-    noise: box of everything that the disturbances add
-    """
+    """Nominal coefficients of a `Part`, bounds of what varies, (14)-(15), and a box of noise."""
 
     R: Exact
     sigma_lower: Exact

@@ -20,11 +20,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 
 def memory_sizes(design: IntervalDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
-
-    ``r_lower`` and ``r_upper`` (bounds of r = P z2 at the instant of the next call),
-    ``share_lower`` and ``share_upper`` (of the fault, without what the next measurement tells).
-    """
+    """Return the parts: bounds of r at the next call, and of the share of the fault known now."""
     n2, n_f = len(design.P), design.n_f
     return {"r_lower": n2, "r_upper": n2, "share_lower": n_f, "share_upper": n_f}
 
@@ -39,9 +35,7 @@ def settling(
 ) -> tuple[int, FloatArray] | None:
     """Return how many calls the sets take to settle, and their half widths from then on.
 
-    They begin from boxes of half widths `box`, of the states alone; with `calls` given, the half
-    widths after so many, infinite where a state that matters has no bound.
-    None if nothing is proved.
+    From half widths `box`, of states alone, infinite where one that matters is; None if unproved.
     """
     declared = 0.5 * np.diff(design.plant.box("x"), axis=1)[:, 0]
     first = design.first_width(np.minimum(box[: len(declared)], declared))
@@ -124,7 +118,6 @@ def _contract(design: IntervalDesign, r: Ends, y: ca.SX, u: ca.SX) -> Ends:
 def build_core(design: IntervalDesign) -> Core:
     """Build the observer: contraction, sets of x_k and f_{k-1}, prediction.
 
-    It begins with the image of a box of states, and with a share of the fault that is not known.
     A reading that is missing leaves nothing to predict from: the decoupling needs them all.
     """
     plant, n_f = design.plant, design.n_f

@@ -26,13 +26,7 @@ UNBOUNDED = 1e6
 
 
 def lp_problem(data: Reduced, P: FloatArray) -> Problem:
-    """Return the programme whose solution L makes the bounds for a fixed P narrow.
-
-    With Lambda = diag(lambda), Y = Lambda P L and S = P^-1: T >= |Lambda P A_i S - Y C2 S| and
-    U >= |Lambda P W1 - (Lambda P D_i + Y N12) W2| at every vertex, lambda >= 0 and
-    1'T <= lambda' - 1'|S|; minimise 1'U (w_upper - w_lower) + 1'|Lambda P (D_i - D_j)| |y|, an
-    upper bound of the sum of the steady widths of z2.
-    """
+    """Return the programme (the method's page, Gains) of the L that makes bounds for P narrow."""
     n2, m2 = len(P), len(data.C2)
     if not n2:
         raise ObsynthError("every state is measured once the faults are known: there is no gain")
@@ -105,11 +99,7 @@ def sylvester_gain(
 
 
 def placed_gains(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield (P, L) that make P (A2 - L C2) P^-1 diagonal with several sets of real poles.
-
-    A2 is the mean of the vertices; sets of poles for which the Sylvester equation has no regular
-    solution are left out.
-    """
+    """Yield (P, L) that make P (A2 - L C2) P^-1 diagonal with real poles, A2 the mean."""
     A2, C2 = data.A.mean(axis=0), data.C2
     n2, m2 = len(A2), len(C2)
     if not n2 or not m2:
@@ -127,10 +117,7 @@ def placed_gains(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def predicted_size(data: Reduced, P: FloatArray, L: FloatArray) -> float:
-    """Return the sum of the steady widths of x of the vertex form without contraction.
-
-    In doubles, for a search; at least 1e6 where the widths are unbounded.
-    """
+    """Return the sum of steady widths of x, vertex form, in doubles; 1e6 or more if unbounded."""
     if np.linalg.cond(P) > MOST_SKEW:
         return 2.0 * UNBOUNDED
     S = np.linalg.inv(P)
@@ -213,11 +200,7 @@ def lp_design(design: IntervalDesign) -> IntervalDesign:
 
 
 def search_design(design: IntervalDesign) -> IntervalDesign:
-    """Gains by a direct search that improves P and L together.
-
-    Starts at the linear programme's gain for P = I and at gains that place real poles; what has
-    the smallest steady widths is taken.
-    """
+    """Gains by a direct search on P and L, from the programme's and from placed poles."""
     data = design.reduced
     identity = np.eye(data.A.shape[1])
     starts = list(placed_gains(data))

@@ -1,10 +1,8 @@
 """How wide the intervals can get: a monotone recursion, its steady value and the proof.
 
 Let e bound r_upper - r and r - r_lower, and w the width of the interval of r. One step maps both
-by functions that grow with their argument but never faster than it: f(c e) <= c f(e) for c >= 1.
-If f(e*) <= (1 - delta) e* with e* > 0, an error of c e*, c > 1, becomes at most (1 - delta) c e*,
-so that e* bounds the error in the limit whatever it was at the start. That inequality is checked
-in exact arithmetic; it proves stability and the steady widths at once.
+by f with f(c e) <= c f(e) for c >= 1, so f(e*) <= (1 - delta) e*, which is checked exactly, bounds
+the error in the limit whatever it was at the start.
 """
 
 from __future__ import annotations
@@ -40,10 +38,7 @@ MOST_CALLS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class PartWidth:
-    """What one `Part` adds: error <= E e + e_rest, width <= V w + V_mixed min(w, e) + w_rest.
-
-    All entries nonnegative, exact or in doubles; shapes (rows, n - q) and (rows,).
-    """
+    """What a `Part` adds: error <= E e + e_rest, width <= V w + V_mixed min(w, e) + w_rest."""
 
     E: Any
     e_rest: Any
@@ -67,11 +62,7 @@ class Contraction:
 
 @dataclass(frozen=True, eq=False)
 class WidthMap:
-    """One step of the error and of the width of r, in exact numbers or in doubles.
-
-    part: of the prediction
-    contractions: in the order in which the step makes them, both sweeps
-    """
+    """One step of error and width of r, exact or in doubles; contractions of both sweeps."""
 
     part: PartWidth
     contractions: tuple[Contraction, ...]
@@ -200,8 +191,7 @@ def contraction_width(rows: Rows, slack: FloatArray, part: Part, component: int)
 def steady(step: WidthMap) -> tuple[FloatArray, FloatArray] | None:
     """Return (e*, w*) in doubles, or None if the errors grow without bound.
 
-    Iterates from the solution without contraction where there is one: the step maps it below
-    itself, and so every iterate. Where only the contraction keeps the errors small, from zero.
+    From the solution without contraction, which the step maps below itself, or else from zero.
     """
     n2 = len(step.part.e_rest)
     if n2 == 0:
@@ -253,9 +243,8 @@ def settling(
 ) -> tuple[int, FloatArray, FloatArray]:
     """Return how many calls errors and widths take to within 1 % of e* and w*, and both then.
 
-    They begin with widths of at most `first`; with `calls` given, what both are after so many. The
-    multiple of e* and w* that the first ones are below is mapped below itself, so what it becomes
-    falls from call to call and holds for all later ones.
+    They begin with widths of at most `first`. A multiple of e* and w* above these is mapped below
+    itself, so what it becomes after a number of calls holds for all later ones.
     """
     quick = step.rounded()
     begun = quick.contract(first * UP)

@@ -20,11 +20,9 @@ from obsynth.designs.lmi.expression import Affine, ExpressionError, Variable, up
 class Block:
     """A named constraint: an expression and the cone it lies in.
 
-    name: name in reports and in the duals of the solution
     cone: ``"psd"``, ``"nonnegative"``, ``"zero"``, or ``"exponential"`` (rows of three)
     expression: for ``"psd"`` with sense ``<<`` the negative of what was typed, margin included
-    strict: whether a margin is asked of the block; helpers that only define an auxiliary variable
-        are not strict
+    strict: whether a margin is asked of it; helpers that define an auxiliary variable have none
     """
 
     name: str
@@ -54,14 +52,10 @@ class Solution:
     """Values by variable name. A status is not a certificate: prove what matters.
 
     values: every variable as a matrix (numbers are 1 x 1)
-    status: in the words of the solver
-    solved: true only for the status that means solved to full accuracy
-    infeasible: true only where the solver reports infeasibility to full accuracy
+    solved, infeasible: true only where the solver reports it to full accuracy
     objective: in the sense of the problem (what was minimised or maximised)
     gap: difference to the dual objective, relative to the objective where that is above one; inf
         where the solver does not tell
-    solver: name of the solver
-    solve_time: seconds inside the solver
     duals: dual matrix of every block, (r, c) or (N, r, c); empty when the solver gives none
     attempts: how earlier attempts and this one ended, when there was more than one way to try
     """
@@ -116,9 +110,7 @@ class Cone:
 class ConicForm:
     """Data for a conic solver, in units of its own.
 
-    statement: what it says
-    c, A, b: minimise c'x subject to b - A x in the cones
-    cones: in the order of the rows
+    c, A, b: minimise c'x subject to b - A x in the cones, in the order of the rows
     offsets: where each variable's free entries stand in x
     constant, sign: the objective typed is sign (c'x) + constant
     columns, rows: what x and the duals are multiplied by to be those of the statement

@@ -38,12 +38,7 @@ def upper_triangle(n: int) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True)
 class Variable:
-    """A matrix variable: a value compared by name, shape and structure.
-
-    name: name under which the solution returns it
-    shape: rows and columns
-    structure: which entries are free
-    """
+    """A matrix variable: a value compared by name, shape and structure (free entries)."""
 
     name: str
     shape: tuple[int, int]
@@ -92,13 +87,11 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """constant + sum over the variables of a linear operator.
+    """constant + sum over the variables of a linear operator, beside NumPy arrays as an array.
 
-    NumPy arrays stand beside expressions as in ``A.T @ P @ A - P``. An array with a leading
-    axis, (N, r, c), makes a family: one member per vertex, and arithmetic broadcasts over it
-    as ``numpy.matmul`` does.
+    An array with a leading axis, (N, r, c), makes a family: one member per vertex, and arithmetic
+    broadcasts over it as ``numpy.matmul`` does.
 
-    constant: value where every variable is zero
     terms: operators from the free entries of the variable to the entries of the expression, vertex
         after vertex, each stacked by columns
     """

@@ -42,8 +42,7 @@ class Margin:
     """The largest margin of a set of inequalities.
 
     value: largest t with every strict block >= t I, within the caps (at most 1)
-    binding: blocks and vertices that limit it
-    bound: what exact arithmetic says about it
+    binding, bound: blocks and vertices that limit it, and what exact arithmetic says of it
     found: where it was found
     """
 
@@ -80,8 +79,6 @@ class Margin:
 class MarginSolution:
     """Values that passed the proof, and how they came about.
 
-    values: by variable name
-    objective: of these values
     back_off: share of the phase 1 point mixed in
     chosen: vertices stated in phase 2, by family
     proof: what ``prove`` returned for the values
@@ -100,10 +97,9 @@ class MarginSolution:
 def largest_margin(
     problem: Problem, *, caps: Mapping[str, Inequality] | None = None, explain: bool = True
 ) -> Margin:
-    """Phase 1: the largest t with every strict block >= t I.
+    """Phase 1: the largest t with every strict block >= t I, measured at the point found.
 
-    The margin is measured at the point found, so an inaccurate answer of the solver serves as
-    long as it shows a margin; that there is none is believed of a solved problem only.
+    That there is none is believed of a solved problem only.
     """
     t = scalar(_MARGIN)
     first = problem.tightened(t)

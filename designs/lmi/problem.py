@@ -1,7 +1,5 @@
 """What is stated: block matrices of unknowns, named inequalities, an objective.
 
-Block matrices in any of the three arithmetics: expressions, enclosures, exact rationals.
-
 A formula written with ``block``, ``+ - @ *`` and ``.T`` says its LMI once: given variables it
 is the constraint the solver sees, given enclosures it is what gets proved, given exact
 matrices it is the independent check.
@@ -148,10 +146,7 @@ def _affine_block(cells: Sequence[Sequence[Any]]) -> Affine:
 
 
 class Problem:
-    """Linear objective, named matrix inequalities.
-
-    name: used in messages
-    """
+    """Linear objective, named matrix inequalities; its name is used in messages."""
 
     def __init__(self, name: str = "problem") -> None:
         self.name = name
@@ -235,10 +230,9 @@ class Problem:
         self._criterion = lambda values: np.linalg.eigvalsh(P.value(values))[0]
 
     def maximise_log_det(self, P: Affine) -> None:
-        """Maximise log det of a symmetric expression, with one exponential cone per row.
+        """Maximise log det P of a symmetric expression, with one exponential cone per row.
 
-        With Z lower triangular and [P, Z; Z', diag(Z)] >= 0, log det P is at least the sum of
-        log Z_ii, with equality for the Cholesky factor times its diagonal.
+        With Z lower triangular and [P, Z; Z', diag(Z)] >= 0 it is at least the sum of log Z_ii.
         """
         n = P.shape[0]
         Z = full("log_det.Z", n, n)
@@ -337,10 +331,7 @@ class Problem:
 
 
 def cap_gain(problem: Problem, P: Affine, H: Affine, limit: float, name: str = "gain") -> None:
-    """Keep the largest singular value of K = P^-1 H below a limit (sufficient).
-
-    With p I <= P and ``[limit^2 p I, H'; H, P] >= 0`` follows p K'K <= K'P K <= limit^2 p I.
-    """
+    """Keep |P^-1 H| below a limit: p I <= P and ``[limit^2 p I, H'; H, P] >= 0`` suffice."""
     p = scalar(f"{name}.p")
     problem.add_lmi(f"{name}.floor", P - p * np.eye(P.shape[0]), ">>", strict=False)
     cap: Any = symmetric_block([[limit**2 * p * np.eye(H.shape[1])], [H, P]])

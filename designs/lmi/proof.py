@@ -1,7 +1,5 @@
 """Why yes and why no: proofs at every vertex; blocks that bind, and a bound on the margin.
 
-Why no design exists: the blocks that bind, and a bound on the margin in exact arithmetic.
-
 Maximise t subject to F_i(x) - t I >= 0. For any matrices Z_i >= 0 the sum of <Z_i, F_i(x) - t I>
 is not negative at a feasible point, and it is affine in x and t: c0 + r'x - t sum tr Z_i >= 0.
 So t <= (c0 + r'x) / sum tr Z_i whatever the solver did; its dual solution only makes the bound
@@ -45,8 +43,6 @@ _SAMPLE = 256
 class FamilyProof:
     """What was proved of a matrix inequality at its vertices.
 
-    name: name of the inequality
-    count: number of vertices
     failed: vertices without proof (at most ten are listed)
     margin: guaranteed lower bound of the smallest eigenvalue over all vertices; -inf if one failed
     worst: vertices with the smallest margins, worst first
@@ -179,8 +175,7 @@ class MarginBound:
     """An upper bound of the margin, checked in exact rational arithmetic.
 
     multipliers: Z_i by block, exactly positive definite or zero (psd), or not negative; doubles
-    offset, slope: every design whose free entries are below s in size has a margin of at most
-        ``offset + slope s``
+    offset, slope: with free entries below s in size the margin is at most ``offset + slope s``
     """
 
     multipliers: Mapping[str, NDArray[np.float64]]
@@ -225,10 +220,7 @@ def binding_blocks(
 
 
 def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBound | None:
-    """Bound the margin that any values of the variables can reach.
-
-    The coefficients are those of the problem as assembled from doubles.
-    """
+    """Bound the margin that any values of the variables can reach, for data in doubles."""
     found = _multipliers(problem, solution)
     if found is None:
         return None
@@ -246,8 +238,7 @@ def bound_margin(problem: Problem, solution: Solution, margin: str) -> MarginBou
 def excluded_size(problem: Problem, solution: Solution) -> float:
     """Size of free entries below which none satisfies the constraints, 0 where that is not shown.
 
-    With t left out, c0 + r'x >= 0 at a feasible point, for the ray that a solver gives for
-    infeasibility as for any other matrices Z_i >= 0.
+    With t left out, c0 + r'x >= 0 at a feasible point, for the ray of a solver as for any Z_i >= 0.
     """
     found = _multipliers(problem, solution)
     if found is None:

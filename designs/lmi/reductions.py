@@ -20,11 +20,9 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class Extremes:
-    """The extreme points among given points, and how the others follow from them.
+    """The extreme points among given points, by row, and how the others follow from them.
 
-    kept: row numbers of the extreme points
-    weights: for every other row, weights of kept rows that sum to one and give the row exactly; a
-        repeated row refers to its first occurrence with weight one
+    weights: for every other row, weights of rows kept or dropped later that give it exactly
     """
 
     kept: IntArray
@@ -42,11 +40,9 @@ class Extremes:
 
 
 def extreme_points(points: ArrayLike) -> Extremes:
-    """Drop points that are convex combinations of others.
+    """Drop points that are convex combinations of others, and what stands twice.
 
-    An inequality that is affine in a parameter holds at all points if it holds at the
-    extreme ones. What stands twice is dropped too. Merge what enters only through a
-    difference by passing the differences.
+    An inequality that is affine in a parameter holds at all points if it holds at the extreme ones.
     """
     # Adding zero makes one zero of the two, so that equal rows have equal bytes.
     array = np.asarray(points, dtype=float) + 0.0
@@ -72,10 +68,8 @@ def extreme_points(points: ArrayLike) -> Extremes:
 class SplitFamily:
     """A family written as one common inequality and a small one per vertex.
 
-    common: one inequality >= 0; None if nothing is common
-    members: the part that depends on the vertex, >= 0 at each
-    rows: rows of the family that ``members`` has
-    shared: rows that both have, with the slack variable between them
+    common, members: inequalities >= 0, the former None if nothing is common
+    rows, shared: of the family that ``members`` has, and those that both have, with the slack
     """
 
     common: Affine | None

@@ -19,11 +19,9 @@ _GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 @dataclass(frozen=True)
 class Bisection:
-    """The limit of feasibility along a line.
+    """The limit of feasibility along a line, and how many problems were solved.
 
-    feasible: last value found feasible
-    infeasible: last value found infeasible; None if the whole line is feasible
-    evaluations: number of problems solved
+    feasible, infeasible: last values found so; the latter None if the whole line is feasible
     """
 
     feasible: float
@@ -61,11 +59,9 @@ def bisect_feasible(
 
 @dataclass(frozen=True)
 class Knob:
-    """One scalar that could be changed to make a design feasible.
+    """One scalar that could be changed to make a design feasible, in the words of the user.
 
-    name: in the words of the user, as ``"gamma"`` or ``"half width of the box of h3"``
-    current: value at which the design is infeasible
-    limit: as far as it may be changed
+    current, limit: a value at which the design is infeasible, and as far as it may be changed
     feasible: whether the design is feasible at a value, all else being equal
     """
 
@@ -95,14 +91,10 @@ def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Search(Generic[Result]):
-    """The best design along a line.
+    """The best design along a line: the value, what the design returned there, its objective.
 
-    value: where the objective is smallest
-    result: what the design returned there
-    objective: its objective
     tried: every value tried, in order, with its objective (inf where infeasible)
-    lower_bound: what no value of the line can be below, where the shape of the objective is known;
-        0 where only a grid speaks
+    lower_bound: what no value of the line can be below; 0 where only a grid speaks
     """
 
     value: float
@@ -152,8 +144,7 @@ def search_log_convex(
 ) -> Search[Result]:
     """Minimise an objective whose logarithm is known to be convex along a line.
 
-    Such an objective has one minimum, its feasible values are one interval, and the chords
-    through the points tried bound it from below, so that the search knows when to stop.
+    Chords through the points tried bound it from below, so that the search knows when to stop.
     """
     record = _Record(design, objective)
 

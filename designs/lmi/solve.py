@@ -1,8 +1,6 @@
-"""How a stated problem is solved again: by other means, and with more of its vertices.
+"""How a stated problem is solved again: scaled, by other solvers, and with more of its vertices.
 
-Where Clarabel gives up the problem is scaled, then handed to another solver. Where a family has
-many vertices it is stated with few, all are checked, and the worst are added until none is
-violated.
+A family with many vertices is stated with few, all are checked, and the worst are added.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,10 +48,7 @@ def solve_with_retries(
     second_solvers: Sequence[str] = SECOND_SOLVERS,
     good_enough: Callable[[Solution], bool] | None = None,
 ) -> Solution:
-    """Solve by Clarabel, then by Clarabel on the scaled problem, then by other solvers.
-
-    A report of infeasibility counts where its dual solution shows it in exact arithmetic.
-    """
+    """Solve by Clarabel, scaled, by others; infeasible is what exact arithmetic shows."""
     attempts: list[str] = []
     status = ""
     for outcome in _attempts(problem, second_solvers):
@@ -108,10 +103,7 @@ def _attempts(problem: Problem, second_solvers: Sequence[str]) -> Iterator[Solut
 class LazySolution:
     """A solution found with some vertices and checked at all.
 
-    solution: of the last round
-    problem: as it was stated in the last round
-    chosen: vertices that were stated, by family; the other families are stated whole
-    rounds: number of solves
+    problem, chosen: as it was stated in the last round, vertices by family, the others whole
     """
 
     solution: Solution
@@ -129,7 +121,7 @@ def solve_lazily(
 ) -> LazySolution:
     """Solve a problem whose families may have many vertices, none left below the floor.
 
-    Vertices that mattered to a like problem before can be given to start with, by family.
+    start: vertices that mattered to a like problem before, by family.
     """
     families = {
         item.name: item.expression

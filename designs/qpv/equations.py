@@ -123,10 +123,7 @@ WEIGHTS = (1.0, 2.0, 2.0, 1.0)
 
 
 def build_update(design: QPVDesign) -> ca.Function:
-    """(state, u, y, theta) -> the estimates one sample later, by a Runge-Kutta step.
-
-    Beside them the innovations nu and the rates k of its stages.
-    """
+    """(state, u, y, theta) -> estimates after a Runge-Kutta step, nu and rates of its stages."""
     equations, inputs = Equations(design), symbols_of(design.plant)
     state = ca.SX.sym("state", len(design.P))
     u, y, theta = inputs["u"], inputs["y"], inputs["theta"]

@@ -1,7 +1,6 @@
 """The matrix Psi of the error dynamics over the polytopes of state and error.
 
-With x' = A x + [x'N_i x] and e = x - xhat follows e' = (A - L C + Psi(x, e)) e, where row i of Psi
-is x'(N_i + N_i') - e'N_i: equations (8)-(10), (30) and (24) of Rotondo, Buciakowski and Witczak.
+Row i is x'(N_i + N_i') - e'N_i: docs/methods/qpv_observer.md, Conditions.
 """
 
 from dataclasses import dataclass
@@ -26,8 +25,7 @@ class ErrorSets:
     centre (n,): c of the region
     state: of x - c, all coordinates; it holds the region
     error: of e in the first coordinates, at least those that enter Psi; it holds {e : e'P e <= 1}
-    start (r, n): corners of the polytope of e(0), one of every pair v, -v; it lies in {e : e'P e <=
-        1}
+    start (r, n): corners of the polytope of e(0), one of every pair v, -v, within {e : e'P e <= 1}
     state_entering, error_entering: the coordinates that enter Psi
     """
 
@@ -108,12 +106,9 @@ def psi_family(
 
 
 def psi_kept(N: FloatArray, sets: ErrorSets) -> FloatArray:
-    """Return the distinct extreme values of Psi among all pairs.
+    """Return the distinct extreme values of Psi among all pairs, for N (V, n, n, n).
 
-    An inequality that is affine in Psi holds at all pairs if it holds at these. What enters only
-    through a difference, such as x_j - e_i, is merged, and what enters nowhere disappears.
-
-    Shapes: N (V, n, n, n), returns (V, kept, n, n).
+    An inequality that is affine in Psi holds at all pairs if it holds at these.
     """
     families = np.stack([psi_family(block, sets).mid for block in N], axis=1)
     count = len(families)
@@ -157,10 +152,7 @@ def _independent(columns: FloatArray) -> FloatArray:
 
 
 def _tidy(points: FloatArray) -> FloatArray:
-    """Round to 30 bits of the half range of each column, so that exact tests see patterns.
-
-    The result only chooses what the solver is told; the proof covers all pairs.
-    """
+    """Round to 30 bits of half ranges, so that exact tests see patterns; the proof takes all."""
     low, high = points.min(axis=0), points.max(axis=0)
     centred = (points - 0.5 * (low + high)) / np.where(high > low, 0.5 * (high - low), 1.0)
     return np.asarray(np.round(centred * 2.0**30) / 2.0**30)

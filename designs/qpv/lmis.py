@@ -1,15 +1,10 @@
 """The matrix inequalities of the method, written once for unknowns, enclosures and exact numbers.
 
-Divided by eta they are stated over the enlarged polytopes themselves: with x = c + (x_j - c)/eta
-and e = (x_i - c)/eta, eta times Psi(x, e) is the Psi of (24) in Rotondo, Buciakowski and Witczak.
-
-Double polytopic sums as finitely many terms: Polya's relaxation, and its exact collapse.
-
+Divided by eta they are stated over the enlarged polytopes themselves (see the method's page).
+Double polytopic sums are finitely many terms, by Polya's relaxation or its exact collapse:
 sum_l sum_m mu_l mu_m F_lm < 0 on the simplex follows from the coefficients of (sum mu)^(s-2) times
 it, one for every multi-index of s vertices. With k_l the multiplicity of vertex l the coefficient
-is, up to a positive factor, sum_lm k_l (k_m - [l = m]) / (s (s - 1)) F_lm. This is (47)-(49) of
-Rotondo, Buciakowski and Witczak with the sum over the distinct permutations, the range 1..N of the
-indices and alpha P inside the sum.
+is, up to a positive factor, sum_lm k_l (k_m - [l = m]) / (s (s - 1)) F_lm: (47)-(49) put right.
 """
 
 from __future__ import annotations
@@ -28,11 +23,9 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class PolyaTerm:
-    """Integer weights of one term.
+    """Integer weights of one term: `single` of what depends on one index, `double` of products.
 
-    total: s (s - 1), the sum of either kind of weights; 1 for collapsed terms
-    single: weights of what depends on one index
-    double: weights of products, [r_1, r_2]
+    total: s (s - 1), the sum of either kind; 1 for collapsed terms
     """
 
     total: int
@@ -65,10 +58,7 @@ def polya_terms(vertices: int, order: int) -> tuple[PolyaTerm, ...]:
 class Closed:
     """One Polya term of the closed loop, `total` times what belongs to it.
 
-    total: sum of the weights
-    drift: he{P (A + Psi) - Gamma C}
-    side: P G - Gamma H, or None without disturbances
-    Cz: performance output
+    drift, side: he{P (A + Psi) - Gamma C}, P G - Gamma H, the latter None without disturbances
     """
 
     total: Any

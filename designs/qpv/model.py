@@ -52,11 +52,9 @@ class Derived:
 class QPVModel(Derived):
     """A plant of the class, and the sets that the options describe.
 
-    region: X
-    unit: the polytope P_x - c for kappa = 1
+    region: X; unit: the polytope P_x - c for kappa = 1
     apart: polytope of the errors and corners (r, n) of that of e(0), where they are not P_x's
-    Cz (V, n_z, n)
-    noise: bounds of disturbances and fault rates, where they are taken into account
+    Cz (V, n_z, n); noise: None where disturbances and fault rates are not taken into account
     """
 
     region: Ellipsoid
@@ -274,10 +272,9 @@ def read_noise(rate: float | None, model: Plant) -> NoiseBound | None:
 
 
 def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> None:
-    """Refuse states and faults that no output shows somewhere in the sets.
+    """Refuse states and faults that no output shows somewhere in the sets (Section 3).
 
-    A column of (A + Psi, C) that vanishes at a point of the polytopes belongs to an integrator
-    that no gain reaches there: the persistency of excitation that Section 3 of the paper asks for.
+    A column of (A + Psi, C) that vanishes there belongs to an integrator that no gain reaches.
     """
     from scipy.optimize import linprog
 
@@ -308,13 +305,9 @@ def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> N
 
 
 def default_sets(form: QPV) -> Mapping[str, Any]:
-    """Return region, E_x and initial_error by name.
+    """Return region, E_x and initial_error by name: docs/methods/qpv_observer.md, Plant class.
 
-    region: the smallest ellipsoid with axes along the coordinates and sides in proportion to the
-        declared ranges that holds all of them
-    E_x: half of the half ranges, of the states or, where their errors enter the dynamics, of all
-    initial_error: a tenth of the half ranges of the states; no fault at the start, as
-        `Observer.memory0` takes it
+    Without a fault at the start, as `Observer.memory0` takes it.
     """
     plant = form.model
     boxes = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])

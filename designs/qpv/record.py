@@ -39,12 +39,9 @@ ASSUMED = 2.0**-40
 class VertexData:
     """Matrices of the augmented plant at the V vertices of the scheduling variables.
 
-    A, G, C, H: shapes (V, n, n), (V, n, n_v), (V, m, n), (V, m, n_v), n with the faults;
-        disturbances first, then the rates of faults that have one
+    G, H (V, n, n_v), (V, m, n_v): disturbances first, then the rates of faults that have one
     N (V, n, n, n): N[l, i] is N_i
-    Cz (V, n_z, n): performance output
-    A_radius, G_radius, C_radius, H_radius, N_radius: what rounding may add, the same at every
-        vertex
+    A_radius, ...: what rounding may add, the same at every vertex
     """
 
     A: FloatArray
@@ -133,25 +130,18 @@ class NoiseBound(Record):
 class QPVDesign(Design):
     """Everything that is deployed and proved, in doubles; states of the form are states, faults.
 
-    plant: the continuous plant
-    form_of_N: see `obsynth.qpv`
     family: the stacked matrices of the quadratic form, affine in the scheduling variables
     scheduling: the scheduling variables as expressions of inputs and scheduling signals
     region: X, in which the augmented state is assumed to stay
-    state, error: polytopes of x - c and of e, see `ErrorSets`
-    start: corners of the polytope of e(0)
-    eta, kappa: with which the polytopes were made
+    state, error, start: polytopes of x - c and e, corners of that of e(0), see `ErrorSets`
     alpha: decay of V without disturbances
     w_centre: middle of the declared disturbances
     L: gains at the vertices of the scheduling
     gamma: proved bound of the squared L2 gain, where it is claimed
-    rows: proved upper bounds of the diagonal of Cz P^-1 Cz'
-    inverse_diagonal: proved upper bounds of (P^-1)_ii
+    rows, inverse_diagonal: proved upper bounds of the diagonals of Cz P^-1 Cz' and P^-1
     reset: X - c lies in {e'P e <= reset^2}, proved
-    Ts: sample time of the step
     rounding: what rounding of all steps adds to the root of V at most, see `rounding`; `ASSUMED`
         where that is not proved, 0 where no set follows from V
-    options: the options of the method, as given
     """
 
     plant: Plant

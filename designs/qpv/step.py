@@ -30,10 +30,7 @@ _PLACED = 0.999
 
 
 def memory_sizes(design: QPVDesign) -> dict[str, int]:
-    """Return the parts of the memory vector.
-
-    ``xhat``, ``fhat`` and ``level`` (a bound of V = e'P e, infinite where none is known).
-    """
+    """Return the parts: xhat, fhat, and level, a bound of V = e'P e, infinite if none is known."""
     plant = design.plant
     return {"xhat": len(plant.x), "fhat": len(plant.f), "level": 1}
 
@@ -112,8 +109,7 @@ class _Sizes:
 def build_core(design: QPVDesign) -> Core:
     """Build the Runge-Kutta step of order four with u, y and theta held, and the bound of V.
 
-    The sets of an instant follow from readings before it. One that is missing is replaced by what
-    is expected, which says nothing of V from then on: the bound begins anew.
+    A missing reading is replaced by what is expected, and the bound begins anew.
     """
     n, m = len(design.plant.x), len(design.plant.output)
     equations, sizes, follow = Equations(design), _Sizes.of(design), build_update(design)

@@ -50,12 +50,8 @@ REFINE = 3
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Everything that the inequalities depend on besides the unknowns.
+    """Everything that the inequalities depend on besides the unknowns, see `QPVObserver`.
 
-    eta: 1 / eta enlarges the polytopes
-    alpha: decay rate of V = e'P e
-    polya: order of the relaxation
-    gain_cap: largest singular value of every L_l
     printed: whether (19) and (20) are taken as printed
     room: share of E that the polytope of the error has to hold beyond E, for rounding
     """
@@ -115,10 +111,7 @@ class Unknowns:
 
 
 def state_problem(setting: Setting, gains: FloatArray | None = None) -> Problem:
-    """State the design problem, or with gains L_l given the analysis problem.
-
-    Shapes: gains (V, n, m).
-    """
+    """State the design problem, or with gains L_l (V, n, m) given the analysis problem."""
     half, n = setting.half, setting.data.sizes[0]
     data = setting.data.scaled(half)
     psi = setting.data.psi(setting.sets) * half / half[:, None]
@@ -216,10 +209,7 @@ class Accepted:
 def solve_with_proof(
     setting: Setting, prove: Callable[[Unknowns], bool], gains: FloatArray | None = None
 ) -> tuple[Unknowns, MarginSolution]:
-    """Solve with a margin and back off until `prove` accepts the numbers as stored.
-
-    Shapes: gains (V, n, m).
-    """
+    """Solve with a margin and back off until `prove` accepts the numbers as stored."""
     found = solve_with_margin(
         state_problem(setting, gains),
         prove=lambda values: Accepted(prove(Unknowns.read(values, setting, gains))),
@@ -231,10 +221,7 @@ def solve_with_proof(
 def synthesise(
     setting: Setting, options: Mapping[str, Any], gains: FloatArray | None, Ts: float | None
 ) -> QPVDesign:
-    """Find P and, where they are not given, gains; explain it where there are none.
-
-    Shapes: gains (V, n, m).
-    """
+    """Find P and, where they are not given, gains (V, n, m); explain it where there are none."""
 
     def prove(unknowns: Unknowns) -> bool:
         if np.linalg.eigvalsh(unknowns.P)[0] <= 0 or not np.isfinite(unknowns.gains).all():

@@ -1,8 +1,7 @@
 """Elementwise bounds of the state matrix between the ends of what the outputs show.
 
-The arguments are a lower and an upper end for every measured state. Equal ends are the paper's
-bounds as functions of the output; ends y - v and y + v include the noise, and ends moved further
-apart include what the output does between two samples.
+Equal ends are the paper's bounds as functions of the output; ends y - v and y + v include the
+noise, and ends moved further apart what the output does between two samples.
 """
 
 from __future__ import annotations
@@ -34,10 +33,8 @@ _SIDES = ("lower", "upper")
 class EndBounds:
     """Bounds of A, B and the offset as functions of ends of the measured states.
 
-    states: the measured states
     exact: inputs and measured scheduling variables, known exactly
-    lower, upper: bounds of the blocks ``"A"`` (n, n), ``"B"`` (n, n_u) and ``"offset"`` (n, 1), for
-        states that lie between their ends and inside their declared ranges
+    lower, upper: of the blocks, for states between their ends and inside their declared ranges
     """
 
     states: tuple[Signal, ...]
@@ -64,10 +61,7 @@ class EndBounds:
         )
 
     def extremes(self, reach: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the least A_lower and the largest A_upper over the declared ranges.
-
-        Shapes: reach (number of measured states,).
-        """
+        """Return the least A_lower and the largest A_upper over the ranges; reach: a state each."""
         width = np.broadcast_to(np.asarray(reach, dtype=float), (len(self.states),))
         known = _columns(len(self.exact))
         variables = [known[i] for i in range(len(self.exact))]

@@ -1,11 +1,8 @@
 """The coordinates z = S x in which the bounds move, and the plant in them.
 
-With L the gain in z and D a Metzler matrix,
+    z' = D z + (S A - D S - L C) x + L (C x) + S (B u + offset + G theta + W1 w)
 
-    z' = D z + (S A - D S - L C) x + L (C x) + S (B u + offset + G theta + W1 w),
-
-exactly, for any S, D and L. So nothing is asked of how well S makes S (A - L C) S^-1 equal to D:
-what it leaves, and what A varies by, multiplies states between bounds and is added to the drive.
+for any S, D and L: docs/methods/set_adaptive_observer.md, Other coordinates.
 """
 
 from dataclasses import dataclass
@@ -23,9 +20,8 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class Coordinates(Record):
-    """What is stored of coordinates.
+    """What is stored of coordinates: S and D of the equation above.
 
-    S, D: of the equation above
     rate, input_rate: ranges of the derivatives of all states, as those of the outputs in `System`
     """
 
@@ -46,10 +42,8 @@ class Coordinates(Record):
 class Frame:
     """The plant in the coordinates of the bounds: exact in S, L and D, every number rounded once.
 
-    C (m, n): of z, C S^-1
-    G (n, n_f), W1 (n, n_w): into z, S G and S W1
-    back (n, n): S^-1
-    own (n, n): D S + L C, by what A differs from which the drive is
+    C (m, n), G (n, n_f), W1 (n, n_w): of z, C S^-1, S G and S W1
+    back, own (n, n): S^-1 and D S + L C, by what A differs from which the drive is
     """
 
     C: FloatArray

@@ -30,11 +30,9 @@ MONITORS = ("R_m", "R_M", "b_m", "b_M", "weight")
 
 
 def memory_sizes(design: SetDesign) -> dict[str, int]:
-    """Return the parts of the memory vector; matrices are stored row by row.
+    """Return the parts: zeta (6), Omega (7), theta (8), xi (14), integrals of the monitors (13).
 
-    ``zeta`` (6), ``Omega`` (7), ``theta`` (8) and ``xi`` (14), each with the index m, then M: in
-    case (a) of Theorem 1, which applies, theta_m is the upper and theta_M the lower bound of the
-    fault. ``R``, ``b`` and ``weight`` are the integrals of the monitors (13).
+    theta_m is the upper and theta_M the lower bound of the fault; matrices stand row by row.
     """
     return {name: math.prod(_shape(design, letters)) for name, letters in _PARTS.items()}
 
@@ -71,8 +69,7 @@ def columns(parts: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
 class Drive:
     """What drives one of the two bounding systems.
 
-    M (n, n): A_o - L C
-    c (n, 1): inputs, offset, disturbances and outputs
+    M (n, n), c (n, 1): A_o - L C, and inputs, offset, disturbances and outputs
     size (n, 1): sum of the magnitudes of what c is made of
     """
 
@@ -104,11 +101,7 @@ Pair = tuple[ca.SX, ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """The plant between ends of its measured states.
-
-    A, forced: ends of A(rho) and of B u + offset
-    size (n, 1): sum of the magnitudes of what forced is made of
-    """
+    """The plant between ends of measured states: of A(rho) and of B u + offset, and its size."""
 
     A: Pair
     forced: Pair
@@ -129,10 +122,7 @@ def balance(design: SetDesign, states: Pair, u: ca.SX, exact: ca.SX) -> Balance:
 def drives(
     design: SetDesign, states: Pair, outputs: Pair, u: ca.SX, exact: ca.SX, x: Pair
 ) -> tuple[Drive, Drive]:
-    """Return the lower and the upper bounding system; x are ends of all states.
-
-    In the plant's own coordinates x >= 0 is left to the bounding systems.
-    """
+    """Return the lower and the upper bounding system; x are ends of all states."""
     found, frame, given = balance(design, states, u, exact), design.frame, design.coordinates
     A, forced, size = found.A, found.forced, found.size
     M = [end - ca.DM(design.L @ design.C) for end in A]
@@ -186,10 +176,7 @@ def residuals(design: SetDesign, memory: Memory, low: ca.SX, high: ca.SX) -> tup
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """What an output says of a fault: factor * fault is on one side of rest, 0 where it is silent.
-
-    size: sum of the magnitudes of what rest and factor * fault are made of
-    """
+    """factor * fault is on one side of rest, 0 where an output is silent; size: of their terms."""
 
     factor: ca.SX
     rest: ca.SX
@@ -201,8 +188,7 @@ def pulls(
 ) -> tuple[list[list[Pull]], list[list[Pull]]]:
     """Return what bounds every fault from above and below, the others anywhere in their bounds.
 
-    N_m theta <= r_m bounds fault i from above where N_m,ki > 0 and from below where it is negative,
-    r_M <= N_M theta the other way; k is the output that shows it. sizes (m, 1): of the readings.
+    By N_m theta <= r_m and r_M <= N_M theta and the signs of N; sizes (m, 1): of the readings.
     """
     N, size = responses(design, memory), sizes + shown_size(design, memory)
     bounds = memory["theta_m"], memory["theta_M"]
@@ -233,12 +219,9 @@ def shown_size(design: SetDesign, memory: Memory) -> ca.SX:
 
 
 def theta_rates(design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return the derivatives of theta_m and theta_M.
+    """Return the derivatives of theta_m and theta_M by the law of the method's page.
 
-    Printed, (8): -Gamma Omega'C'(r + C Omega theta). Cooperative, with N = -C Omega: every
-    component goes towards what its own output leaves when the other faults are anywhere in their
-    bounds, so that the order is kept for every Gamma. Where N >= 0 that is
-    theta_m,i' = Gamma_i N_ki (r_m,k - sum_{j != i} N_kj theta_M,j - N_ki theta_m,i).
+    The cooperative one moves every component towards what its own output leaves.
     """
     own = memory["theta_m"], memory["theta_M"]
     if design.law == "printed":

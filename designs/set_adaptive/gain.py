@@ -1,12 +1,7 @@
 """The gain by linear programming: A_m - L C and A_M - L C Metzler and Hurwitz with one p.
 
-With W = diag(p) L the conditions
-
-    diag(p) A_lower - W C + diag(r) >= 0   (elementwise, r >= 0),
-    p'A_upper - 1'W C <= -alpha p' ,        p > 0, sum(p) = 1
-
-are linear for a fixed decay alpha; A_lower is the least A_m and A_upper the largest A_M over the
-range of the outputs. The largest alpha is found by a ratio iteration in which every iterate is a
+The conditions (docs/methods/set_adaptive_observer.md, Gain) are linear in p and W = diag(p) L for
+a fixed decay alpha. The largest alpha is found by a ratio iteration in which every iterate is a
 design. (The paper's L = p w' solves neither p'L = w' nor the Metzler condition.)
 """
 
@@ -30,12 +25,7 @@ _GRID = 2.0**40
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """A gain with the vector and the decay that certify it.
-
-    L (n, m)
-    p (n,): positive, its sum about 1
-    alpha: p'(A_upper - L C) <= -alpha p'
-    """
+    """A gain L (n, m), and p (n,) > 0, alpha that certify it: p'(A_upper - L C) <= -alpha p'."""
 
     L: FloatArray
     p: FloatArray
@@ -52,8 +42,7 @@ def design_gain(
 ) -> Gain:
     """Return the gain of the fastest decay with entries of size at most `cap`.
 
-    Without a cap the supremum need not be attained. judge: what a gain is worth; without, what it
-    certifies where outputs show single states, its entries lowered to what is Metzler
+    judge: what a gain is worth; without, what it certifies, lowered to what is Metzler
     """
     alpha, best = -np.inf, None
     if judge is None:
@@ -77,10 +66,9 @@ def design_gain(
 
 
 def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: FloatArray) -> Gain:
-    """Return p and the largest decay of a given gain; a negative decay shows that it is unstable.
+    """Return p and the largest decay of a given gain; a negative one shows that it is unstable.
 
-    A_upper - L C is a Metzler matrix, so its left Perron vector is the best p. For a reducible
-    matrix a small coupling keeps p positive.
+    The left Perron vector of A_upper - L C is the best p; a small coupling keeps it positive.
     """
     lacking = off_diagonal(A_lower - L @ C)
     if lacking.min(initial=0.0) < 0.0:
@@ -111,10 +99,7 @@ def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: Flo
 def gain_problem(
     A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, cap: float, alpha: float
 ) -> Problem:
-    """Return the program for a given decay, which is possible where its optimum is not negative.
-
-    Its variables are P = diag(p), W = P L, R = diag(r) and the margin t of the decay.
-    """
+    """Return the program for a decay; variables P = diag(p), W = P L, R = diag(r), margin."""
     n, m = A_lower.shape[0], C.shape[0]
     problem = Problem("gain of the set adaptive observer")
     P, R, W, t = diagonal("P", n), diagonal("R", n), full("W", n, m), scalar("margin")

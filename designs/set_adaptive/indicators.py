@@ -47,8 +47,6 @@ class Indicators:
 class Monitors:
     """Means over the window, (13), and what they tell.
 
-    R_m, R_M (q, q)
-    b_m, b_M (q,)
     limit_m, limit_M (q,): R^-1 b, where the printed law would settle; NaN while R is singular
     excitation: smallest eigenvalue of R_m and R_M: persistent excitation keeps it positive
     weight: length of the window that is filled, in seconds

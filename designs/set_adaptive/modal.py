@@ -1,9 +1,7 @@
 """A choice of coordinates and gain for plants whose own coordinates have no Metzler error matrix.
 
-A row s of S with a gain row k keeps to itself with the rate -r where s'(A - L C) = -r s', that is
-s' = k' C (A + r I)^-1: real modal coordinates of A - L C, row by row, for any rates and gain rows.
-Modes that no output sees keep their own rates; they have to be real and decay. Nothing that is
-proved rests on the choice.
+Real modal coordinates of A - L C, row by row: docs/methods/set_adaptive_observer.md, Other
+coordinates. Nothing that is proved rests on the choice.
 """
 
 from collections.abc import Iterator
@@ -142,11 +140,7 @@ def _candidates(A: FloatArray, C: FloatArray) -> Iterator[tuple[FloatArray, Floa
 
 
 def predicted_cost(model: SetModel, found: Choice, Ts: float | None) -> float:
-    """Return half widths of faults and states in the long run, in shares of their ranges, summed.
-
-    What S leaves of A, and what A varies by, counts with the declared ranges of states that are not
-    measured; a share s as s / (1 + s).
-    """
+    """Return half widths of faults and states s in the long run, summed as s / (1 + s)."""
     S, K, D = found.S, found.gain.L, found.D
     plant, back = model.plant, np.linalg.inv(S)
     A, varies = middle(model)

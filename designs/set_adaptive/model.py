@@ -35,10 +35,7 @@ CLASS = PlantClass(
 
 @dataclass(frozen=True, eq=False)
 class SetModel(System):
-    """A plant of the class with everything derived from it.
-
-    form: with the proof that it is the plant
-    """
+    """A plant of the class with all that is derived; form: with the proof that it is the plant."""
 
     form: QuasiLPV
 
@@ -70,10 +67,7 @@ class SetModel(System):
 
 
 def read(given: Plant | Split, noise: bool = True, own: bool = True) -> SetModel:
-    """Read a plant, with or without its disturbances, or refuse it by name.
-
-    own: for bounds in the plant's own coordinates, which needs states that are not negative
-    """
+    """Read a plant, or refuse it by name; own: for bounds in its own coordinates, x >= 0."""
     plant = CLASS.check(given if isinstance(given, Plant) else given.model)
     plant.check()
     for signal in plant.x:
@@ -148,11 +142,7 @@ def read_again(design: SetDesign) -> SetModel:
 def output_of_fault(
     C: FloatArray, flow: FloatArray, G: FloatArray, names: tuple[str, ...]
 ) -> list[int]:
-    """Return for every fault the output that shows it first, by derivatives, then by size.
-
-    What it does to one state may cancel what it does to another: the output that is found then
-    tells little of it, or nothing.
-    """
+    """Return for every fault the output that shows it first, by derivatives, then by size."""
     flow = flow - np.diag(np.diag(flow))
     found = []
     for j, name in enumerate(names):

@@ -12,8 +12,7 @@ def solve_printed(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve p'A_o - w'C < 0, p'A_o - w'C + r' >= 0 for p > 0, w and r >= 0, and set L = p w'.
 
-    Any p and w that meet the first condition meet the second with a large r, so nothing of the
-    Metzler property is asked; and p'(p w') = (p'p) w' is not w'.
+    A large r meets the second condition, and p'(p w') = (p'p) w' is not w'.
     """
     from scipy.optimize import linprog
 

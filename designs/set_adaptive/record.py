@@ -21,12 +21,9 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 class System(Record):
     """The plant in the form (3) of the paper, x' = A x + B u + offset + G theta + W1 w.
 
-    plant: continuous
-    bounds: of A, B and the offset
     w_centre, w_radius: box of the disturbances, zero where the noise is left out
-    rate: range of the derivative of C x over the declared ranges, inputs left out where they enter
-        with a constant factor
-    input_rate: these factors
+    rate: range of the derivative of C x over the declared ranges, without inputs that enter with a
+        constant factor, which `input_rate` has
     """
 
     plant: Plant
@@ -58,16 +55,12 @@ class System(Record):
 class SetDesign(System, Design):
     """Everything that is deployed and proved of the set adaptive observer.
 
-    Ts: sample time of the step
-    noisy: whether the disturbances are included
     A_lower, A_upper: least A_m and largest A_M of the continuous form (noise included)
     A_upper_step: the same with what the outputs move within a step
     A_lower_box: least A_m for ends anywhere in the declared ranges
     alpha, alpha_step: decay of the continuous form and of the step
     fault_outputs: the output that adapts each fault
-    window: time constant of the monitors in seconds, None for all time
     coordinates: z = S x in which the bounds move, None for x itself; L is the gain in them
-    options: the options of the method, as given
     """
 
     Ts: float

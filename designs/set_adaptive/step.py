@@ -1,11 +1,7 @@
 """The guaranteed discrete step of the observer, and its continuous form.
 
-Between two samples the output moves, so the bounds of A are frozen over everything it may show:
-y - v plus what C x falls in one step at most, up to y + v plus what it rises. The bounding
-systems are then linear with constant coefficients over the step, and their exact exponential
-(uniformisation, all terms nonnegative) keeps the order for every sample time; zeta, Omega and xi
-move by the same transition, so x - zeta + Omega theta keeps its sign. The fault bounds follow by
-backward Euler, which is a convex combination of two bounds.
+Bounds of A are frozen over everything that the output may show until the next sample; the exact
+exponential of the bounding systems keeps their order (docs/methods/set_adaptive_observer.md).
 """
 
 from collections.abc import Sequence
@@ -66,11 +62,10 @@ def begun(x: Sequence[Any], f: Sequence[Any]) -> dict[str, Any]:
 
 
 def build_core(design: SetDesign) -> Core:
-    """Build the observer.
+    """Build the observer: fault bounds from y_k, xi of x_k, then the prediction with u_k.
 
-    At instant k: first the fault bounds from y_k, then xi of x_k, then the prediction to k + 1
-    with u_k. Where a reading is missing the output is anywhere in its range, and no fault bound
-    moves. The printed law keeps no order, so no bound of it is given.
+    Where a reading is missing the output is anywhere in its range, and no fault bound moves. The
+    printed law keeps no order, so no bound of it is given.
     """
     plant, sizes = design.plant, memory_sizes(design)
     m = len(plant.output)
@@ -130,9 +125,7 @@ def build_core(design: SetDesign) -> Core:
 def build_ode(design: SetDesign) -> ca.Function:
     """Build (memory, u, y[, theta]) -> dmemory of equations (6)-(8), (13), (14).
 
-    With noise the bounds are those for states anywhere in y - v to y + v (inside their ranges)
-    and the gain is fed with y -+ v; without, they are the printed functions of y, outside of the
-    ranges too, as far as they are regular.
+    With noise for states anywhere in y - v to y + v; without, the printed functions of y.
     """
     plant = design.plant
     vector = ca.SX.sym("memory", sum(memory_sizes(design).values()))
@@ -226,8 +219,8 @@ def _frozen(
 ) -> tuple[Drive, Drive]:
     """Return the bounding systems for everything that C x may show until the next sample.
 
-    In coordinates of their own, for all that the states may be: what moves them from where they
-    are is bounded by what does in the declared ranges first, then by what does within that reach.
+    In coordinates of their own, for all that the states may be: their reach by the speeds in the
+    declared ranges first, then by those within that reach.
     """
     given, states = design.coordinates, (x.lower, x.upper)
     if given is None:

@@ -20,11 +20,7 @@ _TAIL = 2.0**-64
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the powers of Q = I + M / mu.
-
-    state (J + 1,): of the terms of e^{hM}: the Poisson probabilities of h mu
-    drive (J + 1,): of the terms of the integral of e^{sM} from 0 to h: their tails, divided by mu
-    """
+    """Weights of the powers of Q = I + M / mu: Poisson probabilities, and tails over mu."""
 
     h: float
     mu: float
@@ -33,10 +29,7 @@ class Weights:
 
 
 def uniformisation(h: float, mu: float) -> Weights:
-    """Return the weights for a step h and a mu that no diagonal entry of -M exceeds.
-
-    e^{hM} = e^{-h mu} sum (h (M + mu I))^j / j!, all terms nonnegative.
-    """
+    """Return the weights for a step h and a mu that no diagonal entry of -M exceeds."""
     product = h * mu
     if not 0.0 < product <= LARGEST_PRODUCT:
         raise ObsynthError(
@@ -67,10 +60,7 @@ def _poisson(mean: float) -> tuple[list[float], list[float]]:
 
 
 def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
-    """Return e^{hM} state + (integral of e^{sM}) drive by Horner's scheme.
-
-    Shapes: M (n, n), state, drive (n, c).
-    """
+    """Return e^{hM} state + (integral of e^{sM}) drive, (n, c) each, by Horner's scheme."""
     Q = M / weights.mu + ca.SX.eye(M.shape[0])
     result = weights.state[-1] * state + weights.drive[-1] * drive
     for chance, tail in zip(weights.state[-2::-1], weights.drive[-2::-1], strict=True):

@@ -43,9 +43,8 @@ class Around:
 
 @dataclass(frozen=True, eq=False)
 class SetMembershipModel:
-    """A plant, and its equations around a point of operation.
+    """A plant in discrete time, and its equations around a point of operation.
 
-    plant: in discrete time
     followed: places of faults that are states of the zonotopes
     general: what the general class makes of the plant, None where it is not of it
     """
@@ -97,9 +96,9 @@ class SetMembershipModel:
 
     @cached_property
     def beside(self) -> FloatArray:
-        """Half widths of variables that z does not carry; of those without a range a guess, (n_v,).
+        """Half widths of variables that z does not carry, (n_v,).
 
-        The guess is what moves no state by more than a tenth of half its range in a call.
+        Of those without a range what moves no state by more than a tenth of half its range.
         """
         half = 0.5 * np.diff(self.box, axis=1)[:, 0]
         half[[*self.enclosures.place]] = 0.0
@@ -149,10 +148,7 @@ class SetMembershipModel:
 
     @cached_property
     def _around(self) -> ca.Function:
-        """(lower, upper) of all variables and known signals -> J, columns, spread, H, sigma.
-
-        One behind the other, each by columns.
-        """
+        """(lower, upper) of all variables and known signals -> J, columns, spread, H, sigma."""
         sweeps = self.enclosures.sweeps
         n, n_f, n_v = sweeps.n, sweeps.n_f, sweeps.equations.n_v
         lower, upper = ca.SX.sym("lower", n_v), ca.SX.sym("upper", n_v)

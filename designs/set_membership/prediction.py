@@ -1,7 +1,6 @@
 """How wide the sets become: the generators of the bank followed at the point of operation.
 
-The same recursion as the step's, in numbers and without its rounding: enclosures over boxes as wide
-as the sets have become, readings in the middle of their strips, columns dropped in the same order.
+The step's recursion in numbers and without its rounding, readings in the middle of their strips.
 Nothing that is proved rests on it; it chooses among gains, coordinates and numbers of columns.
 """
 

@@ -21,7 +21,6 @@ MOST_COLUMNS = 400
 class SetMembershipDesign(Design):
     """Everything that is deployed and proved.
 
-    plant: the discrete plant
     followed: faults that the zonotopes carry as states, by their rates
     L: the gain, (N, m)
     V, W, size, leak: see `Frame`
@@ -29,9 +28,8 @@ class SetMembershipDesign(Design):
     columns, kept: K, and for how many calls a generator is kept before it becomes part of a box
     zonotopes, restart: how many zonotopes begin anew every so many calls
     contraction: bound of the spectral radius of ``|V^-1 ((I - L C) A)^kept V|``
-    predicted: half widths at the point of operation, states then faults
-    share: of the declared ranges that the prediction begins from
-    settles: calls that they take to stand still, from the declared ranges
+    predicted, share, settles: half widths at the point of operation, from which share of the
+        declared ranges they were followed, and calls until they stand still
     peak: an observer of the general class with peak bounds, whose sets are met with the others
     """
 

@@ -1,9 +1,6 @@
 """What runs: a bank of zonotopes between the boxes that the sweeps leave.
 
-One zonotope is corrected by the gain of the design; the others begin from the box of states and
-faults every so many calls, one after the other, and are cut with every reading apart. All of them
-hold z = (x, faults that are followed), so their hulls are met, with the box of the peak bounds
-where there are any.
+All hold z = (x, faults that are followed): docs/methods/set_membership_observer.md, Step.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,7 @@
 """Gain, coordinates and numbers of columns: candidates, and the choice by what they predict.
 
-Gains are those of a Kalman filter at the point of operation, with a share of the readings' noise
-that is varied; coordinates of the reduction are the modes of ``(I - L C) A``, the roots of the
-filter's covariance, or the states as they are. Whatever is chosen, the sets hold.
+Gains are those of a Kalman filter at the point of operation with shares of the readings' noise,
+or of peak bounds; see the options. Whatever is chosen, the sets hold.
 """
 
 from collections.abc import Iterator, Mapping
@@ -189,7 +188,6 @@ def candidates(
 class Wishes:
     """What the options say of a bank; None for the choice.
 
-    columns: the most that a zonotope may have
     weights: of states and faults in the mean of half widths, in units of half their ranges
     held: half widths that are guaranteed whatever the bank is, infinite where none is
     fitting: whether a number of operations has to be kept to
@@ -224,8 +222,7 @@ class Wishes:
 class Tried:
     """A gain with a bank, what it predicts, and the weighted mean of that.
 
-    size: of the step, relative to others of the same plant
-    share: of the declared ranges that the prediction begins from
+    size: of the step, relative to others; share: of the ranges that the prediction begins from
     """
 
     gain: Gain

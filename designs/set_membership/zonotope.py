@@ -93,8 +93,7 @@ class Strips:
     def read(cls, z: Zonotope, H: ca.SX, rest: ca.SX, sigma: ca.SX, used: ca.SX) -> "Strips":
         """Return what readings say of a zonotope; nothing where they are not used.
 
-        rest: ``y - o``, (m,). Computed are ``b = rest - H c`` and ``a = H G``; sigma takes what
-        rounding adds to either.
+        rest: ``y - o``, (m,); sigma takes what rounding adds to ``b = rest - H c`` and ``a = H G``
         """
         N, real = H.shape[1], z.real
         size = ca.fabs(H) @ (ca.fabs(z.centre) + z.radius) + ca.fabs(rest)
@@ -135,9 +134,7 @@ def corrected(z: Zonotope, L: ca.SX, strips: Strips, used: ca.SX) -> Zonotope:
 def cut(z: Zonotope, strips: Strips, used: ca.SX) -> Ends:
     """Bound coordinates by one strip at a time and the zonotope together, (N,).
 
-    For any number lam: ``x_i <= c_i + lam b + sum_j |g_ij - lam a_j| + |lam| sigma``, which is
-    least where some ``g_ij = lam a_j`` or lam is zero. All of these are tried where they are few,
-    ``lam = g_i a' / (a a' + sigma^2)`` in any case. Where a strip and the set have a point in
+    docs/methods/set_membership_observer.md, Step, 5. Where a strip and the set have a point in
     common, neither |lam b| nor ``|lam| sum_j |a_j|`` is above ``sum_j |g_ij|`` and the reach.
     """
     hull, real = z.hull, z.real
@@ -191,10 +188,7 @@ class Frame:
 
 
 def reduced(z: Zonotope, keep: int, frame: Frame) -> Zonotope:
-    """Replace all but the first columns, and the slack, by a box in the coordinates of a frame.
-
-    ``D xi = V (W D xi) + (I - V W) D xi``, and whatever vector r is left, ``|V^-1 r| <= size |r|``.
-    """
+    """Replace all but the first columns, and the slack, by a box in coordinates of a frame."""
     N, real = len(frame.V), z.real
     kept, dropped = z.generators[:, :keep], z.generators[:, keep:]
     W, wide = _sparse(frame.W), row_sums(dropped) * real.up
