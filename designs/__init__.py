@@ -23,7 +23,7 @@ from obsynth.designs.interval.method import IntervalObserver as IntervalObserver
 from obsynth.designs.interval.printed import printed_faults as printed_faults
 from obsynth.designs.qpv.method import QPVObserver as QPVObserver
 from obsynth.designs.qpv.printed import printed_gains as printed_gains
-from obsynth.designs.qpv.region import Ellipsoid as Ellipsoid
+from obsynth.designs.qpv.sets import Ellipsoid as Ellipsoid
 from obsynth.designs.set_adaptive.indicators import fault_indicators as fault_indicators
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver as SetAdaptiveObserver
 from obsynth.designs.set_membership.method import SetMembershipObserver as SetMembershipObserver

@@ -6,12 +6,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import Ends, column, every, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign
 from obsynth.symbolic.arrays import FloatArray
@@ -338,3 +340,36 @@ def _move_filters(
         *(decay * N + gathered * gain for (_, gain, _), (decay, gathered), N in moves)
     )
     return moved
+
+
+def bank_intervals(
+    observer: Observer, memory: ArrayLike, y: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return the fault intervals of every filter of a bank.
+
+    Each holds the mean of the fault since the sets began, with the weights exp(-rate age); an alarm
+    of any of them, zero outside of it, proves a fault. `Observer.step` decides by all of them too.
+
+    Shapes: memory (..., n_memory), y (..., m).
+    """
+    if observer.method != "filter_bank":
+        raise ObsynthError(
+            f"the observer of the method {observer.method!r} is no bank of filters",
+            method=observer.method,
+        )
+    design: BankDesign = observer.certificate.design
+    parts, layout = np.asarray(memory, dtype=float), observer.memory_layout
+    shown = np.asarray(y, dtype=float)[..., None]
+    outputs, rates = design.outputs.tolist(), len(design.filters)
+    places = [outputs.index(i) for i in design.fault_rows.tolist()]
+    shape = (*parts.shape[:-1], len(places), rates)
+    # what begins anew at its next call knows nothing yet
+    N = (parts[..., layout["response"]] * (parts[..., layout["begin"]] < 0.5)).reshape(shape)
+    found = []
+    for noise, side in ((1, "upper"), (0, "lower")):
+        ends = (shown[..., 0] - design.noise[:, noise]) / design.scale
+        rest = ends[..., places][..., None] - parts[..., layout[f"filter_{side}"]].reshape(shape)
+        open_end = np.full(shape, -np.inf if noise else np.inf)
+        found.append(np.divide(rest, np.abs(N), out=open_end, where=N != 0.0))
+    rises = design.gain[:, None] > 0.0
+    return np.where(rises, found[0], -found[1]), np.where(rises, found[1], -found[0])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.derive.rigour import Enclosure
 from obsynth.designs.lmi.reductions import extreme_points
-from obsynth.designs.qpv.polytopes import Shape
+from obsynth.designs.qpv.sets import Shape
 from obsynth.symbolic.arrays import FloatArray
 
 # Hulls in more coordinates have too many facets.

@@ -15,7 +15,7 @@ from obsynth.designs.core.given import POSITIVE, Number, read_gains, read_matrix
 from obsynth.designs.core.guard import MOST_CALLS
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi.problem import Problem
-from obsynth.designs.qpv import claims, guarantee, model, step
+from obsynth.designs.qpv import claims, model, step
 from obsynth.designs.qpv.claims import prove_rounding
 from obsynth.designs.qpv.model import (
     CLASS,
@@ -35,8 +35,8 @@ from obsynth.designs.qpv.model import (
 )
 from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
-from obsynth.designs.qpv.region import Ellipsoid
 from obsynth.designs.qpv.rounding import settle
+from obsynth.designs.qpv.sets import Ellipsoid
 from obsynth.designs.qpv.step import SETTLED, found_again
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise
 from obsynth.symbolic import Plant
@@ -124,7 +124,7 @@ class QPVObserver(Method):
     """
 
     CLASS = CLASS
-    CONTRACT = Contract.of("qpv_observer", QPVDesign, claims, guarantee, model, step, quiet=True)
+    CONTRACT = Contract.of("qpv_observer", QPVDesign, claims, model, step, quiet=True)
 
     norm: Norm = "h2"
     region: Ellipsoid | None = None

@@ -16,9 +16,8 @@ from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family
-from obsynth.designs.qpv.polytopes import Shape, box, cross, hull, one_of_each_pair
 from obsynth.designs.qpv.record import FormOfN, NoiseBound, QPVDesign, VertexData
-from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.designs.qpv.sets import Ellipsoid, Shape, box, cross, hull, one_of_each_pair
 from obsynth.symbolic import Plant, Role
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -16,8 +16,7 @@ from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design, Record
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_kept
 from obsynth.designs.qpv.lmis import PolyaTerm, collapsed_terms, polya_terms
-from obsynth.designs.qpv.polytopes import Shape
-from obsynth.designs.qpv.region import Ellipsoid
+from obsynth.designs.qpv.sets import Ellipsoid, Shape
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.set_adaptive.coordinates import image, product
 from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.symbolic.arrays import FloatArray
 
 _PARTS = {
     "zeta_m": "n",
@@ -236,3 +236,34 @@ def theta_rates(design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX]) -> tu
         ]
         rates.append(ca.vertcat(*parts))
     return rates[0], rates[1]
+
+
+def image(matrix: FloatArray, low: ca.SX, high: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the ends of M a for every a between two ends, columns or matrices."""
+    plus, minus = ca.DM(np.maximum(matrix, 0.0)), ca.DM(np.minimum(matrix, 0.0))
+    return plus @ low + minus @ high, plus @ high + minus @ low
+
+
+def carried(
+    matrix: FloatArray | None, low: ca.SX, high: ca.SX, share: float
+) -> tuple[ca.SX, ca.SX]:
+    """Return the ends of M a outside of what rounding may do, a share of the terms' magnitudes."""
+    if matrix is None:
+        return low, high
+    first, second = image(matrix, low, high)
+    slack = share * (ca.DM(np.abs(matrix)) @ ca.fmax(ca.fabs(low), ca.fabs(high)))
+    return first - slack, second + slack
+
+
+def product(M: tuple[ca.SX, ca.SX], x: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Return the ends of M x, column, for a matrix and a column between two ends each."""
+    ends: tuple[list[ca.SX], list[ca.SX]] = ([], [])
+    for i in range(M[0].shape[0]):
+        low, high = ca.SX(0), ca.SX(0)
+        for j in range(M[0].shape[1]):
+            corners = [a[i, j] * b[j] for a in M for b in x]
+            low = low + ca.fmin(ca.fmin(*corners[:2]), ca.fmin(*corners[2:]))
+            high = high + ca.fmax(ca.fmax(*corners[:2]), ca.fmax(*corners[2:]))
+        ends[0].append(low)
+        ends[1].append(high)
+    return ca.vertcat(*ends[0]), ca.vertcat(*ends[1])

@@ -15,26 +15,29 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.set_adaptive import claims, equations, model, step
-from obsynth.designs.set_adaptive.coordinates import Coordinates, build_frame, read_coordinates
 from obsynth.designs.set_adaptive.equations import MONITORS
 from obsynth.designs.set_adaptive.gain import (
+    Choice,
     Gain,
     analyse_gain,
+    complete,
     design_gain,
     gain_problem,
-    settled_response,
-)
-from obsynth.designs.set_adaptive.modal import (
-    Choice,
-    complete,
     given_coordinates,
     middle,
     modal_coordinates,
     modes_of,
+    settled_response,
 )
 from obsynth.designs.set_adaptive.model import CLASS, SetModel, output_of_fault, read
 from obsynth.designs.set_adaptive.printed import printed_gain
-from obsynth.designs.set_adaptive.record import SetDesign, System
+from obsynth.designs.set_adaptive.record import (
+    Coordinates,
+    SetDesign,
+    System,
+    build_frame,
+    read_coordinates,
+)
 from obsynth.designs.set_adaptive.transition import uniformisation
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray

@@ -1,4 +1,9 @@
-"""The stored design: plain data from which step, ode and proofs are made."""
+"""The stored design, and the coordinates z = S x in which its bounds move.
+
+    z' = D z + (S A - D S - L C) x + L (C x) + S (B u + offset + G theta + W1 w)
+
+for any S, D and L: docs/methods/set_adaptive_observer.md, Other coordinates.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,13 +13,78 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from obsynth.derive.jacobian.slope_signs import with_ranges
-from obsynth.derive.rigour import allowance
+from obsynth.derive.rigour import allowance, exact, inverse, nearest
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design, Record
 from obsynth.designs.set_adaptive.bounds import EndBounds
-from obsynth.designs.set_adaptive.coordinates import Coordinates, Frame, build_frame
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.errors import ObsynthError
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates(Record):
+    """What is stored of coordinates: S and D of the equation above.
+
+    rate, input_rate: ranges of the derivatives of all states, as those of the outputs in `System`
+    """
+
+    S: Annotated[FloatArray, "n n"]
+    D: Annotated[FloatArray, "n n"]
+    rate: Annotated[FloatArray, "n 2"]
+    input_rate: Annotated[FloatArray, "n n_u"]
+
+    def check(self) -> None:
+        """Refuse coordinates that do not tell the states apart."""
+        try:
+            inverse(exact(self.S))
+        except ObsynthError as error:
+            raise CertificateError("S of the stored design has no inverse") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The plant in the coordinates of the bounds: exact in S, L and D, every number rounded once.
+
+    C (m, n), G (n, n_f), W1 (n, n_w): of z, C S^-1, S G and S W1
+    back, own (n, n): S^-1 and D S + L C, by what A differs from which the drive is
+    """
+
+    C: FloatArray
+    G: FloatArray
+    W1: FloatArray
+    back: FloatArray | None = None
+    own: FloatArray | None = None
+
+
+def read_coordinates(rows: tuple[tuple[float, ...], ...], names: tuple[str, ...]) -> None:
+    """Refuse an S that is not square, or that does not tell the states apart."""
+    S, n = np.array(rows), len(names)
+    if S.shape != (n, n):
+        raise ObsynthError(
+            f"coordinates has shape {S.shape}; S of z = S x has a row and a column for each of "
+            f"{', '.join(names)}",
+            option="coordinates",
+        )
+    try:
+        inverse(exact(S))
+    except ObsynthError as error:
+        raise ObsynthError(
+            f"coordinates do not tell {', '.join(names)} apart: S has no inverse",
+            option="coordinates",
+        ) from error
+
+
+def build_frame(
+    C: FloatArray, G: FloatArray, W1: FloatArray, L: FloatArray, given: Coordinates | None
+) -> Frame:
+    """Return the frame of a plant's own coordinates, or of others."""
+    if given is None:
+        return Frame(C, G, W1)
+    S, D = exact(given.S), exact(given.D)
+    back, shown = inverse(S), exact(C)
+    rows = (shown @ back, S @ exact(G), S @ exact(W1), back, D @ S + exact(L) @ shown)
+    return Frame(*map(nearest, rows))
 
 
 @dataclass(frozen=True, eq=False)

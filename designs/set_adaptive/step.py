@@ -16,15 +16,16 @@ from obsynth.designs.core.boxes import Ends, column, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import make_ode, slices
-from obsynth.designs.set_adaptive.coordinates import carried, image
 from obsynth.designs.set_adaptive.equations import (
     MONITORS,
     Drive,
     Memory,
     Pair,
+    carried,
     columns,
     drives,
     ends,
+    image,
     memory_sizes,
     pulls,
     residuals,

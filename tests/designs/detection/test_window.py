@@ -16,8 +16,7 @@ from contracted import drawn, finite, made, signals
 import obsynth as ob
 from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
-from obsynth.designs.detection.relations import relations
-from obsynth.designs.detection.window import Window
+from obsynth.designs.detection.window import Window, relations
 
 NOT_VALID, VOID = STATUS["fault_not_valid"], STATUS["void"]
 KINDS = ("u", "d", "f", "w", "p", "rho")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import obsynth as ob
 from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family, psi_kept
 from obsynth.designs.qpv.model import read_form
-from obsynth.designs.qpv.polytopes import box, cross, hull
+from obsynth.designs.qpv.sets import box, cross, hull
 
 REGION = ob.Ellipsoid([1.0, 0.1], [5.0, 0.0])
 

@@ -12,8 +12,8 @@ import obsynth as ob
 from methods import METHODS
 from obsynth.designs.core.core import Seen
 from obsynth.designs.qpv import claims as proofs
+from obsynth.designs.qpv.claims import guarantee
 from obsynth.designs.qpv.equations import build_update
-from obsynth.designs.qpv.guarantee import guarantee
 from obsynth.designs.qpv.record import ASSUMED
 from obsynth.designs.qpv.rounding import needed, of_step, settle
 from obsynth.designs.qpv.step import build_core

@@ -15,7 +15,7 @@ from adaptive_runs import CASES, made_of, of, oscillator, outside, unstable
 import obsynth as ob
 from obsynth.derive.rigour import allowance, exact, inverse
 from obsynth.designs.set_adaptive import equations, step
-from obsynth.designs.set_adaptive.coordinates import carried, product
+from obsynth.designs.set_adaptive.equations import carried, product
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 SHARES = {"oscillator": (0, 0.6), "lag": (3, 0.7), "growing": (1, 0.6), "machine": (2, 0.1)}

@@ -13,8 +13,8 @@ from adaptive_runs import outside
 
 import obsynth as ob
 from obsynth.designs.filter_bank.claims import claims
-from obsynth.designs.filter_bank.indicators import bank_intervals
 from obsynth.designs.filter_bank.method import FilterBank
+from obsynth.designs.filter_bank.step import bank_intervals
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
 
 SIZE = 0.2

@@ -8,9 +8,9 @@ import pytest
 import obsynth as ob
 from obsynth.derive.jacobian.slope_signs import Monotone, with_ranges
 from obsynth.designs.filter_bank import step as step_module
-from obsynth.designs.filter_bank.indicators import bank_intervals
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.filter_bank.model import read as filter_bank_model
+from obsynth.designs.filter_bank.step import bank_intervals
 from obsynth.symbolic.noise import bounded_noise
 
 REGION = [(0.2, 0.9), (0.0, 0.4), (0.1, 0.6)]
