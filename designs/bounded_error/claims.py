@@ -9,28 +9,16 @@ import numpy as np
 
 from obsynth.derive.rigour import is_positive_definite, prove_positive_definite
 from obsynth.derive.structure.conditions import decouple
-from obsynth.designs.bounded_error.lmis import (
-    Arithmetic,
-    ModelData,
-    build_error_system,
-    fixed_gain_block,
-    lift,
-)
+from obsynth.designs.bounded_error import lmis
+from obsynth.designs.bounded_error.lmis import Arithmetic, ModelData
 from obsynth.designs.bounded_error.model import MATRICES, Derived, Limits, noise_box
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
+from obsynth.designs.core import signals
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import (
-    DECLARED,
-    IEEE,
-    beyond,
-    covers_jacobian,
-    prove_boxes,
-    within,
-)
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
@@ -41,7 +29,7 @@ def claims(design: UioDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     rates = design.rate - noise_box(design.plant).rate
     w = design.plant.box("w")
-    yield prove_boxes(DECLARED, w, design.w_centre, design.w_radius, rates)
+    yield signals.prove_boxes(signals.DECLARED, w, design.w_centre, design.w_radius, rates)
     yield _prove_decoupling(design)
     yield prove_rounding(design)
     yield from prove_ellipsoid(design)
@@ -69,13 +57,13 @@ def recursion_block(
     arithmetic: Arithmetic,
 ) -> Any:
     """Form the matrix whose definiteness makes ellipsoid `number` invariant."""
-    system = build_error_system(data, bound.error, arithmetic)
-    X, Z = system.closed_loop(lift(gain, arithmetic))
-    gamma = lift(np.array([[bound.gamma[number]]]), arithmetic)
-    one = lift(np.ones((1, 1)), arithmetic)
-    noise = gamma * lift(np.diag(bound.weights[number]), arithmetic)
-    P = lift(bound.P[number], arithmetic)
-    return fixed_gain_block(X, Z, P, one - gamma, noise)
+    system = lmis.build_error_system(data, bound.error, arithmetic)
+    X, Z = system.closed_loop(lmis.lift(gain, arithmetic))
+    gamma = lmis.lift(np.array([[bound.gamma[number]]]), arithmetic)
+    one = lmis.lift(np.ones((1, 1)), arithmetic)
+    noise = gamma * lmis.lift(np.diag(bound.weights[number]), arithmetic)
+    P = lmis.lift(bound.P[number], arithmetic)
+    return lmis.fixed_gain_block(X, Z, P, one - gamma, noise)
 
 
 def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:
@@ -178,7 +166,7 @@ def covers(design: UioDesign, fresh: Derived) -> Iterator[Claim]:
         room,
         "bounds of |exact - double| times the limits of the signals",
     )
-    yield covers_jacobian("g", design.family, family)
+    yield signals.covers_jacobian("g", design.family, family)
 
 
 def numbers(design: UioDesign) -> Numbers:
@@ -190,8 +178,8 @@ def numbers(design: UioDesign) -> Numbers:
 def guarantee(design: UioDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     names = (*design.plant.names("x"), *design.plant.names("f"))
-    where = within(compress(design.plant.x, curved_states(design.plant)), units=True)
-    noise = within(design.plant.w)
+    where = signals.within(compress(design.plant.x, curved_states(design.plant)), units=True)
+    noise = signals.within(design.plant.w)
     rates = ", ".join(
         f"|{name}(k+1) - {name}(k)| <= {rate:g}"
         for name, rate in zip(design.plant.names("f"), design.rate, strict=True)
@@ -222,9 +210,11 @@ def _on_rounding(design: UioDesign) -> Iterator[str]:
         yield f"{said}, which is not proved for this plant"
         return
     plant, limits = design.plant, Limits.of(design.plant, design.precision)
-    listed = beyond((*plant.x, *plant.f, *plant.u), np.concatenate(limits))
+    listed = signals.beyond((*plant.x, *plant.f, *plant.u), np.concatenate(limits))
     where = f"{listed}, estimates too: there " if listed else ""
-    yield (f"{where}{said}, which is proved for {IEEE[design.precision]} rounded to nearest")
+    yield (
+        f"{where}{said}, which is proved for {signals.IEEE[design.precision]} rounded to nearest"
+    )
 
 
 def _gains(design: UioDesign) -> dict[str, FloatArray]:

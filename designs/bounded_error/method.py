@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
-from obsynth.designs.bounded_error import claims, model, step
+from obsynth.designs.bounded_error import claims, model, step, synthesis
 from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
 from obsynth.designs.bounded_error.lmis import (
     ErrorKind,
@@ -19,16 +19,7 @@ from obsynth.designs.bounded_error.lmis import (
 from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
-from obsynth.designs.bounded_error.synthesis import (
-    EllipsoidSolution,
-    Objective,
-    analyse_gain,
-    design_problem,
-    explain_infeasible,
-    largest_gamma,
-    search_gamma,
-    synthesise,
-)
+from obsynth.designs.bounded_error.synthesis import EllipsoidSolution, Objective
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.core.given import Number, changed, read_gains, refuse_idle
 from obsynth.designs.core.method import Contract, Method
@@ -228,15 +219,15 @@ class BoundedErrorUIO(Method):
         gain = given.gain(self.error)
 
         def solve(gamma: float) -> EllipsoidSolution:
-            return synthesise(system, gamma, noise, self.objective, weights, gain)
+            return synthesis.synthesise(system, gamma, noise, self.objective, weights, gain)
 
         def complete(solution: EllipsoidSolution) -> tuple[UioDesign, bool]:
             return self._complete(given, system, solution, noise, weights)
 
         if self.gamma is None:
-            return complete(analyse_gain(system, gain, noise, weights))[0]
+            return complete(synthesis.analyse_gain(system, gain, noise, weights))[0]
         return _at_or_explained(
-            self.gamma, solve, complete, lambda: largest_gamma(system, gain), system, gain
+            self.gamma, solve, complete, lambda: synthesis.largest_gamma(system, gain), system, gain
         )
 
     def problem(self, given: Plant | Split, bounds: JacobianBounds | None = None) -> Problem:
@@ -257,7 +248,7 @@ class BoundedErrorUIO(Method):
             noise, weights = self._noise(model, 3), self._weights(model)
             return multiplier_problem(data, self.gamma, noise, self.objective, weights, self.form)
         system, free_or_fixed, weights = self._setting(model)
-        return design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
+        return synthesis.design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
 
     def _weights(self, model: UioModel) -> FloatArray:
         design = model.design
@@ -287,10 +278,10 @@ class BoundedErrorUIO(Method):
         if self.form not in ("printed", "repaired"):
 
             def solve(gamma: float) -> EllipsoidSolution:
-                return synthesise(system, gamma, noise, self.objective, weights)
+                return synthesis.synthesise(system, gamma, noise, self.objective, weights)
 
             def top() -> float:
-                return largest_gamma(system)
+                return synthesis.largest_gamma(system)
 
         else:
             solve, top = self._multiplier_form(model, weights)
@@ -318,7 +309,7 @@ class BoundedErrorUIO(Method):
                 ],
                 largest_gamma=0.0,
             )
-        return complete(search_gamma(solve, weights, largest))[0]
+        return complete(synthesis.search_gamma(solve, weights, largest))[0]
 
     def _multiplier_form(self, model: UioModel, weights: FloatArray) -> tuple[Any, Any]:
         from obsynth.designs.bounded_error.printed import (
@@ -355,7 +346,9 @@ class BoundedErrorUIO(Method):
         gain = given.gain(self.error)
         solutions = [solution]
         if self.post == "per_component":
-            solutions = [analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))]
+            solutions = [
+                synthesis.analyse_gain(system, gain, noise, unit) for unit in np.eye(len(weights))
+            ]
         shapes = np.stack([s.P for s in solutions])
         gammas = np.array([s.gamma for s in solutions])
         rows = np.stack([s.weights for s in solutions])
@@ -396,7 +389,7 @@ def _at_or_explained(
     largest = top()
     told = f"the largest feasible gamma is about {largest:.5g}"
     if gamma >= largest:
-        lines, share = explain_infeasible(system, gamma, gain)
+        lines, share = synthesis.explain_infeasible(system, gamma, gain)
         raise InfeasibleDesign(
             f"gamma = {gamma:.6g} is infeasible"
             + (" for the given gain" if gain is not None else ""),

@@ -20,16 +20,9 @@ import numpy as np
 
 from obsynth.derive import JacobianBounds
 from obsynth.derive.rigour import ExactMatrix
+from obsynth.designs.bounded_error import synthesis
 from obsynth.designs.bounded_error.lmis import ModelData, multiplier_block
-from obsynth.designs.bounded_error.synthesis import (
-    FLOOR,
-    GAP,
-    MARGIN,
-    EllipsoidSolution,
-    Objective,
-    largest_feasible,
-    set_objective,
-)
+from obsynth.designs.bounded_error.synthesis import EllipsoidSolution, Objective
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi.expression import Affine, diagonal, full, scalar, symmetric
 from obsynth.designs.lmi.problem import Problem
@@ -71,8 +64,8 @@ def multiplier_problem(
     As in `design_problem`, P and H stand for gamma times those of the paper.
     """
     problem = Problem(f"(51), {form}, at gamma = {gamma:.6g}")
-    P = _state(problem, data, gamma, noise, form, MARGIN)
-    set_objective(problem, P, objective, weights, np.ones(len(weights)))
+    P = _state(problem, data, gamma, noise, form, synthesis.MARGIN)
+    synthesis.set_objective(problem, P, objective, weights, np.ones(len(weights)))
     return problem
 
 
@@ -103,7 +96,7 @@ def largest_multiplier_gamma(data: ModelData) -> float:
         problem = Problem(f"(51), repaired, decay at gamma = {gamma:.6g}")
         return problem, _state(problem, quiet, gamma, np.ones(2 * n_w + n_f), "repaired", 0.0)
 
-    return largest_feasible(state)
+    return synthesis.largest_feasible(state)
 
 
 def synthesise_multipliers(
@@ -116,7 +109,7 @@ def synthesise_multipliers(
 ) -> EllipsoidSolution:
     """Solve (51) at a fixed gamma."""
     problem = multiplier_problem(data, gamma, noise, objective, weights, form)
-    solution = solve_reliably(problem, floor=FLOOR, gap=GAP)
+    solution = solve_reliably(problem, floor=synthesis.FLOOR, gap=synthesis.GAP)
     gain = np.asarray(np.linalg.solve(solution["P"], solution["H"]), dtype=float)
     P = gamma * solution["P"]
     return EllipsoidSolution(gain, 0.5 * (P + P.T), gamma, noise)

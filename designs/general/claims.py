@@ -6,18 +6,11 @@ from itertools import compress
 import numpy as np
 
 from obsynth.derive.structure.following import NO_RATE, untold
+from obsynth.designs.core import signals
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import (
-    DECLARED,
-    IEEE,
-    beyond,
-    covers_jacobian,
-    prove_boxes,
-    within,
-)
 from obsynth.designs.general.fading import prove_fading
 from obsynth.designs.general.lmis import error_loop
 from obsynth.designs.general.model import GeneralModel, boxes
@@ -34,7 +27,7 @@ LOST = "no gain was found that follows it"
 def claims(design: GeneralDesign) -> Iterator[Claim]:
     """Prove everything that the guarantee of a stored design rests on."""
     box = design.extended.plant.box("w").reshape(-1, 2)
-    yield prove_boxes(DECLARED, box, design.v_centre, design.v_radius)
+    yield signals.prove_boxes(signals.DECLARED, box, design.v_centre, design.v_radius)
     yield prove_rounding(design)
     yield from prove_storage(design)
     if design.peak is not None:
@@ -88,7 +81,7 @@ def covers(design: GeneralDesign, fresh: GeneralModel) -> Iterator[Claim]:
         0.0,
         "constant directions proved symbolically, L0 in exact arithmetic" if free else "comparison",
     )
-    yield covers_jacobian("rows and outputs", design.family, fresh.bounds.family)
+    yield signals.covers_jacobian("rows and outputs", design.family, fresh.bounds.family)
 
 
 def numbers(design: GeneralDesign) -> Numbers:
@@ -113,10 +106,10 @@ def guarantee(design: GeneralDesign) -> Guarantee:
     """Return what is promised of the intervals, and what has to hold for it."""
     plant, extended = design.plant, design.extended
     names = (*plant.names("x"), *extended.followed)
-    where = within(
+    where = signals.within(
         compress(extended.plant.x, curved_states(extended.plant, noise=True)), units=True
     )
-    noise = within(extended.plant.w)
+    noise = signals.within(extended.plant.w)
     bound = design.bound
     if isinstance(bound, EnergyBound):
         claims = [*_energy_claims(design, bound)]
@@ -194,9 +187,9 @@ def _on_rounding(design: GeneralDesign) -> str:
     rounding = design.rounding
     largest = max(float(part.max(initial=0.0)) for part in (rounding.q, rounding.c, rounding.p))
     plant, limits = design.extended.plant, Limits.of(design.extended.plant, design.precision)
-    listed = beyond((*plant.x, *plant.u), np.vstack([limits.x, limits.u]))
+    listed = signals.beyond((*plant.x, *plant.u), np.vstack([limits.x, limits.u]))
     where = f"estimates and inputs with {listed}: there " if listed else ""
     return (
         f"{where}the rounding errors of one step stay below {largest:.1e} in every component, "
-        f"which is proved for {IEEE[design.precision]} rounded to nearest"
+        f"which is proved for {signals.IEEE[design.precision]} rounded to nearest"
     )

@@ -8,26 +8,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import UNIT, ExactMatrix, is_positive_definite, prove_positive_definite
+from obsynth.designs.core import signals
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import covered_inputs
 from obsynth.designs.core.method import Numbers
-from obsynth.designs.core.signals import (
-    LARGEST_SIGNAL,
-    about_centre,
-    at_centre,
-    covers_jacobian,
-    finite_box,
-    noise_centre,
-    within,
-)
-from obsynth.designs.hinf.lmis import (
-    PrintedLoop,
-    decay_block,
-    dissipation_block,
-    loop_of_filter,
-    printed_block,
-    printed_bound,
-)
+from obsynth.designs.hinf import lmis
+from obsynth.designs.hinf.lmis import PrintedLoop
 from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
 from obsynth.designs.hinf.system import Arithmetic, FilterData, build_sector, covers_sector, lift
@@ -65,16 +51,16 @@ def proof_blocks(
         alpha, beta, Q = number(bound.printed[0]), number(bound.printed[1]), bound.Q
         N = P @ lift(design.gains.K, arithmetic)
         return {
-            "lmi": printed_block(loop, P, N, lift(Q, arithmetic), alpha, beta, mu @ mu),
-            "lipschitz": printed_bound(loop, P, alpha),
+            "lmi": lmis.printed_block(loop, P, N, lift(Q, arithmetic), alpha, beta, mu @ mu),
+            "lipschitz": lmis.printed_bound(loop, P, alpha),
             "Q": lift(Q, arithmetic),
         }
-    error = loop_of_filter(data, design.gains, P, arithmetic)
+    error = lmis.loop_of_filter(data, design.gains, P, arithmetic)
     tau = [number(value) for value in bound.tau]
-    blocks = {"lmi": dissipation_block(error, mu @ mu, data.sector, tau)}
+    blocks = {"lmi": lmis.dissipation_block(error, mu @ mu, data.sector, tau)}
     if bound.decay is not None:
         extra = [number(value) for value in (() if bound.tau_decay is None else bound.tau_decay)]
-        blocks["decay"] = decay_block(error, number(bound.decay), data.sector, extra)
+        blocks["decay"] = lmis.decay_block(error, number(bound.decay), data.sector, extra)
     return blocks
 
 
@@ -88,8 +74,8 @@ def prove_level(design: HinfDesign) -> Iterator[Claim]:
         if data.sector is None
         else f"for every nonlinearity in the sector ({data.sector.groups} multipliers)"
     )
-    plant, centre = design.plant, noise_centre(design.plant)
-    about, quiet = about_centre(plant, centre), at_centre(plant, centre)
+    plant, centre = design.plant, signals.noise_centre(design.plant)
+    about, quiet = signals.about_centre(plant, centre), signals.at_centre(plant, centre)
     level = f"V+ - V + |f - fhat|^2 < mu^2 |{about}|^2 with mu = {bound.mu:.9g}"
     statements = {
         "lmi": f"{level} {where}" + (", by (45)" if printed else ""),
@@ -177,13 +163,13 @@ def covers(design: HinfDesign, fresh: Derived) -> Iterator[Claim]:
     yield Claim(
         "matrix_rounding",
         f"rounding C and L to doubles moves no signal by more than {ALLOWED:.0e} of its size "
-        f"(signals without a range up to {LARGEST_SIGNAL:g})",
+        f"(signals without a range up to {signals.LARGEST_SIGNAL:g})",
         bool(lost <= ALLOWED * size),
         ALLOWED * size - lost,
         "bounds of |exact - double| times the ranges",
     )
     # The step and the refusal of unstable gains use the vertices in every form.
-    yield covers_jacobian("g", design.family, fresh.bounds.family)
+    yield signals.covers_jacobian("g", design.family, fresh.bounds.family)
     if design.sector is not None:
         yield _covers_sector(design, fresh)
 
@@ -209,7 +195,7 @@ def _rounding_of_signals(
     """Bound what rounding C, B_f and D moves in one step, and the size to compare it with."""
     lost, size = 0.0, 1.0
     for kind, name in (("x", "C"), ("f", "B_f"), ("d", "D")):
-        box = np.abs(finite_box(design.plant, kind)).max(axis=1, initial=0.0)
+        box = np.abs(signals.finite_box(design.plant, kind)).max(axis=1, initial=0.0)
         lost += float((rounding[name] @ box).max(initial=0.0))
         size = max(size, float(box.max(initial=0.0)))
     return lost, size
@@ -254,8 +240,8 @@ def guarantee(design: HinfDesign) -> Guarantee:
     """Return what is promised of the fault estimates, and what has to hold for it."""
     plant, bound = design.plant, design.bound
     faults = ", ".join(plant.names("f"))
-    centre = noise_centre(plant)
-    about, quiet = about_centre(plant, centre), at_centre(plant, centre)
+    centre = signals.noise_centre(plant)
+    about, quiet = signals.about_centre(plant, centre), signals.at_centre(plant, centre)
     start = "e_0'Pe_0 + s_0'Qs_0" if bound.printed.size else "e_0'Pe_0"
     claims = [
         f"sum_k |f_k - fhat_k|^2 <= mu^2 sum_k |w_k|^2 + {start} over every horizon, with "
@@ -271,7 +257,7 @@ def guarantee(design: HinfDesign) -> Guarantee:
     inside = "x lies in the box" if design.sector is not None else "x and xhat lie in the box"
     assumptions = [
         f"the plant is {plant.name} in discrete time with Ts = {plant.Ts:g}",
-        f"{inside}: {within(plant.x, units=True)} {seen}",
+        f"{inside}: {signals.within(plant.x, units=True)} {seen}",
         *_inputs_assumed(design),
         "every reading arrives (status bit 32); one that is missing counts as a new initial error",
         f"{about} has finite energy over the horizon; no bound is used",
@@ -288,4 +274,4 @@ def guarantee(design: HinfDesign) -> Guarantee:
 def _inputs_assumed(design: HinfDesign) -> list[str]:
     held = compress(design.plant.u, covered_inputs(design.plant))
     bounded = [s for s in held if np.isfinite([s.lower, s.upper]).any()]
-    return [f"{within(bounded)} [monitored: status bit 4]"] if bounded else []
+    return [f"{signals.within(bounded)} [monitored: status bit 4]"] if bounded else []

@@ -14,21 +14,11 @@ from obsynth.designs.core.given import Number, changed, read_gains, read_matrix,
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.hinf import claims, model, step
+from obsynth.designs.hinf import claims, model, step, synthesis
 from obsynth.designs.hinf.claims import RESIDUAL, decoupling_residual, prove_level
 from obsynth.designs.hinf.model import CLASS, HinfModel, read
 from obsynth.designs.hinf.record import Bound, HinfDesign
-from obsynth.designs.hinf.synthesis import (
-    CAP,
-    NOT_FOUND,
-    Found,
-    Structure,
-    find_filter,
-    find_level,
-    find_storage,
-    state_problem,
-    unstable_vertex,
-)
+from obsynth.designs.hinf.synthesis import Found, Structure
 from obsynth.designs.hinf.system import Filter, Multipliers, SectorForm
 from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import Plant
@@ -204,7 +194,7 @@ class HinfUIO(Method):
         """Find the filter with the smallest trace of P at the first level that is proved."""
 
         def find(level: float) -> tuple[Filter, Found]:
-            return find_filter(model.design.data, self._structure, level, self.decay)
+            return synthesis.find_filter(model.design.data, self._structure, level, self.decay)
 
         return self._first_proved(model, find)
 
@@ -213,13 +203,13 @@ class HinfUIO(Method):
         chosen = _read_filter(model.design, gains)
         if self.form == "printed" and chosen.D.any():
             raise ObsynthError('form="printed" has no gain D; leave it out', option="D")
-        unstable = unstable_vertex(model.design.data, chosen)
+        unstable = synthesis.unstable_vertex(model.design.data, chosen)
         if unstable is not None:
             raise _unstable_gains(model, *unstable)
 
         def find(level: float) -> tuple[Filter, Found]:
             data = model.design.data
-            return chosen, find_storage(data, self._structure, level, chosen, self.decay)
+            return chosen, synthesis.find_storage(data, self._structure, level, chosen, self.decay)
 
         return self._first_proved(model, find, chosen)
 
@@ -229,7 +219,7 @@ class HinfUIO(Method):
         Without ``mu`` it minimises ``mu2``, the square of the level; with it the trace of P.
         """
         model: HinfModel = self._checked(given, bounds)
-        return state_problem(model.design.data, self._structure, self.mu, self.decay)
+        return synthesis.state_problem(model.design.data, self._structure, self.mu, self.decay)
 
     @property
     def _multipliers(self) -> Multipliers | None:
@@ -254,7 +244,7 @@ class HinfUIO(Method):
         if self.mu is not None:
             levels = [self.mu]
         else:
-            least = find_level(model.design.data, self._structure, self.decay, gains)
+            least = synthesis.find_level(model.design.data, self._structure, self.decay, gains)
             growth = [self.slack * 2.0**k for k in range(12)]
             levels = [least * (1.0 + s) for s in growth if s <= max(self.slack, 0.01)]
         last: Exception | None = None
@@ -295,7 +285,7 @@ class HinfUIO(Method):
         design = complete(found)
         if holds(design):
             return design
-        more = find_storage(design.data, self._structure, level, gains, self.decay)
+        more = synthesis.find_storage(design.data, self._structure, level, gains, self.decay)
         # The nearer to the first one, the smaller is P.
         mixed = (complete(found.mixed(more, float(s))) for s in np.geomspace(1e-8, 1.0, 17))
         return next((design for design in mixed if holds(design)), None)
@@ -305,8 +295,10 @@ class HinfUIO(Method):
     ) -> InfeasibleDesign | SolverTrouble:
         """Say which level was found where the given one is not; infeasible only what was shown."""
         data = model.design.data
-        least = find_level(data, self._structure, self.decay)
-        details = [f"the least level of this form found with P <= {CAP:g} I is {least:.6g}"]
+        least = synthesis.find_level(data, self._structure, self.decay)
+        details = [
+            f"the least level of this form found with P <= {synthesis.CAP:g} I is {least:.6g}"
+        ]
         facts = {"mu": self.mu, "least_mu": least}
         if not isinstance(last, InfeasibleDesign):
             return SolverTrouble(
@@ -315,10 +307,10 @@ class HinfUIO(Method):
                 **facts,
             )
         if self.method != "general" and model.design.family.vertex_count == len(data.vertices):
-            other = find_level(replace(data, sector=None), "general", self.decay)
+            other = synthesis.find_level(replace(data, sector=None), "general", self.decay)
             details.append(f'method="general" reaches {other:.6g}')
         return InfeasibleDesign(
-            f"mu = {self.mu:.9g} is {NOT_FOUND}",
+            f"mu = {self.mu:.9g} is {synthesis.NOT_FOUND}",
             [*last.details, *details],
             **facts,
         )

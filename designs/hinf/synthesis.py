@@ -13,15 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.hinf.lmis import (
-    Loop,
-    PrintedLoop,
-    decay_block,
-    dissipation_block,
-    loop_of_filter,
-    printed_block,
-    printed_bound,
-)
+from obsynth.designs.hinf import lmis
+from obsynth.designs.hinf.lmis import Loop, PrintedLoop
 from obsynth.designs.hinf.system import Filter, FilterData, Units, find_units
 from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import full, scalar, symmetric, trace
@@ -96,10 +89,10 @@ def state_problem(
     else:
         loop = open_loop(data, structure, P, gains)
         tau = multipliers("tau", data)
-        block = dissipation_block(loop, mu2, data.sector, tau)
+        block = lmis.dissipation_block(loop, mu2, data.sector, tau)
         problem.add_lmi("dissipation", block, ">>", margin=margin)
     if decay is not None and loop is not None:
-        block = decay_block(loop, decay, data.sector, multipliers("decay.tau", data))
+        block = lmis.decay_block(loop, decay, data.sector, multipliers("decay.tau", data))
         problem.add_lmi("decay", block, ">>", margin=margin)
     problem.add_lmi("P.cap", cap * np.eye(len(data.A)) - P, ">>", strict=False)
     problem.add_lmi("P.floor", P - FLOOR * np.eye(len(data.A)), ">>", strict=False)
@@ -116,7 +109,7 @@ def multipliers(name: str, data: FilterData) -> list[Any]:
 def open_loop(data: FilterData, structure: Structure, P: Any, gains: Filter | None) -> Loop:
     """Form the error system with free gains, or with the given ones."""
     if gains is not None:
-        return loop_of_filter(data, gains, P)
+        return lmis.loop_of_filter(data, gains, P)
     n, m = len(data.A), len(data.C)
     standard = data.standard_filter(np.zeros((n, m)))
     PG: Any = P @ data.G
@@ -138,8 +131,10 @@ def _state_printed(
     loop = PrintedLoop.of(data, gains)
     N = full("N", n, m) if gains is None else P @ gains.K
     Q, alpha, beta = symmetric("Q", n), scalar("alpha"), scalar("beta")
-    problem.add_lmi("(45)", printed_block(loop, P, N, Q, alpha, beta, mu2), ">>", margin=margin)
-    problem.add_lmi("(37)", printed_bound(loop, P, alpha), ">>", margin=margin)
+    problem.add_lmi(
+        "(45)", lmis.printed_block(loop, P, N, Q, alpha, beta, mu2), ">>", margin=margin
+    )
+    problem.add_lmi("(37)", lmis.printed_bound(loop, P, alpha), ">>", margin=margin)
     problem.add_lmi("Q", Q, ">>", margin=margin)
     # Not implied by (45): with beta < 0 the Lipschitz condition (35) would count backwards.
     problem.add_lmi("beta", beta, ">>", margin=margin)
@@ -320,7 +315,7 @@ def _explained(
         P = symmetric("P", len(scaled.A))
         loop = open_loop(scaled, structure, P, gains)
         keep = 1.0 if decay is None else decay
-        block = decay_block(loop, keep, scaled.sector, multipliers("tau", scaled))
+        block = lmis.decay_block(loop, keep, scaled.sector, multipliers("tau", scaled))
         problem.add_lmi("decay", block, ">>")
         caps = {"size": P << np.eye(len(scaled.A))}
     try:

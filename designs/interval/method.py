@@ -18,21 +18,12 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.step import Step
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.interval import claims, model, step
+from obsynth.designs.interval import claims, model, step, synthesis
 from obsynth.designs.interval.decoupling import check_detectable, find_transformation
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
 from obsynth.designs.interval.step import build_core
-from obsynth.designs.interval.synthesis import (
-    fitting_gains,
-    given_gains,
-    lp_design,
-    lp_problem,
-    search_design,
-    sylvester_design,
-    with_gains,
-)
 from obsynth.designs.lmi.problem import Problem
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -172,11 +163,15 @@ class IntervalObserver(Method):
         start = self._start(model)
         check_detectable(model.plant, start.reduced)
         if self.gains == "sylvester":
-            design = sylvester_design(start, self.R, self.Q)
+            design = synthesis.sylvester_design(start, self.R, self.Q)
         elif isinstance(self.gains, str):
-            design = search_design(start) if self.gains == "search" else lp_design(start)
+            design = (
+                synthesis.search_design(start)
+                if self.gains == "search"
+                else synthesis.lp_design(start)
+            )
         else:
-            design = given_gains(start, *self.gains)
+            design = synthesis.given_gains(start, *self.gains)
         if self.form == "printed":
             raise refuse_printed(design)
         return design
@@ -214,7 +209,7 @@ class IntervalObserver(Method):
                 "only given gains can go unproved: gains=(P, L)", option="gains", given=self.gains
             )
         start = self._start(self._checked(model_or_form))
-        design = with_gains(start, *fitting_gains(start, *self.gains))
+        design = synthesis.with_gains(start, *synthesis.fitting_gains(start, *self.gains))
         step = Step(self.CONTRACT.guard(design), build_core(design)).build()
         return step, partial(self.CONTRACT.start, design)
 
@@ -227,7 +222,7 @@ class IntervalObserver(Method):
         """
         data = self._start(self._checked(model_or_form)).reduced
         P = np.eye(data.A.shape[1]) if isinstance(self.gains, str) else np.array(self.gains[0])
-        return lp_problem(data, P)
+        return synthesis.lp_problem(data, P)
 
     def _start(self, model: IntervalModel) -> IntervalDesign:
         """Return the design without gains."""

@@ -17,18 +17,10 @@ from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.running import above
 from obsynth.designs.core.signals import IEEE, about_centre, at_centre, noise_centre, within
 from obsynth.designs.lmi.proof import RUMP, FamilyProof, prove_family, prove_inverse
+from obsynth.designs.qpv import lmis
 from obsynth.designs.qpv.equations import measured_schedule
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
-from obsynth.designs.qpv.lmis import (
-    PolyaTerm,
-    close,
-    decay_block,
-    h2_block,
-    hinf_block,
-    inside_block,
-    noise_block,
-    start_block,
-)
+from obsynth.designs.qpv.lmis import PolyaTerm
 from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.record import ASSUMED, FASTEST, NoiseBound, QPVDesign, VertexData
 from obsynth.designs.qpv.rounding import needed
@@ -130,8 +122,8 @@ def _error_set(P: FloatArray, sets: ErrorSets) -> Claim:
     proof = prove_family(
         "error set",
         count,
-        lambda k: inside_block(shape, normals.member(k)),
-        lambda k: inside_block(ExactMatrix.of(P), ExactMatrix.of(normals.mid[k])),
+        lambda k: lmis.inside_block(shape, normals.member(k)),
+        lambda k: lmis.inside_block(ExactMatrix.of(P), ExactMatrix.of(normals.mid[k])),
     )
     return _claim(
         "error_set",
@@ -164,8 +156,8 @@ def _start(P: FloatArray, sets: ErrorSets) -> Claim:
     proof = prove_family(
         "start",
         len(sets.start),
-        lambda k: start_block(shape, corners.member(k)),
-        lambda k: start_block(ExactMatrix.of(P), ExactMatrix.of(sets.start[[k]])),
+        lambda k: lmis.start_block(shape, corners.member(k)),
+        lambda k: lmis.start_block(ExactMatrix.of(P), ExactMatrix.of(sets.start[[k]])),
     )
     return _claim(
         "start",
@@ -182,7 +174,7 @@ def _dynamics(design: QPVDesign) -> Iterator[Claim]:
     blocks: dict[str, tuple[str, Any]] = {
         "decay": (
             f"V' + {design.alpha:g} V < 0 in E{quiet and ' where '}{quiet}, (22)",
-            lambda P, closed: decay_block(P, closed, design.alpha),
+            lambda P, closed: lmis.decay_block(P, closed, design.alpha),
         )
     }
     noise, gamma = design.noise, design.gamma
@@ -190,14 +182,14 @@ def _dynamics(design: QPVDesign) -> Iterator[Claim]:
         weights = np.diag(noise.weights)
         blocks["quadratic_boundedness"] = (
             f"V' < {noise.rate:g} (1 - V) in E for bounded disturbances",
-            lambda P, closed: noise_block(P, closed, noise.rate, type(P).of(weights)),
+            lambda P, closed: lmis.noise_block(P, closed, noise.rate, type(P).of(weights)),
         )
     elif design.norm == "h2" and data.sizes[2]:
-        blocks["h2"] = (f"V' < |{about}|^2 in E, (41)", lambda _, closed: h2_block(closed))
+        blocks["h2"] = (f"V' < |{about}|^2 in E, (41)", lambda _, closed: lmis.h2_block(closed))
     if gamma is not None:
         blocks["l2_gain"] = (
             f"V' + z'z < {gamma:.6g} |{about}|^2 in E, (23)",
-            lambda P, closed: hinf_block(closed, type(P).of(gamma)),
+            lambda P, closed: lmis.hinf_block(closed, type(P).of(gamma)),
         )
     distinct = data.N[:1] if (data.N[0] == data.N).all() else data.N
     families = [psi_family(block, design.sets, data.N_radius) for block in distinct]
@@ -230,7 +222,7 @@ def _prove_term(
 
     def at(k: Any) -> Enclosure:
         psi = [family.member(k) for family in families]
-        block: Enclosure = formula(P, close(P, gains, term, psi=psi, **enclosed))
+        block: Enclosure = formula(P, lmis.close(P, gains, term, psi=psi, **enclosed))
         return block
 
     exact_P = ExactMatrix.of(design.P)
@@ -239,7 +231,7 @@ def _prove_term(
 
     def exactly(k: int) -> ExactMatrix:
         psi = [ExactMatrix.of(family.mid[k]) for family in families]
-        closed = close(exact_P, exact_gains, term, psi=psi, **exact_data)
+        closed = lmis.close(exact_P, exact_gains, term, psi=psi, **exact_data)
         block: ExactMatrix = formula(exact_P, closed)
         return block
 

@@ -19,19 +19,10 @@ from obsynth.designs.lmi.proof import inverse_bounds
 from obsynth.designs.lmi.reductions import split_common
 from obsynth.designs.lmi.search import Knob, search_line, smallest_changes
 from obsynth.designs.lmi.solve import solve_reliably
+from obsynth.designs.qpv import lmis
 from obsynth.designs.qpv.claims import prove_inequalities, region_factor
 from obsynth.designs.qpv.error_matrix import ErrorSets
-from obsynth.designs.qpv.lmis import (
-    Closed,
-    PolyaTerm,
-    close,
-    decay_block,
-    h2_block,
-    hinf_block,
-    inside_block,
-    noise_block,
-    start_block,
-)
+from obsynth.designs.qpv.lmis import Closed, PolyaTerm
 from obsynth.designs.qpv.model import QPVModel
 from obsynth.designs.qpv.record import FASTEST, Norm, QPVDesign, VertexData
 from obsynth.symbolic.arrays import FloatArray
@@ -124,7 +115,7 @@ def state_problem(setting: Setting, gains: FloatArray | None = None) -> Problem:
         gammas = [P @ (gain / half[:, None]) for gain in gains]
     level = scalar("gamma") if setting.norm == "hinf" else None
     for number, term in enumerate(setting.terms):
-        closed = close(
+        closed = lmis.close(
             P, gammas, term, *(list(b) for b in (data.A, psi, data.C, data.G, data.H, data.Cz))
         )
         _state_term(problem, setting, P, closed, level, number)
@@ -153,15 +144,15 @@ def _state_term(
 ) -> None:
     noise = setting.model.noise
     if noise is None or setting.alpha > noise.rate:
-        problem.add_lmi(f"decay {number}", decay_block(P, closed, setting.alpha), ">>")
+        problem.add_lmi(f"decay {number}", lmis.decay_block(P, closed, setting.alpha), ">>")
     blocks: dict[str, Any] = {}
     if closed.side is not None:
         if noise is not None:
-            blocks["noise"] = noise_block(P, closed, noise.rate, np.diag(noise.weights))
+            blocks["noise"] = lmis.noise_block(P, closed, noise.rate, np.diag(noise.weights))
         elif setting.norm == "h2":
-            blocks["h2"] = h2_block(closed)
+            blocks["h2"] = lmis.h2_block(closed)
         if setting.norm == "hinf":
-            blocks["hinf"] = hinf_block(closed, level)
+            blocks["hinf"] = lmis.hinf_block(closed, level)
     for name, block in blocks.items():
         parts = split_common(block, f"{name}.slack{number}")
         if parts.common is not None:
@@ -173,11 +164,11 @@ def _state_sets(problem: Problem, setting: Setting, P: Affine) -> None:
     half = setting.half
     normals, corners = setting.sets.normals.mid, setting.sets.start[:, None, :]
     if setting.printed:
-        problem.add_lmi("start", inside_block(P, corners * half), ">>")
-        problem.add_lmi("error set", start_block(P, normals / half), ">>")
+        problem.add_lmi("start", lmis.inside_block(P, corners * half), ">>")
+        problem.add_lmi("error set", lmis.start_block(P, normals / half), ">>")
         return
-    problem.add_lmi("start", start_block(P, corners / half), ">>")
-    problem.add_lmi("error set", inside_block(P, normals * half * (1.0 + setting.room)), ">>")
+    problem.add_lmi("start", lmis.start_block(P, corners / half), ">>")
+    problem.add_lmi("error set", lmis.inside_block(P, normals * half * (1.0 + setting.room)), ">>")
 
 
 def rough_objective(setting: Setting, gains: FloatArray | None = None) -> float:

@@ -12,15 +12,10 @@ from obsynth.designs.core.record import plain
 from obsynth.designs.core.signals import within
 from obsynth.designs.general import claims as general
 from obsynth.designs.general.model import read_again as general_again
+from obsynth.designs.set_membership import synthesis
 from obsynth.designs.set_membership.model import SetMembershipModel, read
 from obsynth.designs.set_membership.record import SetMembershipDesign
 from obsynth.designs.set_membership.step import fault_delay, peak_widths, rates_of
-from obsynth.designs.set_membership.synthesis import (
-    closed_loop,
-    declared,
-    off_identity,
-    radius_bound,
-)
 
 _RTOL = 1e-6
 
@@ -33,7 +28,7 @@ def read_again(design: SetMembershipDesign) -> SetMembershipModel:
 
 def claims(design: SetMembershipDesign) -> Iterator[Claim]:
     """Prove the numbers that the reduction rests on, and the contraction where there is one."""
-    off = off_identity(design.V, design.W)
+    off = synthesis.off_identity(design.V, design.W)
     size, exact_off = ExactMatrix.of(design.size), ExactMatrix.of(off)
     grown = size @ exact_off
     room = least(size - grown - ExactMatrix.of(np.abs(design.W)))
@@ -49,7 +44,7 @@ def claims(design: SetMembershipDesign) -> Iterator[Claim]:
     )
     if design.peak is not None:
         yield from general.claims(design.peak)
-    rho = radius_bound(closed_loop(design))
+    rho = synthesis.radius_bound(synthesis.closed_loop(design))
     if design.contraction < 1.0:
         yield Claim(
             "contraction",
@@ -111,7 +106,7 @@ def guarantee(design: SetMembershipDesign) -> Guarantee:
     plant = design.plant
     names = ", ".join((*plant.names("x"), *plant.names("f")))
     late = " (faults those of the call before)" if fault_delay(design) else ""
-    half = declared(plant)
+    half = synthesis.declared(plant)
     pairs = zip((*plant.names("x"), *plant.names("f")), design.predicted.tolist(), strict=True)
     listed = [
         f"{name} +-{width:.3g}" + (" (no more than is declared)" if width >= limit else "")

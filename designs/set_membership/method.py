@@ -17,21 +17,11 @@ from obsynth.designs.core.step import Step
 from obsynth.designs.general import step as general
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.record import GeneralDesign
-from obsynth.designs.set_membership import claims, step
+from obsynth.designs.set_membership import claims, step, synthesis
 from obsynth.designs.set_membership.model import CLASS, SetMembershipModel, read
 from obsynth.designs.set_membership.record import MOST_COLUMNS, SetMembershipDesign
 from obsynth.designs.set_membership.step import build_core
-from obsynth.designs.set_membership.synthesis import (
-    SHARES,
-    Gain,
-    Wishes,
-    candidates,
-    choose,
-    complete,
-    modes,
-    refuse_wide,
-    watched,
-)
+from obsynth.designs.set_membership.synthesis import Gain, Wishes
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
@@ -124,7 +114,7 @@ class SetMembershipObserver(Method):
 
     def read(self, given: Plant) -> SetMembershipModel:
         """Enclose the equations around the point of operation; leave out faults nothing shows."""
-        model = watched(read(self.CLASS.check(given)))
+        model = synthesis.watched(read(self.CLASS.check(given)))
         with suppress(StructureError, DerivationError, UnboundedError):
             model = replace(model, general=self._general.read(given))
         return model
@@ -135,7 +125,7 @@ class SetMembershipObserver(Method):
 
     def solve(self, model: SetMembershipModel) -> SetMembershipDesign:
         """Choose gain, coordinates and columns by what they predict."""
-        shares = SHARES if self.gain is None else (self.gain,)
+        shares = synthesis.SHARES if self.gain is None else (self.gain,)
         kinds: Any = ("modal", "covariance", "states")
         if self.coordinates is not None:
             kinds = (self.coordinates,)
@@ -143,7 +133,7 @@ class SetMembershipObserver(Method):
         if model.general is not None and self.gain is None:
             with suppress(StructureError, InfeasibleDesign, SolverTrouble):
                 peak = self._general.solve(model.general)
-        gains = [*candidates(model, peak, shares, kinds)]
+        gains = [*synthesis.candidates(model, peak, shares, kinds)]
         if not gains:
             raise InfeasibleDesign(
                 "the modes of (I - L C) A are nearly dependent, so that they are no coordinates",
@@ -156,7 +146,7 @@ class SetMembershipObserver(Method):
         around = model.around(np.zeros(len(model.half)), model.beside)
         L = read_gains(gains, {"L": around.H.T.shape})["L"]
         closed = (np.eye(len(L)) - L @ around.H) @ around.J
-        bases = [modes(closed, model.half), np.diag(model.half)]
+        bases = [synthesis.modes(closed, model.half), np.diag(model.half)]
         found = [Gain(L, basis, around.J, around.H) for basis in bases if basis is not None]
         return self._of(model, found, None, refuse=False)
 
@@ -177,13 +167,13 @@ class SetMembershipObserver(Method):
         weights, fitting = self._weights(model), self.operations is not None
         wishes = Wishes(self.columns, self.zonotopes, self.restart, weights, held, fitting)
         counts = []
-        for chosen in choose(model, gains, wishes):
+        for chosen in synthesis.choose(model, gains, wishes):
             if refuse:
-                refuse_wide(model, chosen.found)
+                synthesis.refuse_wide(model, chosen.found)
             options = dict(self.options())
             if self.horizon is None and peak is None:
                 options["horizon"] = max(chosen.found.calls, _SETTLE) + chosen.bank.restart
-            design = complete(model, chosen, peak, options)
+            design = synthesis.complete(model, chosen, peak, options)
             if self.operations is None:
                 return design
             step = Step(self.CONTRACT.guard(design), build_core(design)).build()
