@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.derive.rigour import is_positive_definite, prove_positive_definite
 from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error import lmis
-from obsynth.designs.bounded_error.lmis import Arithmetic, ModelData
+from obsynth.designs.bounded_error.lmis import ModelData
 from obsynth.designs.bounded_error.model import MATRICES, Derived, Limits, noise_box
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
@@ -19,6 +19,7 @@ from obsynth.designs.core import signals
 from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.method import Numbers
+from obsynth.designs.lmi.problem import Arithmetic, lift
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 
@@ -58,11 +59,11 @@ def recursion_block(
 ) -> Any:
     """Form the matrix whose definiteness makes ellipsoid `number` invariant."""
     system = lmis.build_error_system(data, bound.error, arithmetic)
-    X, Z = system.closed_loop(lmis.lift(gain, arithmetic))
-    gamma = lmis.lift(np.array([[bound.gamma[number]]]), arithmetic)
-    one = lmis.lift(np.ones((1, 1)), arithmetic)
-    noise = gamma * lmis.lift(np.diag(bound.weights[number]), arithmetic)
-    P = lmis.lift(bound.P[number], arithmetic)
+    X, Z = system.closed_loop(lift(gain, arithmetic))
+    gamma = lift(np.array([[bound.gamma[number]]]), arithmetic)
+    one = lift(np.ones((1, 1)), arithmetic)
+    noise = gamma * lift(np.diag(bound.weights[number]), arithmetic)
+    P = lift(bound.P[number], arithmetic)
     return lmis.fixed_gain_block(X, Z, P, one - gamma, noise)
 
 

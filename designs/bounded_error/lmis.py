@@ -14,11 +14,10 @@ import numpy as np
 
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import Enclosure, ExactMatrix
-from obsynth.designs.lmi.problem import block, he, symmetric_block
+from obsynth.designs.lmi.problem import Arithmetic, block, he, lift, symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 ErrorKind = Literal["plain", "shifted"]
-Arithmetic = Literal["float", "enclosure", "exact"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +83,6 @@ class ErrorSystem:
     def closed_loop(self, gain: Any) -> tuple[Any, Any]:
         """X = Abar - Kbar Cbar and Z = Wbar - Kbar Vbar for a given gain (p, m)."""
         return self.Abar - gain @ self.Cbar, self.Wbar - gain @ self.Vbar
-
-
-def lift(value: FloatArray, arithmetic: Arithmetic) -> Any:
-    """Return an array of exact doubles in the arithmetic of a formula."""
-    if arithmetic == "enclosure":
-        return Enclosure.of(value)
-    return ExactMatrix.of(value) if arithmetic == "exact" else value
 
 
 def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:

@@ -21,7 +21,15 @@ from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
 from obsynth.designs.bounded_error.synthesis import EllipsoidSolution, Objective
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, changed, read_gains, refuse_idle
+from obsynth.designs.core.given import (
+    CONTRACTION,
+    WEIGHTS,
+    changed,
+    read_gains,
+    read_weights,
+    refuse_idle,
+    refuse_no_weights,
+)
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general.method import GeneralUIO
@@ -36,8 +44,6 @@ IDLE = ("multipliers", "error", "post", "objective")
 FEW_VERTICES = 16
 # Keeps sums of rounded weights at or below 1.
 BELOW_ONE = 1.0 - 2.0**-48
-CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
-WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 
 
 @dataclass(frozen=True)
@@ -188,8 +194,7 @@ class BoundedErrorUIO(Method):
 
     def check(self) -> None:
         """Refuse options that do not fit each other."""
-        if self.weights is not None and not any(self.weights):
-            raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
+        refuse_no_weights(self.weights)
         if self.bounds == "peak" and self.form in ("corrected", None):
             refuse_idle(self, 'bounds="peak", which has no ellipsoid', *IDLE)
         if self.form in ("printed", "repaired") and (
@@ -252,14 +257,7 @@ class BoundedErrorUIO(Method):
 
     def _weights(self, model: UioModel) -> FloatArray:
         design = model.design
-        n, n_f = design.A.shape[0], design.rate.size
-        weights = np.ones(n + n_f) if self.weights is None else np.array(self.weights)
-        if weights.shape != (n + n_f,):
-            names = (*design.plant.names("x"), *design.plant.names("f"))
-            raise ObsynthError(
-                f"weights are {weights.size} numbers; {n + n_f} are needed ({', '.join(names)})",
-                option="weights",
-            )
+        n, weights = design.A.shape[0], read_weights(self.weights, design.plant)
         return np.concatenate([weights[:n][design.kept(self.error)], weights[n:]])
 
     @staticmethod

@@ -37,6 +37,8 @@ class Number:
 
 
 POSITIVE = Number(above=0.0, because="it has to be positive and finite")
+CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
+WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 MATRIX = "matrix"
 """In ``Annotated``: finite numbers, kept as a tuple of rows; a vector serves as one column."""
 
@@ -125,6 +127,24 @@ def _pairs(name: str, value: Any) -> tuple[tuple[float, float], ...]:
             f"{name} is {value!r}; it has to be pairs (lower, upper) of numbers", option=name
         )
     return tuple((low, high) for low, high in pairs.tolist())
+
+
+def refuse_no_weights(weights: tuple[float, ...] | None) -> None:
+    """Refuse weights that are all zero."""
+    if weights is not None and not any(weights):
+        raise ObsynthError(f"weights are {weights}; {WEIGHTS.because}", option="weights")
+
+
+def read_weights(weights: tuple[float, ...] | None, plant: Plant) -> FloatArray:
+    """Return weights of states and faults, 1 where they are not given, (n + n_f,)."""
+    names = (*plant.names("x"), *plant.names("f"))
+    found = np.ones(len(names)) if weights is None else np.array(weights)
+    if found.shape != (len(names),):
+        raise ObsynthError(
+            f"weights are {found.size} numbers; {len(names)} are needed ({', '.join(names)})",
+            option="weights",
+        )
+    return found
 
 
 def read_matrix(name: str, value: Any, dimensions: tuple[int, ...] = (2,)) -> np.ndarray[Any, Any]:

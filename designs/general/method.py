@@ -13,7 +13,7 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import TINY
 from obsynth.derive.structure.following import follow, hidden_somewhere
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains, refuse_idle
+from obsynth.designs.core.given import CONTRACTION, WEIGHTS, read_gains, read_weights, refuse_idle
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general import claims, model, step
@@ -33,8 +33,6 @@ from obsynth.symbolic.errors import ObsynthError
 
 WAYS: tuple[Literal["divided", "bounded"], ...] = ("divided", "bounded")
 """What is done with faults that cannot be followed, in this order."""
-CONTRACTION = Number(0.0, 1.0, because="the contraction per step lies between 0 and 1")
-WEIGHTS = Number(at_least=0.0, because="they have to be finite, not negative and not all zero")
 
 
 @dataclass(frozen=True)
@@ -181,13 +179,7 @@ class GeneralUIO(Method):
                     condition="faults",
                 )
             return found
-        if len(self.weights) != len(names):
-            raise ObsynthError(
-                f"weights are {len(self.weights)} numbers; {len(names)} are needed "
-                f"({', '.join(names)})",
-                option="weights",
-            )
-        given = dict(zip(names, self.weights, strict=True))
+        given = dict(zip(names, read_weights(self.weights, plant).tolist(), strict=True))
         return np.array([given[name] for name in states.names("x")])
 
 

@@ -16,8 +16,8 @@ from obsynth.designs.hinf import lmis
 from obsynth.designs.hinf.lmis import PrintedLoop
 from obsynth.designs.hinf.model import Derived
 from obsynth.designs.hinf.record import HinfDesign
-from obsynth.designs.hinf.system import Arithmetic, FilterData, build_sector, covers_sector, lift
-from obsynth.designs.lmi.problem import he
+from obsynth.designs.hinf.system import FilterData, build_sector, covers_sector
+from obsynth.designs.lmi.problem import Arithmetic, he, lift
 from obsynth.designs.lmi.proof import RUMP
 from obsynth.symbolic.arrays import FloatArray
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.designs.hinf.system import Arithmetic, Filter, FilterData, Sector, lift
-from obsynth.designs.lmi.problem import symmetric_block
+from obsynth.designs.hinf.system import Filter, FilterData, Sector
+from obsynth.designs.lmi.problem import Arithmetic, lift, symmetric_block
 from obsynth.symbolic.arrays import FloatArray
 
 

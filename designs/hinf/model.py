@@ -6,6 +6,7 @@ import numpy as np
 
 from obsynth.derive import JacobianBounds, Majorant, Split, jacobian_bounds, majorant, split
 from obsynth.derive.errors import DerivationError, StructureError
+from obsynth.derive.structure.conditions import scaled_rank
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.hinf.record import Bound, HinfDesign
 from obsynth.designs.hinf.system import ROOM, Filter, SectorForm, build_sector
@@ -128,7 +129,7 @@ def check_decoupling(parts: Split) -> FloatArray:
             f"{', '.join(dead)} enters no equation; remove it", symbols=tuple(dead), rank_L=s
         )
     CL = parts.C @ L
-    ranks = [_rank(L), _rank(CL)]
+    ranks = [scaled_rank(L), scaled_rank(CL)]
     if ranks[1] < s:
         _, values, vectors = np.linalg.svd(_normalised(CL), full_matrices=True)
         full = np.zeros(s)
@@ -169,10 +170,6 @@ def _refuse_noisy_outputs(parts: Split) -> None:
 def _normalised(matrix: FloatArray) -> FloatArray:
     size = np.linalg.norm(matrix, axis=0)
     return np.asarray(matrix / np.where(size > 0.0, size, 1.0))
-
-
-def _rank(matrix: FloatArray) -> int:
-    return int(np.linalg.matrix_rank(_normalised(matrix), tol=RANK))
 
 
 def check_detectability(parts: Split, G: FloatArray, vertices: FloatArray) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from obsynth.derive import Majorant
-from obsynth.derive.rigour import Enclosure, ExactMatrix
+from obsynth.designs.lmi.problem import Arithmetic, lift
 from obsynth.symbolic.arrays import FloatArray
 
 Multipliers = Literal["single", "per_row", "per_entry"]
@@ -21,7 +21,6 @@ UP = 1.0 + 2.0**-51
 # A given number such as .1089 may be the exact least value: it counts with what branch and bound
 # leaves between the bounds that it proves and those that are attained.
 ROOM = 1.0 + 2.0**-28
-Arithmetic = Literal["float", "enclosure", "exact"]
 # Smallest unit of a coordinate, as a share of the largest: a state that no disturbance reaches
 # within a few steps keeps a unit that is not zero.
 LEAST_UNIT = 1e-3
@@ -93,13 +92,6 @@ def covers_sector(stored: Sector, derived: Sector | None) -> tuple[bool, float]:
         return False, -np.inf
     room = float((stored.R - derived.R).min(initial=np.inf))
     return room >= 0.0, room
-
-
-def lift(value: FloatArray, arithmetic: Arithmetic, radius: FloatArray | float = 0.0) -> Any:
-    """Return doubles, with a radius where the arithmetic knows one, in an arithmetic."""
-    if arithmetic == "enclosure":
-        return Enclosure.of(value, radius)
-    return ExactMatrix.of(value) if arithmetic == "exact" else value
 
 
 @dataclass(frozen=True, eq=False)

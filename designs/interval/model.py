@@ -15,6 +15,7 @@ from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import Exact, exact, nearest
+from obsynth.derive.structure.conditions import scaled_rank
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.core.record import Record
@@ -194,7 +195,7 @@ def _check_ranks(model: IntervalModel) -> None:
     plant, q, F = model.plant, model.q, nearest(model.F)
     CF = nearest(model.C) @ F
     names = (*plant.names("f"), *plant.names("d"))
-    facts: dict[str, Any] = {"rank_F": _rank(F), "rank_CF": _rank(CF), "q": q}
+    facts: dict[str, Any] = {"rank_F": scaled_rank(F), "rank_CF": scaled_rank(CF), "q": q}
     if facts["rank_F"] < q:
         raise StructureError(
             f"rank(F) = {facts['rank_F']} for {q} faults and unknown inputs: {', '.join(names)} "
@@ -223,10 +224,3 @@ def _check_ranks(model: IntervalModel) -> None:
             states=states,
             **facts,
         )
-
-
-def _rank(matrix: FloatArray) -> int:
-    if matrix.size == 0:
-        return 0
-    size = np.linalg.norm(matrix, axis=0)
-    return int(np.linalg.matrix_rank(matrix / np.where(size > 0.0, size, 1.0), tol=RANK))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -29,6 +29,16 @@ from obsynth.designs.lmi.expression import (
     symmetric,
     trace,
 )
+from obsynth.symbolic.arrays import FloatArray
+
+Arithmetic = Literal["float", "enclosure", "exact"]
+
+
+def lift(value: FloatArray, arithmetic: Arithmetic, radius: FloatArray | float = 0.0) -> Any:
+    """Return doubles, with a radius where the arithmetic knows one, in an arithmetic."""
+    if arithmetic == "enclosure":
+        return Enclosure.of(value, radius)
+    return ExactMatrix.of(value) if arithmetic == "exact" else value
 
 
 def block(rows: Sequence[Sequence[Any]]) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
 from obsynth.designs.core.contractor import EVERY_CUT
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
-from obsynth.designs.core.given import Number, read_gains
+from obsynth.designs.core.given import WEIGHTS, Number, read_gains, read_weights, refuse_no_weights
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.step import Step
 from obsynth.designs.general import step as general
@@ -23,7 +23,6 @@ from obsynth.designs.set_membership.record import MOST_COLUMNS, SetMembershipDes
 from obsynth.designs.set_membership.step import build_core
 from obsynth.designs.set_membership.synthesis import Gain, Wishes
 from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 MOST_RESTART = 1000
@@ -33,7 +32,6 @@ COUNT = Number(at_least=0, at_most=10, because="it has to be a number from 0 to 
 ROUND = Number(at_least=1, at_most=MOST_RESTART, because="it has to be a number of calls")
 OPERATIONS = Number(at_least=1, because="it has to be a number of operations")
 SHARE = Number(above=0.0, because="it is a share of the noise: positive and finite")
-WEIGHTS = Number(at_least=0.0, because="they have to be finite and not negative, not all zero")
 
 
 @dataclass(frozen=True)
@@ -109,8 +107,7 @@ class SetMembershipObserver(Method):
                 "begins anew at a call",
                 option="zonotopes",
             )
-        if self.weights is not None and not any(self.weights):
-            raise ObsynthError(f"weights are {self.weights}; {WEIGHTS.because}", option="weights")
+        refuse_no_weights(self.weights)
 
     def read(self, given: Plant) -> SetMembershipModel:
         """Enclose the equations around the point of operation; leave out faults nothing shows."""
@@ -164,7 +161,7 @@ class SetMembershipObserver(Method):
     ) -> SetMembershipDesign:
         size = len(model.plant.x) + len(model.plant.f)
         held = np.full(size, np.inf) if peak is None else general.steady(peak)
-        weights, fitting = self._weights(model), self.operations is not None
+        weights, fitting = read_weights(self.weights, model.plant), self.operations is not None
         wishes = Wishes(self.columns, self.zonotopes, self.restart, weights, held, fitting)
         counts = []
         for chosen in synthesis.choose(model, gains, wishes):
@@ -186,14 +183,3 @@ class SetMembershipObserver(Method):
             ["what helps: columns= of one call, zonotopes=0, or another method, see ob.choose"],
             operations=min(counts),
         )
-
-    def _weights(self, model: SetMembershipModel) -> FloatArray:
-        plant = model.plant
-        names = (*plant.names("x"), *plant.names("f"))
-        weights = np.ones(len(names)) if self.weights is None else np.array(self.weights)
-        if weights.shape != (len(names),):
-            raise ObsynthError(
-                f"weights are {weights.size} numbers; {len(names)} are needed ({', '.join(names)})",
-                option="weights",
-            )
-        return weights
