@@ -151,39 +151,31 @@ class Part:
         names = ("r_upper+", "r_upper-", "r_lower+", "r_lower-", "r_upper", "r_lower")
         sizes = _sizes(self, (*names, "y+", "y-", "u", "one"))
         count, parts = len(self.X), self.split(nominal)
-        lo, hi = parts.sigma_lower, parts.sigma_upper
-        low, high = parts.noise
-        R = parts.R
-        constant = self.model.vertices[0]
+        R, constant = parts.R, self.model.vertices[0]
         rest, known = self.X @ constant[:, o], {"u": self.X @ constant[:, b]}
-        up = {
-            "r_upper+": positive(hi),
-            "r_upper-": -positive(lo),
-            "r_lower+": -negative(hi),
-            "r_lower-": negative(lo),
-            "r_upper": positive(R),
-            "r_lower": -negative(R),
-            "y+": parts.M_upper,
-            "y-": -parts.M_lower,
-            "one": rest + high[:, None],
-        }
-        down = {
-            "r_lower+": positive(lo),
-            "r_lower-": -positive(hi),
-            "r_upper+": -negative(lo),
-            "r_upper-": negative(hi),
-            "r_lower": positive(R),
-            "r_upper": -negative(R),
-            "y+": parts.M_lower,
-            "y-": -parts.M_upper,
-            "one": rest + low[:, None],
-        }
+        sigma, M = (parts.sigma_lower, parts.sigma_upper), (parts.M_lower, parts.M_upper)
+
+        def end(own: int) -> dict[str, Exact]:
+            this, other = (("r_lower", "r_upper")[k] for k in (own, 1 - own))
+            return {
+                f"{this}+": positive(sigma[own]),
+                f"{this}-": -positive(sigma[1 - own]),
+                f"{other}+": -negative(sigma[own]),
+                f"{other}-": negative(sigma[1 - own]),
+                this: positive(R),
+                other: -negative(R),
+                "y+": M[own],
+                "y-": -M[1 - own],
+                "one": rest + parts.noise[own][:, None],
+                **known,
+            }
+
         r, y, u, one = self.radius
         radius = {"r_upper": r, "r_lower": r, "y+": y, "y-": y, "u": u, "one": one}
         return Rows(
             sizes,
-            (_stack(sizes, count, {**known, **up}),),
-            (_stack(sizes, count, {**known, **down}),),
+            (_stack(sizes, count, end(1)),),
+            (_stack(sizes, count, end(0)),),
             _stack(sizes, count, radius),
         )
 
