@@ -24,7 +24,6 @@ from obsynth.derive.rigour import (
     is_positive_definite,
     prove_positive_definite,
 )
-from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import Affine, IntArray
 from obsynth.designs.lmi.problem import Problem, symmetric_block
@@ -49,8 +48,6 @@ class FamilyProof:
     exact: those of them confirmed in exact rational arithmetic
     """
 
-    name: str
-    count: int
     failed: tuple[int, ...]
     margin: float
     worst: tuple[int, ...]
@@ -61,27 +58,8 @@ class FamilyProof:
         """Whether the inequality is proved at every vertex."""
         return not self.failed
 
-    def __str__(self) -> str:
-        if not self.all_proved:
-            listed = ", ".join(map(str, self.failed))
-            return f"{self.name}: NOT proved at vertices {listed} of {self.count}"
-        text = f"{self.name}: proved at {self.count} vertices, margin {self.margin:.3g}"
-        return text + (f", {len(self.exact)} of them exactly" if self.exact else "")
-
-    def require(self) -> FamilyProof:
-        """Return the proof, or raise ``CertificateError`` if a vertex has none."""
-        if not self.all_proved:
-            raise CertificateError(
-                str(self),
-                ["the stored numbers do not satisfy it with a margin that rounding leaves"],
-                failed=self.failed,
-                proof=self,
-            )
-        return self
-
 
 def prove_family(
-    name: str,
     count: int,
     enclosed: Callable[[IntArray], Enclosure],
     exact: Callable[[int], ExactMatrix] | None = None,
@@ -118,8 +96,6 @@ def prove_family(
             else:
                 confirmed.append(vertex)
     return FamilyProof(
-        name=name,
-        count=count,
         failed=tuple(int(k) for k in failed[:10]),
         margin=float(min(margin.min(), np.inf)) if not len(failed) else -np.inf,
         worst=tuple(worst),

@@ -1,7 +1,6 @@
 """Fewer and smaller matrix inequalities that say the same.
 
-Everything here is exact: the reduced inequalities hold if and only if the given ones do. What
-is only sufficient stands in :mod:`obsynth.designs.lmi.relaxation` and says so.
+Everything here is exact: the reduced inequalities hold if and only if the given ones do.
 """
 
 from collections.abc import Mapping
@@ -27,16 +26,6 @@ class Extremes:
 
     kept: IntArray
     weights: Mapping[int, Mapping[int, Fraction]]
-
-    def expand(self, row: int) -> Mapping[int, Fraction]:
-        """Write any row as an exact convex combination of kept rows."""
-        if row not in self.weights:
-            return {row: Fraction(1)}
-        total: dict[int, Fraction] = {}
-        for other, weight in self.weights[row].items():
-            for kept, share in self.expand(other).items():
-                total[kept] = total.get(kept, Fraction(0)) + weight * share
-        return total
 
 
 def extreme_points(points: ArrayLike) -> Extremes:

@@ -103,7 +103,7 @@ def _region(design: QPVDesign) -> Claim:
     normals = design.state.normals
     Q = Enclosure.of(design.region.Q)
     values = np.ones((1, 1)) - normals @ Q @ normals.T
-    proof = prove_family("region", len(normals.mid), lambda k: values.member(k), exact_count=1)
+    proof = prove_family(len(normals.mid), lambda k: values.member(k), exact_count=1)
     return _claim(
         "region",
         f"the region X lies in the polytope of the state ({_both(len(normals.mid))} half-spaces)",
@@ -120,7 +120,6 @@ def _error_set(P: FloatArray, sets: ErrorSets) -> Claim:
     normals, shape = sets.normals, Enclosure.of(P)
     count = len(normals.mid)
     proof = prove_family(
-        "error set",
         count,
         lambda k: lmis.inside_block(shape, normals.member(k)),
         lambda k: lmis.inside_block(ExactMatrix.of(P), ExactMatrix.of(normals.mid[k])),
@@ -154,7 +153,6 @@ def prove_rounding(design: QPVDesign) -> Claim:
 def _start(P: FloatArray, sets: ErrorSets) -> Claim:
     corners, shape = Enclosure.of(sets.start[:, None, :]), Enclosure.of(P)
     proof = prove_family(
-        "start",
         len(sets.start),
         lambda k: lmis.start_block(shape, corners.member(k)),
         lambda k: lmis.start_block(ExactMatrix.of(P), ExactMatrix.of(sets.start[[k]])),
@@ -235,7 +233,7 @@ def _prove_term(
         block: ExactMatrix = formula(exact_P, closed)
         return block
 
-    return prove_family("pairs", count, at, exactly, exact_count=2)
+    return prove_family(count, at, exactly, exact_count=2)
 
 
 def _lifted(data: VertexData) -> dict[str, list[Enclosure]]:

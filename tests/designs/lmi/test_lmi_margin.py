@@ -61,7 +61,6 @@ def design(spread=0.02):
             return decay(P, P @ kind(K), kind(family[k]))
 
         return prove_family(
-            "decay",
             len(family),
             lambda k: matrices(k, Enclosure.of),
             lambda k: matrices(k, ExactMatrix.of),
@@ -73,7 +72,7 @@ def design(spread=0.02):
 def test_the_recipe_returns_what_is_proved_at_hardly_any_loss():
     problem, prove, family = design()
     found = solve_with_margin(problem, prove=prove)
-    assert found.proof.all_proved and found.proof.count == len(family) == 128
+    assert found.proof.all_proved and len(family) == 128
     assert len(found.proof.exact) == 3
     plain = problem.solve()
     assert plain.objective * (1 - 1e-6) <= found.objective < plain.objective * (1 + 2e-3)
@@ -130,10 +129,8 @@ def test_the_proof_refuses_a_perturbed_gain_and_names_the_vertices():
     spoiled["H"] = found["H"] * 1.3
     proof = prove(spoiled)
     assert not proof.all_proved and proof.margin == -np.inf
-    with pytest.raises(CertificateError, match="vertices") as caught:
-        proof.require()
     P, H = Enclosure.of(spoiled["P"]), Enclosure.of(spoiled["H"])
-    worst = decay(P, H, Enclosure.of(family[list(caught.value.failed)])).mid
+    worst = decay(P, H, Enclosure.of(family[list(proof.failed)])).mid
     assert np.linalg.eigvalsh(worst)[:, 0].max() < 1e-12
 
 
@@ -221,18 +218,18 @@ def test_family_proofs_of_many_vertices_agree_with_single_ones():
     base = np.eye(6) + 0.1 * np.ones((6, 6))
     matrices = base + np.diag(rng.random(6)) * rng.random((5000, 1, 1))
     matrices[1234] -= 0.9999 * np.eye(6)
-    proof = prove_family("many", 5000, lambda k: Enclosure.of(matrices[k], 1e-14))
+    proof = prove_family(5000, lambda k: Enclosure.of(matrices[k], 1e-14))
     assert proof.all_proved and proof.worst[0] == 1234
     assert 0 < proof.margin <= np.linalg.eigvalsh(matrices[1234])[0]
     matrices[4321] -= 1.1 * np.eye(6)
-    proof = prove_family("many", 5000, lambda k: Enclosure.of(matrices[k], 1e-14))
+    proof = prove_family(5000, lambda k: Enclosure.of(matrices[k], 1e-14))
     assert proof.failed == (4321,)
 
 
 def test_the_exact_check_has_the_last_word():
     eye = Enclosure.of(np.eye(2))
     proof = prove_family(
-        "wrong", 1, lambda k: Enclosure(eye.mid[None], eye.rad[None]), lambda k: -eye_exact()
+        1, lambda k: Enclosure(eye.mid[None], eye.rad[None]), lambda k: -eye_exact()
     )
     assert proof.failed == (0,)
 
