@@ -115,9 +115,8 @@ def _prove_lmi(design: UioDesign, bound: EllipsoidBound) -> Claim:
         holds = holds and result.all_proved
         margin = min(margin, float(result.relative.min()))
         worst = int(result.worst()[0])
-        exact = exact and is_positive_definite(
-            recursion_block(design.data.vertex(worst), gain, bound, number, "exact")
-        )
+        at = design.data.at(design.data.vertices[[worst]])
+        exact = exact and is_positive_definite(recursion_block(at, gain, bound, number, "exact"))
     return Claim(
         "lmi",
         f"V+ <= (1 - gamma) V + gamma v'Q_v v at all {count} vertices of the Jacobian set "

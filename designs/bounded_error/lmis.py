@@ -41,16 +41,13 @@ class ModelData:
     w_radius: FloatArray
     rate: FloatArray
 
-    def vertex(self, index: int) -> ModelData:
-        """Return the same data with one vertex."""
-        pick = slice(index, index + 1)
-        radius = self.vertex_radius[pick]
-        return replace(self, vertices=self.vertices[pick], vertex_radius=radius)
+    def at(self, vertices: FloatArray) -> ModelData:
+        """Return the same data with other vertices, as they are."""
+        return replace(self, vertices=vertices, vertex_radius=np.zeros_like(vertices))
 
     def without_nonlinearity(self) -> ModelData:
         """Return the same data with the one vertex M = 0."""
-        zero = np.zeros((1, *self.A.shape))
-        return replace(self, vertices=zero, vertex_radius=zero)
+        return self.at(np.zeros((1, *self.A.shape)))
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -211,22 +208,14 @@ def multiplier_block(
     a: Any,
     b: Any,
     U: Any = None,
-    arithmetic: Arithmetic = "float",
 ) -> Any:
     """Inequality (51), as printed or repaired, times -1; H (n + n_f, m), a, b, U (n, n)."""
-    base = plain_error(data.without_nonlinearity(), arithmetic)
+    base, M = plain_error(data.without_nonlinearity()), data.vertices
     n, n_f, _, _ = data.sizes
-    V = lift(np.eye(n, n + n_f), arithmetic)
-    if arithmetic == "float":
-        M: Any = data.vertices
-        T: Any = data.T
-    else:
-        M = Enclosure.of(data.vertices, data.vertex_radius)
-        T = Enclosure.of(np.eye(n)) + Enclosure.of(data.E) @ Enclosure.of(data.C)
-    Y = lift(np.eye(n + n_f, n), arithmetic) @ T
+    V, Y = np.eye(n, n + n_f), np.eye(n + n_f, n) @ data.T
     X = P @ base.Abar - H @ base.Cbar
     Z = P @ base.Wbar - H @ base.Vbar
-    S1 = P * keep - lift(np.eye(n + n_f, n), arithmetic) @ he(a @ M) @ V
+    S1 = P * keep - np.eye(n + n_f, n) @ he(a @ M) @ V
     rows = [[S1], [a @ V, b], [0, 0, noise], [-X, -(P @ Y), -Z, P]]
     if U is None:
         rows.append([-(b @ M @ V), 0, 0, 0, b])

@@ -249,7 +249,7 @@ class BoundedErrorUIO(Method):
         if self.form in ("printed", "repaired"):
             from obsynth.designs.bounded_error.printed import box_vertices, multiplier_problem
 
-            data = _with_vertices(model, box_vertices(model.bounds))
+            data = model.design.data.at(box_vertices(model.bounds))
             noise, weights = self._noise(model, 3), self._weights(model)
             return multiplier_problem(data, self.gamma, noise, self.objective, weights, self.form)
         system, free_or_fixed, weights = self._setting(model)
@@ -318,7 +318,7 @@ class BoundedErrorUIO(Method):
         )
 
         vertices = box_vertices(model.bounds)
-        data = _with_vertices(model, vertices)
+        data = model.design.data.at(vertices)
         noise = self._noise(model, 3)
         form: Any = self.form
         if form == "printed":
@@ -359,10 +359,6 @@ class BoundedErrorUIO(Method):
             if all(claim.holds for claim in prove_ellipsoid(design)):
                 return design, True
         return design, False
-
-
-def _with_vertices(model: UioModel, vertices: FloatArray) -> Any:
-    return replace(model.design.data, vertices=vertices, vertex_radius=np.zeros_like(vertices))
 
 
 def _at_or_explained(
