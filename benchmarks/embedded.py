@@ -29,7 +29,7 @@ from obsynth.designs.core.observer import STEP_OUTPUTS
 from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import ROUND_UP, ULPS
 from obsynth.designs.general.step import Limits, build_core, memory_sizes, running
-from obsynth.evaluate import Table
+from obsynth.symbolic import Table
 
 HERE = Path(__file__).parent
 HAND = HERE / "by_hand"

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 import obsynth as ob
-from obsynth.evaluate import Table
+from obsynth.symbolic import Table
 
 PLANTS = {
     "cruise_control": 0.1,

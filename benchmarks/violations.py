@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from violations import CASES, KINDS, campaign
 
-from obsynth.evaluate import Table
+from obsynth.symbolic import Table
 
 
 def main(count=60, part=""):

@@ -24,6 +24,7 @@ from obsynth.codegen.start import Start, Variable, start_of
 from obsynth.designs.core.files import replaced
 from obsynth.designs.core.observer import ALARM_OUTPUT, STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 _PLATFORMS = {("linux", "x86_64"): ("linux64", "so"), ("darwin", "x86_64"): ("darwin64", "dylib")}
@@ -46,8 +47,8 @@ _OUTPUTS = {
 _BITS = "sum of " + ", ".join(f"{bit} {word.replace('_', ' ')}" for word, bit in STATUS.items())
 
 
-@dataclass(frozen=True)
-class Fmu:
+@dataclass(frozen=True, repr=False)
+class Fmu(Tabled):
     """A unit for co-simulation on the disk.
 
     Attributes
@@ -76,13 +77,13 @@ class Fmu:
     build: Build | None
     comparison: Comparison | None
 
-    def __str__(self) -> str:
+    def table(self) -> Table:
+        """Tabulate its variables, what is inside, and how it was compared."""
         names = {kind: getattr(self, kind) for kind in ("inputs", "outputs", "parameters")}
         rows = {kind: ", ".join(found) or "none" for kind, found in names.items()}
         rows["binary"] = self.platform or "none, sources only"
         rows["comparison"] = str(self.comparison or "not done: no C compiler")
-        lines = (f"  {kind}: {text}" for kind, text in rows.items())
-        return "\n".join([f"FMU {self.name}: {self.path}", *lines])
+        return Table(f"FMU {self.name}: {self.path}", ("", ""), [*rows.items()])
 
 
 @takes(observer="Observer FaultDetector")
@@ -141,7 +142,10 @@ def generate_fmu(
 
     Examples
     --------
-    >>> generate_fmu(None, "tank.zip")
+    >>> import obsynth as ob
+    >>> plant = ob.plants.cruise_control().discretise("euler", Ts=0.1)
+    >>> observer = ob.BoundedErrorUIO(bounds="peak").design(plant)
+    >>> generate_fmu(observer, "tank.zip")
     Traceback (most recent call last):
     ...
     obsynth.codegen.errors.CodegenError: tank.zip: name a file that ends with .fmu

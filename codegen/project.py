@@ -25,7 +25,7 @@ from obsynth.codegen.vectors import COUNT, make_vectors
 from obsynth.designs.core.observer import STATUS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 PRECISIONS = tuple(REALS)
@@ -46,8 +46,8 @@ _ARITHMETIC = (
 )
 
 
-@dataclass(frozen=True)
-class CProject:
+@dataclass(frozen=True, repr=False)
+class CProject(Tabled):
     """A C project on the disk.
 
     Attributes
@@ -81,7 +81,8 @@ class CProject:
     build: Build | None
     comparison: Comparison | None
 
-    def _rows(self) -> list[tuple[str, str]]:
+    def table(self) -> Table:
+        """Tabulate where it is, how large, and how it was built and compared."""
         sizes = ", ".join(f"{count} {kind}" for kind, count in self.sizes.items())
         rows = [
             ("folder", str(self.folder)),
@@ -96,15 +97,7 @@ class CProject:
         else:
             rows.append(("build", str(self.build)))
             rows.append(("comparison", str(self.comparison)))
-        return rows
-
-    def __str__(self) -> str:
-        return "\n".join(
-            [f"C project {self.name}", *(f"  {key}: {text}" for key, text in self._rows())]
-        )
-
-    def _repr_html_(self) -> str:
-        return html_table((), self._rows(), f"C project {self.name}")
+        return Table(f"C project {self.name}", ("", ""), rows)
 
 
 @takes(observer="Observer FaultDetector")
@@ -169,7 +162,10 @@ def generate_c(
 
     Examples
     --------
-    >>> generate_c(None, folder="tank", precision="float")
+    >>> import obsynth as ob
+    >>> plant = ob.plants.cruise_control().discretise("euler", Ts=0.1)
+    >>> observer = ob.BoundedErrorUIO(bounds="peak").design(plant)
+    >>> generate_c(observer, folder="tank", precision="float")
     Traceback (most recent call last):
     ...
     obsynth.codegen.errors.CodegenError: precision='float' is not available; available: 'double', \

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.errors import DerivationError
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 _STARTS = 32
@@ -22,8 +22,8 @@ _SLOW, _PATIENCE = 0.99, 3
 _NO_VALUES: FloatArray = np.zeros(0)
 
 
-@dataclass(frozen=True, eq=False)
-class Equilibrium:
+@dataclass(frozen=True, eq=False, repr=False)
+class Equilibrium(Tabled):
     """A point of operation.
 
     Attributes
@@ -45,11 +45,17 @@ class Equilibrium:
     p: FloatArray = field(default_factory=lambda: _NO_VALUES)
     rho: FloatArray = field(default_factory=lambda: _NO_VALUES)
 
-    def _repr_html_(self) -> str:
+    def __repr__(self) -> str:
+        kinds = [(kind, getattr(self, kind)) for kind in ("x", "u", "p", "rho")]
+        told = [f"{k} = ({', '.join(f'{v:.6g}' for v in part)})" for k, part in kinds if part.size]
+        return f"<Equilibrium: {', '.join(told)}>"
+
+    def table(self) -> Table:
+        """Tabulate the values and the residual."""
         kinds = {"x": self.x, "u": self.u, "p": self.p, "rho": self.rho}
         rows = [[kind, ", ".join(f"{v:.6g}" for v in part)] for kind, part in kinds.items()]
         shown = [row for row in rows if row[1]]
-        return html_table((), [*shown, ["residual", f"{self.residual:.2g}"]], "Equilibrium")
+        return Table("Equilibrium", ("", ""), [*shown, ["residual", f"{self.residual:.2g}"]])
 
 
 def operating_values(model: Plant, kind: str) -> FloatArray:

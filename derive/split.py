@@ -1,6 +1,7 @@
 """A plant as constant matrices plus a nonlinearity, with the proof that they add up."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,15 +19,19 @@ from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.rigour import rational, round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import sx_function
+from obsynth.symbolic.display import matrix_latex, short
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown, aligned, card, formulas
 from obsynth.symbolic.taking import takes
 
 LinearForm = Literal["frozen", "terms", "jacobian"]
+_LARGEST = 150
+"""Entries of a matrix that is shown in full."""
 _FORMS: tuple[LinearForm, ...] = ("frozen", "terms", "jacobian")
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
+@dataclass(frozen=True, eq=False, repr=False)
+class Split(Shown):
     """x+ = A x + B u + D d + B_f f + W1 w + g(x, u), y = C x + W2 w + D_f f.
 
     For a continuous plant x+ stands for the time derivative.
@@ -123,8 +128,28 @@ class Split:
             ) from error
 
     def _repr_latex_(self) -> str:
-        short = self.g.applyfunc(lambda e: e.evalf(6))
-        return f"$\\displaystyle g = {sp.latex(short)}$"
+        linear = [("A", "x"), ("B", "u"), ("D", "d"), ("B_f", "f"), ("W1", "w")]
+        outputs = [("C", "x"), ("W2", "w"), ("D_f", "f")]
+        left = "x^{+}" if self.model.Ts is not None else r"\dot{x}"
+        rows = [f"{left} &= {self._sum(linear)} + g", f"y &= {self._sum(outputs)}"]
+        for name, _ in (*linear, *outputs):
+            if (matrix := getattr(self, name)).any() and matrix.size <= _LARGEST:
+                rows.append(f"{_letter(name)} &= {matrix_latex(matrix)}")
+        return aligned([*rows, f"g &= {sp.latex(self.g.applyfunc(short))}"])
+
+    def _sum(self, blocks: Sequence[tuple[str, str]]) -> str:
+        return " + ".join(f"{_letter(b)} {s}" for b, s in blocks if getattr(self, b).any()) or "0"
+
+    def __str__(self) -> str:
+        return f"split of {self.model.name}, linear part {self.linear}\n{self.proof}"
+
+    def _repr_html_(self) -> str:
+        first, *rest = str(self).splitlines()
+        return card(first, formulas(self._repr_latex_()), rest, self.at)
+
+
+def _letter(name: str) -> str:
+    return name if "_" in name else re.sub(r"(\d)", r"_\1", name)
 
 
 def _symbols(model: Plant, kind: str) -> list[sp.Symbol]:

@@ -28,6 +28,5 @@ from obsynth.evaluate.run import Run as Run
 from obsynth.evaluate.simulate import simulate as simulate
 from obsynth.evaluate.studies.study import Study as Study
 from obsynth.evaluate.studies.study import read_study as read_study
-from obsynth.evaluate.table import Table as Table
 from obsynth.evaluate.trace import Trace as Trace
 from obsynth.evaluate.trace import Violation as Violation

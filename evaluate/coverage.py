@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from obsynth.evaluate.run import Run, covered
-from obsynth.evaluate.table import Table
+from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 

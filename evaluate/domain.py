@@ -1,6 +1,5 @@
 """Was the run inside the domain of the guarantee, and what did the observer say about itself?"""
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 
 from obsynth.designs.detection.comparison import RECOVERING, VOID, Void, find_voids, list_voids
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown, card
 
 _WORDS = {
     1: "not initialised: no measurement has been processed yet",
@@ -35,8 +35,8 @@ class StatusCount:
         return f"status {self.bit} at {self.count} instants, first k = {self.first}: {self.meaning}"
 
 
-@dataclass(frozen=True, eq=False)
-class Domain:
+@dataclass(frozen=True, eq=False, repr=False)
+class Domain(Shown):
     """Where truth and estimate stood relative to the box of the guarantee.
 
     x_inside, xhat_inside (N + 1,): true where every state is inside its range
@@ -88,9 +88,8 @@ class Domain:
         return "\n".join([head, *self.left, *map(str, self.status), *voids])
 
     def _repr_html_(self) -> str:
-        first, *rest = (html.escape(line) for line in str(self).splitlines())
-        items = "".join(f"<li>{line}</li>" for line in rest)
-        return f"<p>{first}.</p>" + (f"<ul>{items}</ul>" if items else "")
+        first, *rest = str(self).splitlines()
+        return card("", f"{first}.", rest)
 
 
 def count_status(status: NDArray[np.int64]) -> tuple[StatusCount, ...]:

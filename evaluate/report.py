@@ -21,10 +21,10 @@ from obsynth.evaluate.svg import (
     constants_html,
     equations_html,
     figure_svg,
-    signals_table,
 )
-from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
+from obsynth.symbolic.display import signals_table
+from obsynth.symbolic.table import Table, text
 from obsynth.symbolic.taking import takes
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def _plant_section(observer: "Observer") -> _Section:
             f"{_remainder_text(model)}). "
             f"{_subject(observer)}</p>"
         )
-    section.add(signals_table(shown)._repr_html_())
+    section.add(signals_table(shown, "Signals", shown.constants)._repr_html_())
     section.add(constants_html(shown))
     return section
 
@@ -210,16 +210,8 @@ def _design_section(observers: Mapping[str, "Observer"]) -> _Section:
     for label, observer in observers.items():
         if len(observers) > 1:
             section.add(f"<h3>{html.escape(label)}</h3>")
-        rows = [
-            ["✓" if c.holds else "✗", c.statement, c.margin, c.proof] for c in observer.certificate
-        ]
         section.add(
-            Table(
-                f"Certificate: {sum(c.holds for c in observer.certificate)} of {len(rows)} "
-                "claims proved for the gains as stored",
-                ["", "claim", "margin", "proof"],
-                rows,
-            )._repr_html_(),
+            observer.certificate._repr_html_(),
             _bullets("Guaranteed", observer.guarantee.claims),
             _bullets("Provided that", observer.guarantee.assumptions),
         )

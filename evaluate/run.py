@@ -1,6 +1,5 @@
 """What a simulation gives: the truth, the claims about it, and whether they hold."""
 
-import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,10 +15,11 @@ from obsynth.evaluate.checked import state_box
 from obsynth.evaluate.data.tables import to_dataset
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.table import Table
 from obsynth.evaluate.trace import Trace, Violation, as_told, take
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import card
+from obsynth.symbolic.table import Table
 
 # Instants listed for each violated signal; the count is always complete.
 LISTED = 5
@@ -272,14 +272,10 @@ class Run:
         )
 
     def _repr_html_(self) -> str:
-        reasons = "".join(f"<li>{html.escape(reason)}</li>" for reason in self.reasons)
-        outside = f"<p>Outside the guarantee:</p><ul>{reasons}</ul>" if reasons else ""
         # What the note of the table says of ranges and voids stands in the lists below it.
         table = replace(self.summary(), note="; ".join(map(str, self.violations)))
-        return (
-            f"{table._repr_html_()}<p>Truth: {html.escape(self.truth)}.</p>{outside}"
-            f"{self.domain._repr_html_()}"
-        )
+        outside = "Outside the guarantee:" if self.reasons else ""
+        return card("", table, f"Truth: {self.truth}.", outside, self.reasons, self.domain)
 
 
 def _bounds(trace: Trace) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,6 @@ import numpy as np
 import sympy as sp
 
 from obsynth.evaluate.plotting.layout import INK, SOFT
-from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant
 
 # Drawn in these colours, shown in the page's own, so that dark pages have light ink.
@@ -77,9 +76,6 @@ def _inline(text: str, key: str, label: str) -> str:
     return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1).strip()
 
 
-_GROUPS = ("x", "u", "d", "f", "w", "rho", "p")
-
-
 def equations_html(plant: Plant, key: str) -> str:
     """Return dynamics and outputs as inline SVG formulas, plain text where that fails."""
     rows = []
@@ -97,27 +93,6 @@ def equations_html(plant: Plant, key: str) -> str:
         natural = f' style="--natural:{width[1]}pt"' if width else ""
         lines.append(f'<div class="formula"{natural}>{shown}</div>')
     return "\n".join(lines)
-
-
-def signals_table(plant: Plant) -> Table:
-    """List every signal with its role, range, rate and unit."""
-    rows = []
-    for group in _GROUPS:
-        for signal in getattr(plant, group):
-            low, high = signal.lower, signal.upper
-            known = np.isfinite(low) or np.isfinite(high)
-            within = f"[{low:g}, {high:g}]".replace("-", "−").replace("inf", "∞")
-            rows.append(
-                [
-                    signal.name,
-                    str(signal.role) + (f" on {signal.of}" if signal.of else ""),
-                    within if known else "–",
-                    signal.nominal,
-                    signal.rate,
-                    signal.unit or "–",
-                ]
-            )
-    return Table("Signals", ["name", "role", "range", "nominal", "rate", "unit"], rows)
 
 
 def constants_html(plant: Plant) -> str:

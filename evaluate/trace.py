@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from obsynth.designs.core.observer import STATUS
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic.arrays import BoolArray, FloatArray
+from obsynth.symbolic.table import Table, Tabled
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trace(Tabled):
     """One signal over time: truth, estimate and interval, all about the same instants.
 
     Signals without an estimate (inputs, outputs, disturbances) have None there.
@@ -32,6 +33,18 @@ class Trace:
     upper: FloatArray | None = None
     alarm: NDArray[np.bool_] | None = None
     status: NDArray[np.int64] | None = None
+
+    def table(self) -> Table:
+        """Tabulate the ends of what there is."""
+        kinds = {"truth": self.true, "estimate": self.estimate}
+        kinds |= {"lower bound": self.lower, "upper bound": self.upper}
+        rows = [
+            [kind, float(np.nanmin(values)), float(np.nanmax(values))]
+            for kind, values in kinds.items()
+            if values is not None and not np.isnan(values).all()
+        ]
+        title = f"Trace of {self.label}, {len(self.t)} instants"
+        return Table(title, ["", "least", "largest"], rows)
 
     @property
     def label(self) -> str:

@@ -24,6 +24,7 @@ from obsynth.symbolic.signals import Signal as Signal
 from obsynth.symbolic.sxmodel import ParityError as ParityError
 from obsynth.symbolic.sxmodel import SxModel as SxModel
 from obsynth.symbolic.sxmodel import check_parity as check_parity
+from obsynth.symbolic.table import Table as Table
 from obsynth.symbolic.tape import from_tape as from_tape
 from obsynth.symbolic.text import TextError as TextError
 from obsynth.symbolic.text import read_text as read_text

@@ -1,82 +1,97 @@
 """Plants in notebooks: equations in LaTeX, signals in a table."""
 
-import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import aligned, card, formulas
 from obsynth.symbolic.signals import Signal
+from obsynth.symbolic.table import Table
 
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
 
-def aligned(rows: Iterable[str]) -> str:
-    """Return rows with an & before their relation as one LaTeX environment."""
-    return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
+_DIGITS = 6
+_LONG = 10**6
 
 
-def html_table(heads: Sequence[str], rows: Iterable[Iterable[str]], caption: str = "") -> str:
-    """Return an HTML table of plain text, without heads or caption where there are none."""
-    title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heads)
-    lines = [head] if heads else []
-    lines += ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
-    lines = [f"<tr>{line}</tr>".replace("\n", "<br>") for line in lines]
-    return f"<table>{title}{''.join(lines)}</table>"
+def short(expression: sp.Expr) -> sp.Expr:
+    """Write the numbers of an expression with six digits, small integers and fractions as is."""
+    if expression.is_number:
+        plain = expression.is_Rational and abs(expression.p) < _LONG and expression.q < 1000
+        return expression if plain else sp.Float(expression.evalf(_DIGITS), _DIGITS)
+    if expression.is_Pow:
+        exponent = expression.exp if expression.exp.is_Rational else short(expression.exp)
+        return sp.Pow(short(expression.base), exponent, evaluate=expression.base.is_Symbol)
+    if not expression.args:
+        return expression
+    if expression.is_Mul or expression.is_Add:
+        numbers = [a for a in expression.args if a.is_number]
+        rest = [short(a) for a in expression.args if not a.is_number]
+        joined = [short(expression.func(*numbers))] if numbers else []
+        return expression.func(*joined, *rest)
+    return expression.func(*[short(a) if isinstance(a, sp.Expr) else a for a in expression.args])
 
 
-def html_lines(shown: object) -> str:
-    """Return what is printed of an object as a table: its first line above, the others in rows."""
-    title, *lines = str(shown).splitlines()
-    return html_table((), ([line.strip()] for line in lines), title)
+def matrix_latex(matrix: FloatArray) -> str:
+    """Return a matrix of numbers as LaTeX, with six digits."""
+    rows = (" & ".join(f"{value:.6g}" for value in row) for row in matrix.tolist())
+    return "\\begin{bmatrix}" + r" \\ ".join(rows) + "\\end{bmatrix}"
 
 
 def plant_latex(plant: "Plant") -> str:
-    r"""Return the equations of a plant, faults inserted, as one LaTeX environment."""
+    r"""Return the equations of a plant, faults inserted, as one LaTeX display."""
     # A Runge-Kutta step written out fills pages; its derivatives say the same.
     original = plant.continuous
     if original is not None and plant.discretisation != "euler":
         step = sp.latex(plant.exact_Ts)
         note = rf"\text{{{plant.discretisation}, }} T_s &= {step}\,\mathrm{{s}}"
-        inner = plant_latex(original).removeprefix("\\begin{aligned}\n")
-        return f"\\begin{{aligned}}\n{note} \\\\\n{inner}"
+        return aligned([note, *_equations(original)])
+    return aligned(_equations(plant))
+
+
+def _equations(plant: "Plant") -> list[str]:
     rows = []
     if plant.has_dynamics:
         for signal, row in zip(plant.x, plant.rhs, strict=True):
             name = sp.latex(signal.symbol)
             left = rf"\dot{{{_base(name)}}}{_index(name)}" if plant.Ts is None else rf"{name}^{{+}}"
-            rows.append(f"{left} &= {sp.latex(row)}")
+            rows.append(f"{left} &= {sp.latex(short(row))}")
     if plant.has_outputs:
         for name, row in zip(plant.output_names, plant.output, strict=True):
-            rows.append(f"{sp.latex(sp.Symbol(name))} &= {sp.latex(row)}")
-    return aligned(rows)
+            rows.append(f"{sp.latex(sp.Symbol(name))} &= {sp.latex(short(row))}")
+    return rows
 
 
 def plant_html(plant: "Plant") -> str:
     """Return equations and a table of signals for a notebook."""
     time = "continuous time" if plant.Ts is None else f"sampled every {plant.Ts:g} s"
     method = f", {plant.discretisation}" if plant.discretisation else ""
+    title = f"{plant.name}, {time}{method}"
+    return card(title, formulas(plant_latex(plant)), signals_table(plant))
+
+
+def signals_table(plant: "Plant", title: str = "", without: Sequence[Signal] = ()) -> Table:
+    """List every signal with its role, range, nominal value, rate and unit."""
     heads = ("signal", "role", "range", "nominal", "rate", "unit")
-    rows = [_cells(signal) for signal in plant.signals]
+    rows = [_cells(signal) for signal in plant.signals if signal not in without]
     rest = {signal.name for signal in plant.remainder or ()}
     word = f"what a step of {plant.discretisation} leaves out"
     rows = [(row[0], word, *row[2:]) if row[0] in rest else row for row in rows]
     sensors = zip(plant.output_names, plant.output_ranges, plant.output_units, strict=True)
     rows += [(name, "output", _span(*ends), "", "", unit) for name, ends, unit in sensors]
-    return (
-        f"<p><b>{html.escape(plant.name)}</b>, {time}{method}</p>"
-        f"<div>$${html.escape(plant_latex(plant), quote=False)}$$</div>{html_table(heads, rows)}"
-    )
+    return Table(title, heads, rows)
 
 
 def _cells(signal: Signal) -> tuple[str, ...]:
     role = f"{signal.role} of {signal.of}" if signal.of else str(signal.role)
     role += "" if signal.measured else ", not measured"
     if signal.value is not None and signal.lower == signal.upper:
-        span = sp.sstr(signal.value, full_prec=False)
+        span = sp.sstr(short(signal.value), full_prec=False)
     else:
         span = _span(signal.lower, signal.upper)
     nominal = "" if signal.nominal is None else f"{signal.nominal:g}"

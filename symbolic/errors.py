@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from obsynth.symbolic.shown import card
+
 
 class ObsynthWarning(UserWarning):
     """Something worth knowing that is not wrong."""
@@ -27,6 +29,10 @@ class ObsynthError(ValueError):
     def __init__(self, message: str, **facts: Any) -> None:
         super().__init__(message)
         self.facts = facts
+
+    def _repr_html_(self) -> str:
+        first, *lines = str(self).splitlines() or [""]
+        return card(type(self).__name__, first, [line.strip() for line in lines])
 
     def __getattr__(self, name: str) -> Any:
         try:

@@ -412,7 +412,7 @@ class Plant:
         return f"Plant({self.name!r}, {time}: {', '.join(counts)})"
 
     def _repr_latex_(self) -> str:
-        return f"$${plant_latex(self)}$$"
+        return plant_latex(self)
 
     def _repr_html_(self) -> str:
         return plant_html(self)

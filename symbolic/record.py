@@ -1,6 +1,5 @@
 """Records: what was measured of a plant, one row for each instant."""
 
-import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,9 +9,10 @@ from typing import Any, overload
 import numpy as np
 
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.errors import RecordError
 from obsynth.symbolic.findings import Finding, find, quantum
+from obsynth.symbolic.shown import card
+from obsynth.symbolic.table import Table
 
 GROUPS = ("u", "rho", "y", "reference")
 
@@ -191,13 +191,8 @@ class Record:
             kinds = [f.kind for f in self.findings() if f.channel == name]
             found = ", ".join(f"{kinds.count(k)} {k}" for k in dict.fromkeys(kinds))
             rows.append((name, words[group], unit, span, str(len(self) - values.size), step, found))
-        told = "".join(
-            f"<li>{html.escape(t)}</li>" for t in (*map(str, self.findings()), *self.notes)
-        )
-        return (
-            f"<p><b>{html.escape(self.source)}</b>, {len(self)} instants, {self.time[0]:g} to "
-            f"{self.time[-1]:g} s</p>{html_table(heads, rows)}<ul>{told}</ul>"
-        )
+        title = f"{self.source}, {len(self)} instants, {self.time[0]:g} to {self.time[-1]:g} s"
+        return card(title, Table("", heads, rows), [*self.findings(), *self.notes])
 
     def plot(self, names: Sequence[str] | None = None) -> Any:
         """Plot channels over time, by default all; findings are shaded.

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import PlantError
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import labelled
 
 _FIELDS = {
@@ -22,8 +23,8 @@ _FIELDS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Scenario:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scenario(Tabled):
     """Initial state, inputs, faults and disturbances over the samples 0..steps.
 
     Parameters
@@ -104,6 +105,16 @@ class Scenario:
                 if np.any(box[:, 0] > box[:, 1]):
                     raise PlantError(f"scenario {self.name!r}: {field} has lower above upper")
                 object.__setattr__(self, field, box)
+
+    def table(self) -> Table:
+        """Tabulate what is given: values, the ranges of samples, what is a function."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)[2:-1]}
+        rows = [
+            (name.replace("_", " "), _told(value.T if name.endswith("range") else value))
+            for name, value in given.items()
+            if value is not None
+        ]
+        return Table(f"Scenario {self.name!r}, {self.steps} steps", ("", ""), rows)
 
     @property
     def functions(self) -> dict[str, Callable[[float], ArrayLike]]:
@@ -258,6 +269,16 @@ def known_name(name: str, known: Sequence[str], who: str) -> None:
     """Refuse a name that no scenario of a plant has."""
     if name not in known:
         raise PlantError(f"scenario {name!r} is unknown; {who} {', '.join(known)}", name=name)
+
+
+def _told(value: Any) -> str:
+    """Say what is given: entries of a vector, ranges of samples (N+1, count)."""
+    if callable(value):
+        return "a function"
+    if value.ndim == 1:
+        return f"({', '.join(f'{entry:.6g}' for entry in value)})"
+    ends = zip(value.min(axis=0), value.max(axis=0), strict=True)
+    return ", ".join(f"[{low:.6g}, {high:.6g}]" for low, high in ends)
 
 
 def _needed(function: Callable[..., Any], unknown: int = 1) -> int:

@@ -14,8 +14,8 @@ from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 _MOST_VERTICES = 4096
@@ -36,8 +36,8 @@ class InnerBound:
     radius: float
 
 
-@dataclass(frozen=True, eq=False)
-class LipschitzConstants:
+@dataclass(frozen=True, eq=False, repr=False)
+class LipschitzConstants(Tabled):
     """How fast a nonlinearity can change over the box, in the 2-norm of the plant's units.
 
     norm: Lipschitz constant: largest norm of the Jacobian
@@ -52,26 +52,20 @@ class LipschitzConstants:
     inner: InnerBound
     what: str
 
-    def _rows(self) -> list[tuple[str, Maximum]]:
+    def table(self) -> Table:
+        """Tabulate the constants: what is guaranteed, attained, and where."""
         inner = f"inner-bounded: beta for gamma = {self.inner.gamma:.6g}"
-        return [
+        maxima = [
             ("Lipschitz: norm of the Jacobian", self.norm),
             ("one-sided: largest eigenvalue of the symmetric part", self.one_sided),
             (inner, self.inner.beta),
         ]
-
-    def __str__(self) -> str:
-        width = max(len(name) for name, _ in self._rows())
-        lines = [f"  {name:<{width}}  {value}" for name, value in self._rows()]
-        return "\n".join([f"Constants of {self.what}, over the box", *lines])
-
-    def _repr_html_(self) -> str:
         heads = ("", "guaranteed", "attained", "status", "by", "at")
         rows = [
             (name, f"{m.upper:.8g}", f"{m.attained:.8g}", m.status.word, m.method, m.where)
-            for name, m in self._rows()
+            for name, m in maxima
         ]
-        return html_table(heads, rows, f"Constants of {self.what}, over the box")
+        return Table(f"Constants of {self.what}, over the box", heads, rows)
 
 
 @takes(split_or_model="Plant Split")

@@ -23,12 +23,12 @@ from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian
 from obsynth.derive.rigour import up
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 
-@dataclass(frozen=True, eq=False)
-class Majorant:
+@dataclass(frozen=True, eq=False, repr=False)
+class Majorant(Tabled):
     """A diagonal M'M with J(x)'J(x) <= M'M at every point of the box, J = dg/dx.
 
     diagonal (n,): of M'M; zero for states on which g does not depend
@@ -64,7 +64,8 @@ class Majorant:
         """The worst status of all groups."""
         return Status.worst(group[2].status for group in self.groups)
 
-    def _lines(self) -> list[tuple[str, str]]:
+    def table(self) -> Table:
+        """Tabulate the diagonal, and how much of every group is attained."""
         names = self.split.model.names("x")
         lines = [("M'M", f"diag({', '.join(f'{v:.8g}' for v in self.diagonal)})")]
         for rows, columns, largest in self.groups:
@@ -74,20 +75,8 @@ class Majorant:
             )
             reached = f"{largest.attained:.10g} of 1 attained ({largest.status.word})"
             lines.append((what, f"{reached} at {largest.where}"))
-        return lines
-
-    def __str__(self) -> str:
-        lines = self._lines()
-        width = max(len(name) for name, _ in lines)
-        return "\n".join(
-            [
-                f"Majorant of g of {self.split.model.name}: |g(a) - g(b)|^2 <= (a - b)'M'M(a - b)",
-                *(f"  {name:<{width}}  {text}" for name, text in lines),
-            ]
-        )
-
-    def _repr_html_(self) -> str:
-        return html_table((), self._lines(), f"Majorant of g of {self.split.model.name}")
+        title = f"Majorant of g of {self.split.model.name}: |g(a) - g(b)|^2 <= (a - b)'M'M(a - b)"
+        return Table(title, ("", ""), lines)
 
 
 @takes(split="Split")

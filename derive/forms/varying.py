@@ -17,29 +17,9 @@ from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.rigour import round_number
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_table
+from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.signals import Signal
-
-_DIGITS = 6
-_LONG = 10**6
-
-
-def short(expression: sp.Expr) -> sp.Expr:
-    """Write the numbers of an expression with six digits, small integers and fractions as is."""
-    if expression.is_number:
-        plain = expression.is_Rational and abs(expression.p) < _LONG and expression.q < 1000
-        return expression if plain else sp.Float(expression.evalf(_DIGITS), _DIGITS)
-    if expression.is_Pow:
-        exponent = expression.exp if expression.exp.is_Rational else short(expression.exp)
-        return sp.Pow(short(expression.base), exponent, evaluate=expression.base.is_Symbol)
-    if not expression.args:
-        return expression
-    if expression.is_Mul or expression.is_Add:
-        numbers = [a for a in expression.args if a.is_number]
-        rest = [short(a) for a in expression.args if not a.is_number]
-        joined = [short(expression.func(*numbers))] if numbers else []
-        return expression.func(*joined, *rest)
-    return expression.func(*[short(a) if isinstance(a, sp.Expr) else a for a in expression.args])
+from obsynth.symbolic.table import Table
 
 
 @dataclass(frozen=True)
@@ -97,8 +77,8 @@ class Blocks(ABC):
         return self.block(name)
 
 
-@dataclass(frozen=True, eq=False)
-class Vertices(Blocks):
+@dataclass(frozen=True, eq=False, repr=False)
+class Vertices(Shown, Blocks):
     """The blocks of a form at the vertices of its scheduling variables.
 
     Each block is an attribute, with the vertices first: ``A`` (V, n, n), ``B`` (V, n, n_u), ...; of
@@ -143,7 +123,7 @@ class Vertices(Blocks):
     def _repr_html_(self) -> str:
         ends = ((f"{low:.8g}", f"{high:.8g}") for low, high in self.family.ranges)
         rows = [(label, *pair) for label, pair in zip(self.family.labels, ends, strict=True)]
-        return html_table(("variable", "min", "max"), rows, str(self))
+        return Table(str(self), ("variable", "min", "max"), rows)._repr_html_()
 
 
 @dataclass(frozen=True, eq=False, repr=False)

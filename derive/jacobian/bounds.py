@@ -32,8 +32,9 @@ from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.discretise import runge_kutta
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown, card
+from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
@@ -191,8 +192,8 @@ def _meets(surface: sp.Expr, box: Box) -> bool:
     return low <= 0.0 <= high
 
 
-@dataclass(frozen=True, eq=False)
-class JacobianBounds:
+@dataclass(frozen=True, eq=False, repr=False)
+class JacobianBounds(Shown):
     """Guaranteed bounds of dg/dx (or dg/du) over the box of the plant.
 
     Attributes
@@ -255,8 +256,12 @@ class JacobianBounds:
         count = f"{self.family.vertex_count} vertices ({kind})"
         return f"{count} in place of {self.naive_vertex_count}"
 
+    @property
+    def _title(self) -> str:
+        return f"{int(self.varying.sum())} varying entries, {self.counted}"
+
     def __str__(self) -> str:
-        lines = [f"{int(self.varying.sum())} varying entries, {self.counted}"]
+        lines = [self._title]
         for (i, j), status in np.ndenumerate(self.status):
             if self.varying[i, j]:
                 lines.append(
@@ -278,9 +283,9 @@ class JacobianBounds:
             for p, s in np.ndenumerate(self.status)
             if self.varying[p]
         ]
-        reasons = "".join(f"<li>{d}</li>" for d in self.dependences if d.coefficients)
-        table = html_table(("entry", "min", "max", "gap", "status"), rows)
-        return f"{table}<p>{self.counted}</p><ul>{reasons}</ul>"
+        reasons = [d for d in self.dependences if d.coefficients]
+        table = Table("", ("entry", "min", "max", "gap", "status"), rows)
+        return card(self._title, table, reasons)
 
 
 @takes(split_or_model="Plant Split")

@@ -8,14 +8,14 @@ import sympy as sp
 from obsynth.derive.intervals.ranges import Status
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import Step
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.table import Table, Tabled
 
 _HEADS = ("state", "guaranteed", "attained", "flow over a step", "unit")
 
 
-@dataclass(frozen=True, eq=False)
-class Remainder:
+@dataclass(frozen=True, eq=False, repr=False)
+class Remainder(Tabled):
     """x(t + Ts) = step(x(t)) + r with r in [lower, upper], everything else held over the step.
 
     plant: the continuous plant
@@ -69,8 +69,14 @@ class Remainder:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(wide <= 1e-250, 1.0, np.where(real > 0.0, wide / real, np.inf))
 
-    def _table(self) -> list[tuple[str, ...]]:
-        return [
+    def table(self) -> Table:
+        """Tabulate bounds, attained values and the box of the flow, a row for every state."""
+        held = "".join(f", {k} in [{a:g}, {b:g}]" for k, (a, b) in self.assumed.items())
+        title = (
+            f"Remainder of {self.method}, Ts = {self.Ts:g} s, for {self.plant.name} "
+            f"(order {self.order}; signals held over a step{held})"
+        )
+        rows = [
             (
                 signal.name,
                 f"[{self.lower[i]:.4g}, {self.upper[i]:.4g}]",
@@ -80,22 +86,4 @@ class Remainder:
             )
             for i, signal in enumerate(self.plant.x)
         ]
-
-    def _title(self) -> str:
-        held = "".join(f", {k} in [{a:g}, {b:g}]" for k, (a, b) in self.assumed.items())
-        return (
-            f"Remainder of {self.method}, Ts = {self.Ts:g} s, for {self.plant.name} "
-            f"(order {self.order}; signals held over a step{held})"
-        )
-
-    def __str__(self) -> str:
-        table = [_HEADS, *self._table()]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  " + "  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip()
-            for row in table
-        ]
-        return "\n".join([self._title(), *lines])
-
-    def _repr_html_(self) -> str:
-        return html_table(_HEADS, self._table(), self._title())
+        return Table(title, _HEADS, rows)

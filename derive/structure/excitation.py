@@ -1,7 +1,6 @@
 """When a fault can be identified: what its effect depends on, and how much has to move."""
 
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import casadi as ca
@@ -13,6 +12,7 @@ from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import substitute
 from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.taking import takes
 
 _MOST_POINTS = 6
@@ -54,8 +54,8 @@ class FaultEffect:
         return f"{self.fault} acts through {by} and fades at {where}: keep away from there"
 
 
-@dataclass(frozen=True, eq=False)
-class Excitation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Excitation(Shown):
     """What has to move for constant faults to be identified together.
 
     effects: one per fault
@@ -99,10 +99,6 @@ class Excitation:
 
     def __str__(self) -> str:
         return "\n".join([self.condition, *(str(effect) for effect in self.effects)])
-
-    def _repr_html_(self) -> str:
-        items = "".join(f"<li>{escape(str(effect))}</li>" for effect in self.effects)
-        return f"<p>{escape(self.condition)}</p><ul>{items}</ul>"
 
 
 @takes(model="Plant")

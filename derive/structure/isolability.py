@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
 from obsynth.derive.structure.frozen import freeze, original, precision, rank, transfer
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown
+from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 # Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
 _FREQUENCIES = (1.3717, -0.8391, 2.1173)
 
 
-@dataclass(frozen=True, eq=False)
-class FaultIsolability:
+@dataclass(frozen=True, eq=False, repr=False)
+class FaultIsolability(Shown):
     """What the outputs say about single faults.
 
     faults: names of the faults
@@ -111,7 +112,7 @@ class FaultIsolability:
             (name, "yes" if seen else "no", *("yes" if ok else "\u00b7" for ok in row))
             for name, seen, row in zip(self.faults, self.detectable, self.isolable, strict=True)
         ]
-        return html_table(("fault", "seen", *self.faults), rows, str(self))
+        return Table(str(self), ("fault", "seen", *self.faults), rows)._repr_html_()
 
 
 @takes(model="Plant")

@@ -24,9 +24,10 @@ from obsynth.derive.structure.zeros import (
     separable_faults,
     zeros_over_polytope,
 )
-from obsynth.symbolic.display import html_table
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown
+from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 T = TypeVar("T")
@@ -47,8 +48,8 @@ class Check:
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class StructureReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class StructureReport(Shown):
     """What the structure of a plant allows, line by line.
 
     plant: name of the plant
@@ -86,7 +87,7 @@ class StructureReport:
     def _repr_html_(self) -> str:
         marks = {True: "\u2713", False: "\u2717", None: ""}
         rows = [(marks[check.passed], check.title, check.text) for check in self.checks]
-        return html_table((), rows, f"Structure of {self.plant}")
+        return Table(f"Structure of {self.plant}", ("", "", ""), rows)._repr_html_()
 
 
 def _signals(model: Plant) -> str:

@@ -1,7 +1,6 @@
 """What faults and unknown inputs do to the outputs: invariant zeros, separable faults."""
 
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import numpy as np
@@ -10,6 +9,7 @@ from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
 from obsynth.derive.structure.conditions import Numbers, scaled_rank
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown
 
 Signals = Literal["unknown", "all"]
 _TOLERANCE = 1e-10
@@ -112,8 +112,8 @@ def _reduce(
         A, B = A[lost:, lost:], B[lost:]
 
 
-@dataclass(frozen=True, eq=False)
-class PolytopeZeros:
+@dataclass(frozen=True, eq=False, repr=False)
+class PolytopeZeros(Shown):
     """Zeros from some signals to the outputs, at every vertex of the Jacobian family.
 
     signals: the inputs of the system: unknown inputs, or these and the faults
@@ -145,9 +145,6 @@ class PolytopeZeros:
             f"{what}: slowest {value} at vertex {int(self.vertex or 0) + 1} of {len(self.zeros)} "
             f"({verdict})"
         )
-
-    def _repr_html_(self) -> str:
-        return f"<p>Invariant zeros {escape(str(self))}</p>"
 
 
 def list_zeros(zeros: Numbers) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import reading, shown
-from obsynth.symbolic.display import html_lines
+from obsynth.symbolic.shown import Shown, card
+from obsynth.symbolic.table import Table, Tabled
 
 if TYPE_CHECKING:
     from obsynth.designs.core.method import Contract
@@ -63,8 +64,8 @@ class Claim:
         return same and isclose(told, margin, rel_tol=1e-2, abs_tol=1e-12)
 
 
-@dataclass(frozen=True)
-class Guarantee:
+@dataclass(frozen=True, repr=False)
+class Guarantee(Shown):
     """What an observer promises, and under which assumptions.
 
     Attributes
@@ -82,12 +83,15 @@ class Guarantee:
         lines += ["provided that:", *(f"  - {text}" for text in self.assumptions)]
         return "\n".join(lines)
 
+    def __repr__(self) -> str:
+        return f"<Guarantee: {len(self.claims)} claims under {len(self.assumptions)} assumptions>"
+
     def _repr_html_(self) -> str:
-        return html_lines(self)
+        return card("Guaranteed", self.claims, card("provided that", self.assumptions))
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Tabled):
     """All claims of a design, bound to the record that they were proved for.
 
     Attributes
@@ -221,15 +225,14 @@ class Certificate:
     def __str__(self) -> str:
         return "\n".join(str(claim) for claim in self.claims)
 
-    def _repr_html_(self) -> str:
-        from html import escape
+    def __repr__(self) -> str:
+        return f"<{self.table().title}>"
 
-        left = "style='text-align:left'"
-        rows = "".join(
-            f"<tr><td>{'&#10003;' if c.holds else '&#10007;'}</td>"
-            f"<td {left}>{escape(c.statement)}</td>"
-            f"<td>{c.margin:.3g}</td><td {left}>{escape(c.proof)}</td></tr>"
-            for c in self.claims
+    def table(self) -> Table:
+        """Tabulate the claims with their margins and proofs."""
+        proved = sum(claim.holds for claim in self.claims)
+        return Table(
+            f"Certificate: {proved} of {len(self.claims)} claims proved for the gains as stored",
+            ["", "claim", "margin", "proof"],
+            [["✓" if c.holds else "✗", c.statement, c.margin, c.proof] for c in self.claims],
         )
-        head = f"<tr><th></th><th {left}>claim</th><th>margin</th><th {left}>proof</th></tr>"
-        return f"<table>{head}{rows}</table>"

@@ -6,6 +6,7 @@ A method is written as a folder with the files ``model`` (what is read of a plan
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
@@ -33,6 +34,8 @@ from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.shown import card
+from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 D = TypeVar("D")
@@ -44,6 +47,7 @@ WATCHED = ("horizon", "recovery", "cuts", "precision")
 """Options that every method has."""
 FORMAT = "obsynth design"
 VERSION = 2
+_NUMBER = re.compile(r"\d+\.\d+(e[-+]?\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +241,15 @@ class Method:
             )
         object.__setattr__(self, "cuts", None if self.cuts is None else named)
         self.check()
+
+    def _repr_html_(self) -> str:
+        def said(value: Any) -> str:
+            return _NUMBER.sub(lambda found: f"{float(found[0]):.6g}", str(value))
+
+        given = ((f.name, said(getattr(self, f.name)), said(f.default)) for f in fields(self))
+        about = (type(self).__doc__ or "").strip().split("\n\n")[0]
+        rows = [(name, value, "" if value == own else own) for name, value, own in given]
+        return card(type(self).__name__, about, Table("", ("option", "value", "by default"), rows))
 
     def check(self) -> None:
         """Refuse options that do not fit each other, with an ObsynthError."""

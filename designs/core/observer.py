@@ -12,6 +12,8 @@ import numpy as np
 from obsynth.designs.core.certificate import Certificate, Guarantee
 from obsynth.designs.core.record import Precision, precision_of
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown, card, folded
+from obsynth.symbolic.table import Table
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -52,8 +54,8 @@ FURTHER_OUTPUTS = ((), (ALARM_OUTPUT,), (ALARM_OUTPUT, *MEAN_OUTPUTS))
 """What a step may have behind `STEP_OUTPUTS`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observer:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observer(Shown):
     """A certified observer; `step` is the one truth at run time.
 
     Attributes
@@ -216,18 +218,12 @@ class Observer:
         return f"says no more of {told} than is declared: obsynth.choose tries the other methods"
 
     def _repr_html_(self) -> str:
-        from html import escape
-
-        left = "style='text-align:left'"
-        rows = "".join(
-            f"<tr><td {left}>{escape(name)}</td><td>{escape(word)}</td></tr>"
-            for name, word in self.widths.items()
+        first, *_ = str(self).splitlines()
+        told = [*self.widths.items(), *((k, f"{v:.6g}") for k, v in self.figures.items())]
+        return card(
+            first,
+            Table("", ("", ""), told),
+            self._advice if self.vacuous else "",
+            self.certificate,
+            folded("Guarantee", self.guarantee),
         )
-        facts = "".join(
-            f"<tr><td {left}>{escape(key)}</td><td>{value:.6g}</td></tr>"
-            for key, value in self.figures.items()
-        )
-        words = f"{escape(self.method)} for {escape(self.model.name)}"
-        title = f"<caption style='text-align:left;white-space:nowrap'>{words}</caption>"
-        advice = f"<p>{escape(self._advice)}</p>" if self.vacuous else ""
-        return f"<table>{title}{rows}{facts}</table>{advice}{self.certificate._repr_html_()}"

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown, card
 
 BoolArray = NDArray[np.bool_]
 LISTED = 5
@@ -91,8 +91,8 @@ class FaultEvent:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Detection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Detection(Shown):
     """Alarms of a run compared with the faults that were there.
 
     Attributes
@@ -150,7 +150,7 @@ class Detection:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return "<br>".join(escape(line) for line in str(self).splitlines())
+        return card("Detection", str(self).splitlines())
 
 
 def compare(

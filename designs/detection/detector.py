@@ -24,7 +24,7 @@ from obsynth.designs.detection.comparison import Detection, compare
 from obsynth.designs.detection.observed import Handed, bounded_faults, core_of, whole_numbers
 from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.display import html_lines
+from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.taking import check_kind
 
 SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "recovering")
@@ -33,8 +33,8 @@ SKIPPED = ("not_initialised", "non_finite_input", "void", "fault_not_valid", "re
 _COUNT = "alarm_count"
 
 
-@dataclass(frozen=True, eq=False)
-class FaultDetector:
+@dataclass(frozen=True, eq=False, repr=False)
+class FaultDetector(Shown):
     """Raises one alarm per fault when zero has left the fault's guaranteed interval.
 
     Parameters
@@ -413,6 +413,3 @@ class FaultDetector:
             mean = " for the mean" if self._of_mean else ""
             lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}{mean}")
         return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return html_lines(self)

@@ -15,6 +15,7 @@ from obsynth.designs.hinf.record import HinfDesign
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.shown import Shown
 
 ComplexArray = NDArray[np.complex128]
 FREQUENCIES = 48
@@ -184,8 +185,8 @@ def _finite(box: FloatArray) -> FloatArray:
     return np.column_stack([lower, upper])
 
 
-@dataclass(frozen=True, eq=False)
-class WorstCase:
+@dataclass(frozen=True, eq=False, repr=False)
+class WorstCase(Shown):
     """A disturbance that was simulated on the nonlinear plant, and what it did.
 
     Attributes

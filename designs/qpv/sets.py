@@ -17,6 +17,7 @@ from obsynth.derive.rigour import Enclosure
 from obsynth.designs.core.record import Context
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.table import Table
 
 Kind = Literal["box", "cross", "hull"]
 _MOST = 2**14
@@ -108,6 +109,11 @@ class Ellipsoid:
         diagonal = np.diag(np.diag(self.Q))
         Q = np.diag(self.Q).tolist() if np.array_equal(self.Q, diagonal) else self.Q.tolist()
         return f"Ellipsoid(Q={Q}, c={self.c.tolist()})"
+
+    def _repr_html_(self) -> str:
+        rows = [*zip(self.c.tolist(), self.half_widths.tolist(), *self.Q.tolist(), strict=True)]
+        heads = ("centre c", "half width", *("Q" if j == 0 else "" for j in range(self.dimension)))
+        return Table("Ellipsoid (x - c)' Q^-1 (x - c) <= 1", heads, rows)._repr_html_()
 
 
 def _numbers(name: str, value: ArrayLike) -> FloatArray:

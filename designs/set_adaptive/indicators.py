@@ -10,12 +10,13 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.set_adaptive.record import SetDesign
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.shown import Shown
 
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Indicators:
+@dataclass(frozen=True, eq=False, repr=False)
+class Indicators(Shown):
     """Which outputs and faults raise an alarm.
 
     s: (16): the output is outside of what a plant without fault may show
@@ -26,6 +27,11 @@ class Indicators:
     s: Flags
     d: Flags
     z: Flags
+
+    def __str__(self) -> str:
+        count = self.S.size
+        told = ((name, int(getattr(self, name).sum())) for name in "SDZ")
+        return "Indicators: " + ", ".join(f"{name} at {k} of {count} instants" for name, k in told)
 
     @property
     def S(self) -> Flags:

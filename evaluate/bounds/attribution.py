@@ -9,16 +9,17 @@ from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.certified import Least, least
 from obsynth.evaluate.bounds.linear import assemble
 from obsynth.evaluate.bounds.problem import Problem
-from obsynth.evaluate.table import Table
 from obsynth.symbolic import Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown, card
+from obsynth.symbolic.table import Table
 
 WIDER = 1e3
 """Up to how many times its bound a disturbance that is freed is looked for."""
 
 
-@dataclass(frozen=True, eq=False)
-class Attribution:
+@dataclass(frozen=True, eq=False, repr=False)
+class Attribution(Shown):
     """What of a record contradicts bounds, four ways of saying where.
 
     scale: certified and attained: the factor of the bounds that explains the whole record. Above 1
@@ -60,11 +61,11 @@ class Attribution:
             "missing from.",
         )
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         return f"{self._sentence}\n{self.blamed}\n{self.alone}"
 
     def _repr_html_(self) -> str:
-        return f"<p>{self._sentence}</p>{self.blamed._repr_html_()}{self.alone._repr_html_()}"
+        return card("", self._sentence, self.blamed, self.alone)
 
     @property
     def _sentence(self) -> str:

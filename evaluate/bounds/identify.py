@@ -14,9 +14,9 @@ from obsynth.evaluate.bounds.certified import narrowed
 from obsynth.evaluate.bounds.problem import Problem, default_groups, pose
 from obsynth.evaluate.bounds.trajectory import Search, Trajectory, guess, measured
 from obsynth.evaluate.errors import BoundsError
-from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 MOST_CUTS = 12
@@ -27,8 +27,8 @@ UNKNOWN = 1e-8
 """Information of a direction, relative to the largest, below which the record has none of it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Identified:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Tabled):
     """What a record says of a plant's parameters.
 
     Parameters
@@ -83,12 +83,6 @@ class Identified:
             rows,
             note=". ".join([*said, "Seen over " + ", ".join(seen)]) + ".",
         )
-
-    def __repr__(self) -> str:
-        return str(self.table())
-
-    def _repr_html_(self) -> str:
-        return self.table()._repr_html_()
 
 
 @takes(plant="Plant", record="Record")

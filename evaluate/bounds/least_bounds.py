@@ -13,9 +13,9 @@ from obsynth.evaluate.bounds.certified import Least, below, least
 from obsynth.evaluate.bounds.problem import Groups, Problem, pose
 from obsynth.evaluate.bounds.validation import Validation, validate
 from obsynth.evaluate.errors import BoundsError
-from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 SAFETY = 1.2
@@ -24,8 +24,8 @@ BESIDE = 0.01
 """By how much bounds are looked for above those that are asked for, relative."""
 
 
-@dataclass(frozen=True, eq=False)
-class LeastBounds:
+@dataclass(frozen=True, eq=False, repr=False)
+class LeastBounds(Tabled):
     """The least bounds of a plant's disturbances with which a record can be explained.
 
     Bounds below the certified cost are refuted by the record, for certain. That the bounds which
@@ -256,12 +256,6 @@ class LeastBounds:
             rows,
             note=f"{len(self.record)} instants of {self.record.source}. {verdict}".strip(),
         )
-
-    def __repr__(self) -> str:
-        return str(self.table())
-
-    def _repr_html_(self) -> str:
-        return self.table()._repr_html_()
 
 
 @takes(plant="Plant", record="Record")

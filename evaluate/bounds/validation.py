@@ -10,14 +10,14 @@ from scipy.optimize import brentq
 from obsynth.evaluate.bounds.certified import least
 from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.errors import BoundsError
-from obsynth.evaluate.table import Table
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.table import Table, Tabled
 
 CONFIDENCE = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class Validation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Validation(Tabled):
     """Factors of the bounds that single windows of the record need.
 
     factors (n,): attained, by window
@@ -52,12 +52,6 @@ class Validation:
     def safety(self) -> float:
         """Factor that holds with 95 per cent confidence if the tail is uniform up to its bound."""
         return float((1.0 - CONFIDENCE) ** (-1.0 / len(self.factors)))
-
-    def __repr__(self) -> str:
-        return str(self.table())
-
-    def _repr_html_(self) -> str:
-        return self.table()._repr_html_()
 
     def table(self) -> Table:
         """Factors by window, with what they mean."""

@@ -16,9 +16,9 @@ from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.progress import bar
 from obsynth.evaluate.run import percent
-from obsynth.evaluate.table import Table
 from obsynth.evaluate.truth import dense
 from obsynth.symbolic import Plant, Scenario
+from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
 _TOGETHER = 200_000
@@ -28,8 +28,8 @@ _LEVEL = 0.95
 Designs = Observer | FaultDetector | Mapping[str, Observer | FaultDetector]
 
 
-@dataclass(frozen=True, eq=False)
-class Campaign:
+@dataclass(frozen=True, eq=False, repr=False)
+class Campaign(Tabled):
     """Rows of runs, and what they say together.
 
     Attributes
@@ -83,6 +83,9 @@ class Campaign:
             "that is at 95 % confidence; half widths are means over the second halves.",
         )
 
+    def __repr__(self) -> str:
+        return f"<Campaign: {len(self.rows)} runs in {len(self.groups)} groups>"
+
     def alarms(self) -> Table:
         """Tabulate alarms of detectors: false ones, and how long a fault was there before one."""
         rows: list[list[Any]] = []
@@ -109,12 +112,6 @@ class Campaign:
         import pandas as pd
 
         return pd.DataFrame(list(self.rows))
-
-    def _repr_html_(self) -> str:
-        return self.table()._repr_html_()
-
-    def __str__(self) -> str:
-        return str(self.table())
 
 
 def interval(successes: int, trials: int) -> tuple[float, float]:

@@ -1,6 +1,5 @@
 """What choosing gives: one row for everything tried, the recommended observer, and why."""
 
-import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,9 +12,10 @@ from obsynth.designs.detection.comparison import find_voids
 from obsynth.evaluate.choosing.tries import Try
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, new_figure, style
-from obsynth.evaluate.table import Table, text
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.shown import card, folded
+from obsynth.symbolic.table import Table, text
 
 NEAR = 1.05
 """What is wider by less than this counts as as narrow; the cheapest of them is recommended."""
@@ -232,11 +232,8 @@ class Choice:
         return f"{self.table}\n\n{self.widths}"
 
     def _repr_html_(self) -> str:
-        name, assumed = html.escape(self.model.name), self.assumptions._repr_html_()
-        return (
-            f"<p><b>Observers for {name}</b></p>{self.table._repr_html_()}"
-            f"{self.widths._repr_html_()}<details><summary>Assumptions</summary>{assumed}</details>"
-        )
+        assumed = folded("Assumptions", self.assumptions)
+        return card(f"Observers for {self.model.name}", self.table, self.widths, assumed)
 
 
 def _settled(one: Try) -> FloatArray:

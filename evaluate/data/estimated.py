@@ -19,10 +19,10 @@ from obsynth.evaluate.data.meter import compare
 from obsynth.evaluate.data.tables import to_dataset, write_columns
 from obsynth.evaluate.domain import count_status
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.table import Table, text
 from obsynth.evaluate.trace import Trace, take
 from obsynth.symbolic import Record
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+from obsynth.symbolic.table import Table, text
 
 
 @dataclass(frozen=True)

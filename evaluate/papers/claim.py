@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from obsynth.evaluate.table import Table
+from obsynth.symbolic.table import Table
 
 
 @dataclass(frozen=True)

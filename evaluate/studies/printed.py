@@ -15,7 +15,7 @@ from obsynth.evaluate.papers.buciakowski import (
     Refusals,
     too_narrow,
 )
-from obsynth.evaluate.table import Table, text
+from obsynth.symbolic.table import Table, text
 
 
 def bounds_table(bounds: "JacobianBounds") -> Table:

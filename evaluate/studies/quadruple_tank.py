@@ -27,8 +27,8 @@ from obsynth.evaluate.studies.printed import (
     vertices_table,
     width_table,
 )
-from obsynth.evaluate.table import Table
 from obsynth.symbolic import Plant, Scenario, scenarios
+from obsynth.symbolic.table import Table
 
 # The largest round value that leaves room below the largest feasible gamma of all forms.
 GAMMA = 0.005

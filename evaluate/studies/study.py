@@ -35,6 +35,7 @@ from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant_file import PlantText, read_text_file
 from obsynth.symbolic.scenarios import gentle
+from obsynth.symbolic.shown import Shown, card
 
 _SIGNALS = {"faults": "f", "unknown_inputs": "d", "scheduling": "rho"}
 _SCENARIO = {"steps", "x0", "guess", "seed", "inputs", "disturbances", *_SIGNALS}
@@ -44,8 +45,8 @@ _DEFAULT = {"method": "BoundedErrorUIO", "bounds": "peak"}
 _STEPS = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
+@dataclass(frozen=True, eq=False, repr=False)
+class Study(Shown):
     """What a text file says of a plant and of what is done with it.
 
     Attributes
@@ -59,6 +60,15 @@ class Study:
     method: Method
     told: PlantText
     folder: Path
+
+    def __str__(self) -> str:
+        lines = [f"study of {self.plant.name} by {type(self.method).__name__}"]
+        lines += [f"[{name}] is given" for name in ("scenario", "record") if name in self.told.data]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        first, *rest = str(self).splitlines()
+        return card(first, rest, self.plant, self.method)
 
     @cached_property
     def observer(self) -> Observer:

@@ -47,7 +47,6 @@ from .evaluate import LeastBounds as LeastBounds
 from .evaluate import Run as Run
 from .evaluate import SimulationError as SimulationError
 from .evaluate import Study as Study
-from .evaluate import Table as Table
 from .evaluate import campaign as campaign
 from .evaluate import choose as choose
 from .evaluate import coverage_table as coverage_table
@@ -70,6 +69,7 @@ from .symbolic import PlantError as PlantError
 from .symbolic import Record as Record
 from .symbolic import RecordError as RecordError
 from .symbolic import Scenario as Scenario
+from .symbolic import Table as Table
 from .symbolic import delayed as delayed
 from .symbolic import lookup as lookup
 from .symbolic import plants as plants

@@ -8,7 +8,6 @@ import pytest
 from obsynth.designs import FaultDetector
 from obsynth.evaluate import (
     ReportError,
-    Table,
     coverage_table,
     plot_alarms,
     plot_errors,
@@ -19,7 +18,7 @@ from obsynth.evaluate import (
 )
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.run import Run
-from obsynth.symbolic import Plant
+from obsynth.symbolic import Plant, Table
 
 pytestmark = [pytest.mark.usefixtures("no_window"), pytest.mark.filterwarnings("error")]
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import obsynth
 from obsynth.cli import app
-from obsynth.evaluate import Table
+from obsynth.symbolic import Table
 
 runner = CliRunner()
 

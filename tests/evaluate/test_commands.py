@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import obsynth as ob
 from obsynth.cli import ORDER, app
 from obsynth.commands.told import EXAMPLES, Told, command, plain
-from obsynth.evaluate import Table
 from obsynth.evaluate.progress import times
+from obsynth.symbolic import Table
 
 runner = CliRunner()
 # So that each finds the files that those before it left; test_command has `run`.

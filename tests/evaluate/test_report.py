@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, opened
 
-from obsynth.evaluate import ReportError, Table, coverage_table, report
+from obsynth.evaluate import ReportError, coverage_table, report
 from obsynth.evaluate import report as report_function
 from obsynth.evaluate.svg import equations_html
-from obsynth.symbolic import Plant
+from obsynth.symbolic import Plant, Table
 
 VOID = {"meta", "link", "br", "hr", "img", "input", "path", "use", "rect"}
 NUMBERS = Table("Bounds < printed", ["entry", "derived"], [["m13", 0.00504]], "why & how")
@@ -108,7 +108,7 @@ def test_the_page_holds_tables_claims_guarantee_coverage_and_signals(page):
         "1 of 1 claims proved",
         "|d| <= 0.1",
         "Coverage",
-        "actuator fault on v",
+        "actuator fault of v",
         "2 of 2",
         "Errata",
         "Half widths in steady state",

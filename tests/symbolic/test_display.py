@@ -47,7 +47,7 @@ def test_html_lists_every_signal_and_escapes():
     plant.actuator_faults("f", of=u, rate=0.05)
     plant.dynamics([sp.Piecewise((x, x < 1), (u, True))])
     plant.outputs([x, x], names="y z", unit="<m>", range=[(0, sp.oo), None])
-    html = plant._repr_html_()
+    html = re.sub(r' (class|style|scope|data-\w+)(="[^"]*")?(?=[ >])', "", plant._repr_html_())
     assert "a &lt; b &amp; c" in html
     assert "&lt;m&gt;" in html
     assert "x &lt; 1" in html

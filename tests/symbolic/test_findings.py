@@ -182,7 +182,7 @@ def test_records_are_cut_split_and_mended():
 def test_a_record_is_shown_as_a_table_and_drawn():
     record = damaged_record(0).record
     text = record._repr_html_()
-    assert "<td>1 stuck, 1 missing</td>" in text and "<li>v = pump</li>" in text
+    assert ">1 stuck, 1 missing</td>" in text and "<li>v = pump</li>" in text
     assert repr(record) == "<Record 'dict', 400 samples, inputs v, outputs y1, y2, y3>"
     axes = record.plot()
     assert [ax.get_ylabel() for ax in axes] == ["v", "y1 [cm]", "y2 [cm]", "y3 [cm]"]

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import casadi as ca
 import sympy as sp
 
 from obsynth.derive.forms.qpv.augment import Augmented
-from obsynth.derive.forms.varying import Layout, VaryingForm, short
+from obsynth.derive.forms.varying import Layout, VaryingForm
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import sx_function
-from obsynth.symbolic.display import aligned, html_table
+from obsynth.symbolic.display import short
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import aligned, card, formulas
 from obsynth.symbolic.signals import KINDS
+from obsynth.symbolic.table import Table
 
 _DYNAMICS = {"c": "1", "A": "x", "N": "xx", "M": "ux", "B": "u", "D": "d", "B_f": "f", "G": "w"}
 _OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset": "1"}
@@ -144,16 +145,12 @@ class QPV(VaryingForm):
             for name, part in blocks
             if any(entry != 0 for entry in part)
         ]
-        return f"$${aligned(rows)}$$"
+        return aligned(rows)
 
     def _repr_html_(self) -> str:
         states = [
             (s.name, str(s.role), f"{s.lower:.6g}", f"{s.upper:.6g}") for s in self.plant.states
         ]
-        scheduling = "".join(f"<li>{escape(str(v))}</li>" for v in self.scheduling)
         head, *_ = str(self).split("\n")
-        return (
-            f"<p><b>{escape(head)}</b></p><div>{escape(self._repr_latex_(), quote=False)}</div>"
-            f"{html_table(('state', 'role', 'min', 'max'), states)}"
-            f"<ul>{scheduling}<li>{escape(str(self.proof))}</li></ul>"
-        )
+        table = Table("", ("state", "role", "min", "max"), states)
+        return card(head, formulas(self._repr_latex_()), table, [*self.scheduling, self.proof])

@@ -9,10 +9,11 @@ from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.varying import Vertices
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import Shown
 
 
-@dataclass(frozen=True, eq=False)
-class CentredForm:
+@dataclass(frozen=True, eq=False, repr=False)
+class CentredForm(Shown):
     """Nominal matrices plus a remainder: A(rho) = A + Delta, Delta in a polytope and in a box.
 
     A, B: nominal matrices, (n, n), (n, n_u)

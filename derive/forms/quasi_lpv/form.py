@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 
 import casadi as ca
 import sympy as sp
@@ -15,10 +14,12 @@ from obsynth.derive.forms.quasi_lpv.interval_form import IntervalForm, Ranging, 
 from obsynth.derive.forms.quasi_lpv.ranking import RowRanking
 from obsynth.derive.forms.quasi_lpv.terms import Centre
 from obsynth.derive.forms.scheduling import SchedulingVariable
-from obsynth.derive.forms.varying import Layout, VaryingForm, short
+from obsynth.derive.forms.varying import Layout, VaryingForm
 from obsynth.symbolic.convert import sx_function
-from obsynth.symbolic.display import aligned, html_table
+from obsynth.symbolic.display import short
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import aligned, card, formulas
+from obsynth.symbolic.table import Table
 
 _DYNAMICS = ("A", "B", "D", "B_f", "W1", "offset")
 _OUTPUTS = ("C", "feedthrough", "D_y", "D_f", "W2", "output_offset")
@@ -156,7 +157,7 @@ class QuasiLPV(VaryingForm):
         for v in self.scheduling:
             own = "" if v.symbol == v.expression else f"= {sp.latex(short(v.expression))} "
             rows.append(f"{sp.latex(v.symbol)} &{own}\\in [{v.lower:.6g},\\, {v.upper:.6g}]")
-        return f"$${aligned(rows)}$$"
+        return aligned(rows)
 
     def _repr_html_(self) -> str:
         heads = ("variable", "function", "min", "max", "range", "known on line")
@@ -177,12 +178,11 @@ class QuasiLPV(VaryingForm):
             if r.total > 1
             for k, a in enumerate(r.alternatives)
         ]
-        listed = "".join(f"<li>{escape(note)}</li>" for note in self.notes())
-        table = html_table(heads, variables) if variables else ""
         columns = ("row", "rank", "term by divisor", "inflation", "unmeasured")
-        ranking = html_table(columns, ranked) if ranked else ""
-        latex = escape(self._repr_latex_(), quote=False)
-        return (
-            f"<p><b>{escape(self._title())}</b></p><div>{latex}</div>{table}"
-            f"<ul>{listed}</ul>{ranking}"
+        return card(
+            self._title(),
+            formulas(self._repr_latex_()),
+            Table("", heads, variables) if variables else "",
+            self.notes(),
+            Table("", columns, ranked) if ranked else "",
         )

@@ -10,6 +10,7 @@ from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import enclose_number
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,8 @@ class Ranging:
     effort: str
 
 
-@dataclass(frozen=True, eq=False)
-class IntervalForm:
+@dataclass(frozen=True, eq=False, repr=False)
+class IntervalForm(Shown):
     """A_min <= A(rho) <= A_max elementwise over the box, and the same for B and the offset.
 
     minimum, maximum: guaranteed bounds of ``"A"`` (n, n), ``"B"`` (n, n_u), ``"offset"`` (n, 1)

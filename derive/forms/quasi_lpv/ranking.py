@@ -16,8 +16,8 @@ from obsynth.derive.forms.measured import known_signals
 from obsynth.derive.forms.quasi_lpv.options import Option, Share, kept
 from obsynth.derive.forms.quasi_lpv.terms import Centre, Term, deviations, row_names
 from obsynth.derive.forms.scheduling import Lift
-from obsynth.derive.forms.varying import short
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.symbolic.display import short
 from obsynth.symbolic.functions import phi1, tanhc
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal

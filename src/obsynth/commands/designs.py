@@ -35,8 +35,8 @@ def design(
 @command(app, "check", "design.json")
 def check(design: DesignFile) -> Told:
     """Prove a saved design again, from the file alone and without a solver."""
-    from obsynth.evaluate import Table
     from obsynth.evaluate.progress import bar
+    from obsynth.symbolic import Table
 
     observer = design_of(design)
     with bar() as say:

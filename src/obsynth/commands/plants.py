@@ -44,9 +44,9 @@ def new(
 def plants() -> Told:
     """List the plants of the gallery, their signals and the methods whose class they are of."""
     from obsynth import plants as gallery
-    from obsynth.evaluate import Table
     from obsynth.evaluate.choosing.tries import CLASSES
     from obsynth.evaluate.progress import bar
+    from obsynth.symbolic import Table
 
     found, rows = [], []
     with bar() as say:

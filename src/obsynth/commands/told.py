@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 import typer
 
 if TYPE_CHECKING:
-    from obsynth.evaluate import Table
+    from obsynth.symbolic import Table
 
 EXAMPLES: dict[str, str] = {}
 """By command, an example that runs."""

@@ -250,7 +250,7 @@ def test_unknown_options_are_refused(parts, options):
 
 
 def test_display_is_a_table(bounds):
-    assert "<td>m33</td>" in bounds._repr_html_()
+    assert ">m33</td>" in bounds._repr_html_()
     assert "16 vertices (exact) in place of 64" in bounds._repr_html_()
     assert "16 vertices (exact)" in str(bounds)
     assert "in place of 64" in str(bounds)

@@ -122,7 +122,7 @@ def test_what_no_bounds_explain():
     plant.outputs([x])
     fit = ob.least_bounds(plant, record_of(plant, np.empty((2, 0)), [[0.5], [2.0]]))
     assert fit.lower == fit.upper == np.inf and fit.refuted
-    assert "No bounds explain it" in repr(fit) and fit.to_dict()["upper"] is None
+    assert "No bounds explain it" in str(fit) and fit.to_dict()["upper"] is None
     with pytest.raises(ob.BoundsError, match="no bounds were found"):
         fit.plant.names("w")
     fit = ob.least_bounds(plant, record_of(plant, np.empty((3, 0)), [[0.5], [0.75], [0.5]]))
@@ -261,4 +261,4 @@ def test_a_range_that_is_too_narrow_is_told() -> None:
     assert not ob.least_bounds(plant, record).pressed
     fit = ob.least_bounds(plant.with_ranges({"h2": (0.0, 0.3)}), record)
     assert set(fit.pressed) == {"h2"}
-    assert f"h2 at {fit.pressed['h2']} instants" in repr(fit) and fit.refuted
+    assert f"h2 at {fit.pressed['h2']} instants" in str(fit) and fit.refuted

@@ -77,7 +77,7 @@ def test_scale_of_a_hidden_state_is_not_determined() -> None:
     assert set(direction) == {"b", "c"} and abs(direction["b"] + direction["c"]) < 1e-3
     assert np.isinf(found.deviations["b"]) and np.isinf(found.deviations["c"])
     assert 0.0 < found.deviations["a"] < 0.05
-    assert "Not determined: b by" in repr(found)
+    assert "Not determined: b by" in str(found)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -1,12 +1,13 @@
 """A small table that the report, the command line and notebooks print alike."""
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
-from obsynth.evaluate.errors import ReportError
+from obsynth.symbolic.errors import ObsynthError
+from obsynth.symbolic.shown import Shown
 
 
 def text(value: Any, digits: int = 4) -> str:
@@ -30,14 +31,16 @@ def text(value: Any, digits: int = 4) -> str:
     return f"{number + 0.0:.{digits}g}".replace("-", "−")
 
 
-@dataclass(frozen=True)
-class Table:
+@dataclass(frozen=True, repr=False)
+class Table(Shown):
     """Rows under column heads, with a title and a sentence that says what to see.
 
     Parameters
     ----------
     title : str
+        Left out where it is empty.
     columns : sequence of str
+        All empty where the rows say themselves what they are.
     rows : sequence of sequences
         Cells are strings, numbers, booleans or None.
     note : str
@@ -47,7 +50,7 @@ class Table:
 
     Raises
     ------
-    ReportError
+    ObsynthError
         If a row does not have one cell for each column.
 
     Examples
@@ -69,7 +72,7 @@ class Table:
     def __post_init__(self) -> None:
         for i, row in enumerate(self.rows):
             if len(row) != len(self.columns):
-                raise ReportError(
+                raise ObsynthError(
                     f"row {i} of table {self.title!r} has {len(row)} cells for "
                     f"{len(self.columns)} columns.",
                     row=i,
@@ -87,8 +90,9 @@ class Table:
         ]
 
     def __str__(self) -> str:
-        rows = [list(self.columns), *self.cells()]
-        widths = [max(len(row[j]) for row in rows) for j in range(len(self.columns))]
+        heads = [list(self.columns)] if any(self.columns) else []
+        rows = [*heads, *self.cells()]
+        widths = [max(len(row[j]) for row in rows) for j in range(len(self.columns) if rows else 0)]
         right = self.numeric()
         lines = [
             "  ".join(
@@ -97,7 +101,7 @@ class Table:
             ).rstrip()
             for row in rows
         ]
-        return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
+        return "\n".join([*filter(None, [self.title]), *lines, *filter(None, [self.note])])
 
     def _repr_html_(self) -> str:
         # Notebooks set every cell flush right unless the cell itself says otherwise.
@@ -106,26 +110,42 @@ class Table:
             for flush in self.numeric()
         ]
         head = "".join(
-            f'<th scope="col"{kind}>{html.escape(column)}</th>'
+            f'<th scope="col"{kind}>{escape(column)}</th>'
             for column, kind in zip(self.columns, right, strict=True)
         )
+        head = f"<thead><tr>{head}</tr></thead>" if any(self.columns) else ""
         body = []
         for i, row in enumerate(self.cells()):
             # narrow pages set the cells of a row below each other, each with its column's head
+            names = [f' data-head="{escape(column)}"' if head else "" for column in self.columns]
             cells = "".join(
-                f'<td{kind} data-head="{html.escape(head)}"{" data-none" if cell == "–" else ""}>'
-                f"{html.escape(cell)}</td>"
-                for cell, kind, head in zip(row, right, self.columns, strict=True)
+                f"<td{kind}{name}{' data-none' if cell in ('–', '') else ''}>"
+                f"{escape(cell).replace(chr(10), '<br>')}</td>"
+                for cell, kind, name in zip(row, right, names, strict=True)
             )
-            body.append(
-                f'<tr class="marked">{cells}</tr>' if i in self.marked else f"<tr>{cells}</tr>"
-            )
-        note = f'<p class="note">{html.escape(self.note)}</p>' if self.note else ""
-        title = f'<caption style="text-align:left">{html.escape(self.title)}</caption>'
+            mark = ' class="marked"' if i in self.marked else ""
+            body.append(f"<tr{mark}>{cells}</tr>")
+        note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
+        title = escape(self.title)
+        title = title and f'<caption style="text-align:left">{title}</caption>'
         return (
             f'<div class="table{" wide" * (len(self.columns) > 8)}"><table>{title}'
-            f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{note}</div>"
+            f"{head}<tbody>{''.join(body)}</tbody></table>{note}</div>"
         )
+
+
+class Tabled(Shown):
+    """What shows itself as one table."""
+
+    def table(self) -> Table:
+        """Return the table."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        return self.table()._repr_html_()
 
 
 def _is_number(cell: Any) -> bool:

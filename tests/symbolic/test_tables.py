@@ -2,11 +2,11 @@
 
 import pytest
 
-from obsynth.evaluate import ReportError, Table
+from obsynth.symbolic import ObsynthError, Table
 
 
 def test_rows_have_to_fit_the_columns():
-    with pytest.raises(ReportError, match="row 1 of table 'T' has 1 cells for 2 columns"):
+    with pytest.raises(ObsynthError, match="row 1 of table 'T' has 1 cells for 2 columns"):
         Table("T", ["a", "b"], [[1, 2], [3]])
 
 
