@@ -333,7 +333,7 @@ def _panels(shown: Any, plot: Callable[..., Any]) -> Drawn:
     for name in first.estimated:
         with style():
             figure, ax = _panel(1.6)
-            plot(shown, signals=[name], axes=[ax])
+            plot(shown, signals=[name], ax=[ax])
         drawn.append((figure, ax))
     return drawn
 

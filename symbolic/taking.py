@@ -26,7 +26,7 @@ _MADE = {
     "dict": "by label",
 }
 _BUILTIN = {"list", "tuple", "str", "int", "float", "ndarray", "Series", "DataFrame", "Dataset"}
-_OTHERS = {*_MADE, "Method", *_BUILTIN}
+_OTHERS = {*_MADE, "Method", "Shown", "NoneType", *_BUILTIN}
 _SHOWN = {"dict": "mapping"}
 
 
@@ -38,13 +38,14 @@ def takes(**kinds: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """
 
     def decorated(function: Callable[P, T]) -> Callable[P, T]:
-        names = list(signature(function).parameters)
+        parameters = signature(function).parameters
 
         @wraps(function)
         def call(*args: P.args, **keywords: P.kwargs) -> T:
-            given: dict[str, Any] = {**dict(zip(names, args, strict=False)), **keywords}
+            given: dict[str, Any] = {**dict(zip(parameters, args, strict=False)), **keywords}
             for name, known in kinds.items():
-                check_kind(function.__name__, name, known, given.get(name))
+                if given.get(name, parameters[name].default) is not parameters[name].default:
+                    check_kind(function.__name__, name, known, given[name])
             return function(*args, **keywords)
 
         return call
@@ -59,7 +60,7 @@ def check_kind(where: str, name: str, known: str, value: Any) -> None:
         return
     shown = [kind for kind in known.split() if kind in _MADE]
     wanted = " or ".join(f"{_an(_SHOWN.get(kind, kind))} ({_MADE[kind]})" for kind in shown)
-    kind = _an(type(value).__name__)
+    kind = "None" if value is None else _an(type(value).__name__)
     if isinstance(value, list | tuple) and value:
         kind += f" of {type(value[0]).__name__}"
     raise ObsynthError(f"{where} takes {name} as {wanted}; it was given {kind}", argument=name)

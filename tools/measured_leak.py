@@ -6,10 +6,10 @@ python tools/measured_leak.py docs/pictures/measured_leak.png
 import sys
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 import obsynth as ob
+from obsynth.evaluate.plotting.layout import ESTIMATE, INK, SMALL, name_lines, new_figure, style
 
 VOLTS_A_PULSE = 0.000968
 """Least squares of the middles of one-step intervals, see notebooks/measured_leak.ipynb."""
@@ -25,21 +25,22 @@ def draw(path: Path) -> None:
     told = ob.estimate(ob.FaultDetector(observer, window=WINDOW), record)
     known, one, time = told.mean_status == 0, told["leak"], record.time
     mean = VOLTS_A_PULSE / WINDOW * (record["pulses"][WINDOW:] - record["pulses"][:-WINDOW])
-    figure, ax = plt.subplots(figsize=(7.2, 2.8), layout="constrained")
-    ax.fill_between(one.t, one.lower, one.upper, color="#0072b222", label="one step, guaranteed")
     low, high = told.mean_lower[known, 0], told.mean_upper[known, 0]
-    ax.fill_between(
-        time[known], low, high, color="#0072b277", label=f"mean of {WINDOW} s, guaranteed"
-    )
-    ax.plot(time[WINDOW:], mean, color="#1b1d21", linewidth=1.0, label="flow meter, read by nobody")
-    ax.axvline(60, color="#d55e00", linewidth=0.8)
-    ax.annotate("leak opened", (60, -0.022), (4, 0), textcoords="offset points", color="#a34700")
-    ax.set_xlim(time[0], time[-1])
-    ax.set_xlabel("time [s]")
-    ax.set_ylabel("leak [V/s]")
-    ax.legend(frameon=False, loc="upper right", ncols=3, fontsize=8)
-    ax.set_ylim(-0.03, 0.06)
-    figure.savefig(path, dpi=130, metadata={"Software": None})
+    with style():
+        ax = new_figure(3.4).subplots()
+        ax.fill_between(one.t, one.lower, one.upper, color="#0072b222", label="guaranteed, a step")
+        label = f"guaranteed, mean of {WINDOW} s"
+        ax.fill_between(time[known], low, high, color="#0072b277", label=label)
+        ax.plot(time[WINDOW:], mean, color=INK, label="flow meter, read by nobody")
+        ax.axvline(60, color=ESTIMATE, linewidth=0.8)
+        place = {"xytext": (4, 0), "textcoords": "offset points"}
+        ax.annotate("leak opened", (60, -0.024), color="#a34700", fontsize=SMALL, **place)
+        ax.set_xlim(time[0], time[-1])
+        ax.set_ylim(-0.03, 0.055)
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel("leak [V/s]")
+        name_lines([ax], ax)
+    ax.figure.savefig(path, dpi=150, metadata={"Software": None})
     inside = (low <= mean[known[WINDOW:]]) & (mean[known[WINDOW:]] <= high)
     since = time[known][np.flatnonzero(low > 0)[0]]
     print(f"{inside.mean():.0%} of the meter inside, certain at {since:g} s")

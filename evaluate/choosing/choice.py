@@ -11,7 +11,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.comparison import find_voids
 from obsynth.evaluate.choosing.tries import Try
 from obsynth.evaluate.data.estimated import Estimate
-from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, new_figure, style
+from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, name_lines, new_figure, style
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 from obsynth.symbolic.shown import card, folded
@@ -210,7 +210,8 @@ class Choice:
         """
         rows, share = np.arange(len(self.names)), 0.5 / (len(self.made) + 1)
         with style():
-            ax = new_figure((7.2, 1.2 + 0.4 * len(rows))).subplots() if ax is None else ax
+            height = 1.0 + 0.4 * len(rows) + 0.17 * (len(self.made) + 1)
+            ax = new_figure(height).subplots() if ax is None else ax
             for i, one in enumerate(self.made):
                 at, color = rows + share * (i + 1) - 0.25, BARS[i % len(BARS)]
                 label = f"{one.name} (recommended)" if one is self.best else one.name
@@ -221,8 +222,8 @@ class Choice:
             ax.set_xscale("log")
             ax.set_yticks(rows, self.names)
             ax.invert_yaxis()
-            ax.set_xlabel("half width / half range; dots: in the run, rings: guaranteed")
-            ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+            ax.set_xlabel("half width / half range (dots: in the run, rings: guaranteed)")
+            name_lines([ax], ax)
         return ax
 
     def __repr__(self) -> str:

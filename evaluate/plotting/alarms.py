@@ -10,17 +10,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.designs.detection.comparison import RECOVERING, VOID
 from obsynth.evaluate.errors import ReportError
-from obsynth.evaluate.plotting.layout import BARS, ESTIMATE, INK, SOFT, new_figure, style
+from obsynth.evaluate.plotting.layout import (
+    BARS,
+    ESTIMATE,
+    INK,
+    SMALL,
+    SOFT,
+    inches,
+    name_lines,
+    new_figure,
+    style,
+)
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.taking import takes
 
 if TYPE_CHECKING:
+    from obsynth.designs.core.observer import Observer
+    from obsynth.designs.detection.detector import FaultDetector
     from obsynth.evaluate.run import Run
 
 
+@takes(half_widths="Observer FaultDetector dict")
 def plot_widths(
-    half_widths: Mapping[str, ArrayLike],
-    names: Sequence[str],
+    half_widths: Observer | FaultDetector | Mapping[str, ArrayLike | Observer | FaultDetector],
+    names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
     ax: Any = None,
     title: str = "Guaranteed half widths",
@@ -29,10 +42,10 @@ def plot_widths(
 
     Parameters
     ----------
-    half_widths : mapping of label to (n,)
+    half_widths : Observer or FaultDetector, or mapping of label to them or to (n,)
         For instance ``{"ellipsoid": ..., "peak": ...}``, widest first.
-    names : sequence of str
-        The n signals.
+    names : sequence of str, optional
+        The n signals; by default those of an observer, states and faults.
     units : sequence of str, optional
         Their units. Signals of different units get axes of their own, one beside the other.
     ax : matplotlib Axes or SubFigure or Figure, optional
@@ -47,9 +60,23 @@ def plot_widths(
     Raises
     ------
     ReportError
-        If a design has not one half width for each name.
+        If a design has not one half width for each name, or there are no names.
     """
-    table = {label: np.asarray(values, dtype=float) for label, values in half_widths.items()}
+    given: Any = half_widths
+    designs = dict(given) if isinstance(given, Mapping) else {given.method: given}
+    models = [one.model for one in designs.values() if hasattr(one, "model")]
+    if names is None and not models:
+        raise ReportError(
+            "plot_widths takes observers, or half widths as numbers with the names of their "
+            "signals: names=[...]"
+        )
+    if names is None:
+        signals = (*models[0].x, *models[0].f)
+        names, units = [s.name for s in signals], units or [s.unit for s in signals]
+    table = {
+        label: np.asarray(getattr(values, "half_widths", values), dtype=float)
+        for label, values in designs.items()
+    }
     for label, values in table.items():
         if values.shape != (len(names),):
             raise ReportError(
@@ -62,7 +89,7 @@ def plot_widths(
             _draw(ax, table, names, marked)
             drawn = [ax]
         else:
-            figure = new_figure((7.2, 2.9)) if ax is None else ax
+            figure = new_figure(2.7) if ax is None else ax
             groups = {unit: [i for i, u in enumerate(marked) if u == unit] for unit in marked}
             shares = [len(group) for group in groups.values()]
             drawn = list(
@@ -73,7 +100,7 @@ def plot_widths(
                 _draw(axes, part, [names[i] for i in group], [marked[i] for i in group])
         drawn[0].set_title(title)
         if len(table) > 1:
-            drawn[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(table))
+            name_lines(drawn, drawn[-1])
         return drawn[0] if len(drawn) == 1 else np.array(drawn, dtype=object)
 
 
@@ -88,12 +115,22 @@ def _draw(
         finite = np.where(np.isfinite(values), values, 0.0)
         bars = ax.bar(at, finite, 0.92 * step, color=BARS[i % len(BARS)], label=label, linewidth=0)
         marks = [f"{v:.3g}" if np.isfinite(v) else "∞" for v in values]
-        ax.bar_label(bars, marks, fontsize=8.0, color=INK, padding=1.5)
+        ax.bar_label(bars, marks, fontsize=SMALL, color=INK, padding=1.5)
+    turned = not _fit(ax, [mark.get_text() for mark in ax.texts], len(names) / step)
+    for mark in ax.texts if turned else ():
+        mark.set_rotation(90)
     marked = zip(names, units, strict=True)
-    ax.set_xticks(places, [f"{name}\n[{unit}]" if unit else name for name, unit in marked])
+    words = [f"{name}\n[{unit}]" if unit else name for name, unit in marked]
+    ax.set_xticks(places, words, rotation=0 if _fit(ax, names, len(names)) else 90)
     ax.grid(visible=False, axis="x")
     ax.tick_params(axis="x", length=0)
-    ax.margins(y=0.12)
+    ax.margins(y=0.25 if turned else 0.12)
+
+
+def _fit(ax: Any, words: Sequence[str], count: float) -> bool:
+    """Tell whether the longest of some words fits into one of `count` parts of the width."""
+    width = 72.0 * ax.get_position().width * inches(ax.figure)
+    return bool(0.62 * SMALL * max(map(len, words), default=0) <= width / count)
 
 
 BoolArray = NDArray[np.bool_]
@@ -147,7 +184,7 @@ def plot_alarms(
     there = np.abs(run.f) > threshold
     with style():
         if ax is None:
-            ax = new_figure((7.2, 0.9 + 0.45 * len(names))).subplots()
+            ax = new_figure(0.9 + 0.45 * len(names)).subplots()
         for i in range(len(names)):
             row = len(names) - 1 - i
             kinds = ((there, SOFT, 0.02, "fault"), (shown, ESTIMATE, -0.34, "alarm"))
@@ -161,8 +198,7 @@ def plot_alarms(
         ax.set_xlim(run.t[0], run.t[-1])
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("time [s]")
-        place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-        ax.legend(**place, ncols=4)
+        name_lines([ax], ax)
         return ax
 
 

@@ -21,6 +21,11 @@ INTERVAL_FILL = "#009e7326"
 SOFT = "#8a9099"
 BARS = ("#8a9099", "#56b4e9", "#009e73", "#d55e00", "#cc79a7", "#0072b2")
 
+WIDTH = 5.4
+"""Of figures, in inches."""
+SMALL = 8.8
+"""Points of the smallest letters: 9 pixels where a figure is 400 pixels wide."""
+
 _SETTINGS: dict[str, Any] = {
     "axes.edgecolor": SOFT,
     "axes.grid": True,
@@ -37,17 +42,17 @@ _SETTINGS: dict[str, Any] = {
     "grid.alpha": 0.35,
     "grid.color": SOFT,
     "grid.linewidth": 0.4,
-    "legend.fontsize": 8.5,
+    "legend.fontsize": SMALL,
     "legend.frameon": False,
     "lines.solid_joinstyle": "round",
     "path.simplify": True,
     "text.color": INK,
     "xtick.color": SOFT,
     "xtick.labelcolor": INK,
-    "xtick.labelsize": 8.0,
+    "xtick.labelsize": SMALL,
     "ytick.color": SOFT,
     "ytick.labelcolor": INK,
-    "ytick.labelsize": 8.0,
+    "ytick.labelsize": SMALL,
 }
 
 
@@ -72,11 +77,16 @@ _WORDS = ("truth", "estimate", "interval", "alarm", "void", "recovering")
 _ORDER = {word: i for i, word in enumerate(_WORDS)}
 
 
-def new_figure(size: tuple[float, float]) -> Any:
+def new_figure(height: float) -> Any:
     """Make a figure that pyplot shows in notebooks and that scripts may save."""
     import matplotlib.pyplot as plt
 
-    return plt.figure(figsize=size)
+    return plt.figure(figsize=(WIDTH, height))
+
+
+def inches(figure: Any) -> float:
+    """Return how wide a figure is, or a part of one."""
+    return float(figure.bbox.width / figure.dpi)
 
 
 def grid(count: int, axes: Any) -> Any:
@@ -87,7 +97,7 @@ def grid(count: int, axes: Any) -> Any:
             raise ReportError(f"{len(flat)} axes were given for {count} signals.", given=len(flat))
         return flat
     rows = (count + 1) // 2
-    return panels(new_figure((7.2, 0.6 + 1.5 * rows)), count)
+    return panels(new_figure(0.6 + 1.3 * rows), count)
 
 
 def panels(figure: Any, count: int) -> Any:
@@ -114,13 +124,16 @@ def name_lines(axes: Sequence[Any], source: Any) -> None:
     order = sorted(range(len(words)), key=lambda i: _ORDER.get(words[i], len(_ORDER)))
     entries = [handles[i] for i in order], [words[i] for i in order]
     figure = source.figure
+    columns = max(
+        1, min(len(words), int(inches(figure) / (0.55 + 0.07 * max(map(len, words), default=0))))
+    )
     engine = figure.get_layout_engine()
     own = len(figure.axes) == len(axes) and not figure.legends
     if own and engine is not None and _constrained(engine):
-        figure.legend(*entries, loc="outside upper right", ncols=min(len(words), 4))
+        figure.legend(*entries, loc="outside upper right", ncols=columns)
     else:
         place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-        source.legend(*entries, **place, ncols=min(len(words), 4))
+        source.legend(*entries, **place, ncols=columns)
 
 
 def _constrained(engine: Any) -> bool:

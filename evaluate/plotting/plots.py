@@ -93,11 +93,11 @@ def plot_signal(
                 low, high = ax.get_ylim()
                 ax.set_ylim(low, high + 0.8 * (high - low))
             for i, window in enumerate(windows):
-                inset = ax.inset_axes((0.07 + 0.5 * i, 0.64, 0.4, 0.31))
+                inset = ax.inset_axes((0.13 + 0.47 * i, 0.66, 0.37, 0.3))
                 _draw(inset, trace, window)
-                inset.tick_params(labelsize=6.5)
+                inset.locator_params(nbins=3)
             return ax
-        figure = new_figure((7.2, 4.6 if windows else 2.6))
+        figure = new_figure(4.2 if windows else 2.2)
         if not windows:
             main = figure.subplots()
             _draw(main, trace)
@@ -125,7 +125,7 @@ def plot_signal(
 def plot_run(
     run: "Run | Estimate",
     signals: Sequence[str] | None = None,
-    axes: Any = None,
+    ax: Any = None,
     window: Window | None = None,
 ) -> Any:
     """Plot all estimated signals of a run in a grid.
@@ -135,7 +135,7 @@ def plot_run(
     run : Run or Estimate
     signals : sequence of str, optional
         Which signals; all states and faults by default.
-    axes : array of Axes, optional
+    ax : Axes or array of Axes, optional
         One for each signal; a new figure with two columns by default.
     window : (start, stop), optional
         Seconds to show; the whole run by default.
@@ -151,10 +151,10 @@ def plot_run(
     """
     names = run.estimated if signals is None else tuple(signals)
     with style():
-        flat = grid(len(names), axes)
-        for ax, name in zip(flat, names, strict=True):
-            _draw(ax, run[name], window)
-            _labels(ax, run[name])
+        flat = grid(len(names), ax)
+        for panel, name in zip(flat, names, strict=True):
+            _draw(panel, run[name], window)
+            _labels(panel, run[name])
         name_lines(flat, flat[0])
         return flat
 
@@ -163,7 +163,7 @@ def plot_run(
 def plot_errors(
     runs: "Run | Mapping[str, Run]",
     signals: Sequence[str] | None = None,
-    axes: Any = None,
+    ax: Any = None,
     window: Window | None = None,
 ) -> Any:
     """Plot errors between the bounds that each run promised for them.
@@ -174,7 +174,7 @@ def plot_errors(
         Several runs share the axes, for instance wide and narrow bounds.
     signals : sequence of str, optional
         Which signals; all states and faults by default.
-    axes : array of Axes, optional
+    ax : Axes or array of Axes, optional
         One for each signal.
     window : (start, stop), optional
         Seconds to show; by default from where all intervals have come close to
@@ -192,9 +192,9 @@ def plot_errors(
     start = max(_settled(run) for run in labelled.values())
     shown = (float(first.t[start]), float(first.t[-1])) if window is None else window
     with style():
-        flat = grid(len(names), axes)
-        for ax, name in zip(flat, names, strict=True):
-            ax.axhline(0.0, color=SOFT, linewidth=0.7)
+        flat = grid(len(names), ax)
+        for panel, name in zip(flat, names, strict=True):
+            panel.axhline(0.0, color=SOFT, linewidth=0.7)
             for j, (label, run) in enumerate(labelled.items()):
                 color = (INTERVAL, BARS[5], BARS[4])[j % 3]
                 trace = run[name]
@@ -204,17 +204,17 @@ def plot_errors(
                 for bound, word in ((trace.upper, f"{prefix}bounds"), (trace.lower, None)):
                     if bound is not None and trace.bounded:
                         at, line = _cut(trace.t, _finite(bound) - estimate, shown)
-                        ax.plot(*thin(at, line), color=color, linewidth=1.0, label=word)
-                ax.plot(
+                        panel.plot(*thin(at, line), color=color, linewidth=1.3, label=word)
+                panel.plot(
                     *thin(t, error),
                     color=INK if len(labelled) == 1 else color,
-                    linewidth=0.5,
+                    linewidth=0.7,
                     alpha=0.9,
                     label=f"{prefix}error",
                 )
-            ax.set_xlim(*shown)
-            _labels(ax, first[name])
-            ax.set_ylabel(f"error of {first[name].label}")
+            panel.set_xlim(*shown)
+            _labels(panel, first[name])
+            panel.set_ylabel(f"error of {first[name].label}")
         name_lines(flat, flat[0])
         return flat
 

@@ -5,8 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from obsynth.evaluate import ReportError, plot_errors, plot_run, plot_signal, plot_widths
+from obsynth.evaluate import (
+    ReportError,
+    plot_alarms,
+    plot_errors,
+    plot_run,
+    plot_signal,
+    plot_widths,
+)
 from obsynth.evaluate.plotting.layout import thin
+from obsynth.symbolic import ObsynthError
 
 pytestmark = pytest.mark.usefixtures("no_window")
 
@@ -60,7 +68,7 @@ def test_the_grid_shows_every_estimated_signal(toy_run):
     chosen = plot_run(toy_run, ["b"], window=(5.0, 15.0))
     assert chosen[0].get_xlim() == (5.0, 15.0)
     with pytest.raises(ReportError, match="2 axes were given for 3 signals"):
-        plot_run(toy_run, axes=axes[:2])
+        plot_run(toy_run, ax=axes[:2])
 
 
 def test_errors_are_drawn_between_their_bounds(toy_run):
@@ -83,8 +91,63 @@ def test_half_widths_are_bars_with_their_numbers(toy_run):
     several = plot_widths({"one": [1.0, 2.0, 3.0]}, ["a", "f", "b"], ["cm", "V", "cm"])
     assert [[bar.get_height() for bar in axes.patches] for axes in several] == [[1.0, 3.0], [2.0]]
     assert [t.get_text() for t in several[1].get_xticklabels()] == ["f\n[V]"]
+    assert {mark.get_rotation() for mark in ax.texts} == {0.0}
+    crowd = plot_widths({str(k): np.full(6, 1.25) for k in range(3)}, "abcdef")
+    assert {mark.get_rotation() for mark in crowd.texts} == {90.0}, "numbers stand over each other"
     with pytest.raises(ReportError, match="'wide' has half widths of shape"):
         plot_widths({"wide": [1.0]}, ["a", "b"])
+
+
+def test_observers_bring_their_names_and_units_and_numbers_do_not(toy, toy_run):
+    observer = toy.observer(toy.plant)
+    drawn = plot_widths({"toy": observer, "twice": 2 * observer.half_widths})
+    assert [[t.get_text() for t in axes.get_xticklabels()] for axes in drawn] == [
+        ["a\n[cm]"],
+        ["b"],
+        ["f\n[V]"],
+    ]
+    assert [bar.get_height() for bar in drawn[0].patches] == [0.1, 0.2]
+    for wrong in ({"toy": [1.0, 2.0, 3.0]}, {}):
+        with pytest.raises(ReportError, match=r"takes observers, or half widths .* names=\[...\]"):
+            plot_widths(wrong)
+    for wrong, kind in ((toy_run, "a Run"), ([1.0], "a list of float"), (None, "None")):
+        with pytest.raises(ObsynthError, match=f"plot_widths takes half_widths as .* given {kind}"):
+            plot_widths(wrong)
+
+
+@pytest.mark.parametrize("plot", [plot_alarms, plot_errors, plot_run, plot_signal])
+def test_what_is_no_run_is_refused(plot, toy, toy_run):
+    """Mutants: None, and results of obsynth's own, pass."""
+    rest = ("a",) if plot is plot_signal else ()
+    for wrong in (toy.plant, [toy_run], None, toy_run["a"], toy_run.summary(), np.zeros(3)):
+        with pytest.raises(ObsynthError, match=r"takes runs? as a Run .what ob\.simulate"):
+            plot(wrong, *rest)
+
+
+def heights(figure):
+    """Letters of a figure in pixels where it is 400 pixels wide, by what they say."""
+    figure.draw_without_rendering()
+    shown = figure.findobj(lambda part: hasattr(part, "get_fontsize") and part.get_visible())
+    scale = 400.0 / 72.0 / figure.get_figwidth()
+    return {part.get_text(): scale * part.get_fontsize() for part in shown if part.get_text()}
+
+
+def test_letters_are_nine_pixels_high_on_a_page_of_400(toy_run):
+    """Mutants: a wider figure, smaller letters."""
+    widths = {"wide": [1.0, 2.0, 3.0], "narrow": [0.5, 0.25, 1.0]}
+    drawn = [
+        toy_run.plot(),
+        plot_errors({"one": toy_run, "two": toy_run}),
+        plot_signal(toy_run, "a"),
+        plot_alarms(toy_run, toy_run.f > 0.5),
+        plot_widths(widths, ["a", "b", "f"], ["cm", "", "V"]),
+    ]
+    for axes in drawn:
+        figure = np.atleast_1d(axes)[0].figure
+        found = heights(figure)
+        assert len(found) > 5 and min(found.values()) >= 9.0, found
+        edges = figure.get_tightbbox()
+        assert edges.x0 >= -0.02 and edges.x1 <= figure.get_figwidth() + 0.02
 
 
 def test_the_settings_of_the_user_stay_untouched(toy_run):
