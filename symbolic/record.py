@@ -194,8 +194,14 @@ class Record:
         title = f"{self.source}, {len(self)} instants, {self.time[0]:g} to {self.time[-1]:g} s"
         return card(title, Table("", heads, rows), [*self.findings(), *self.notes])
 
-    def plot(self, names: Sequence[str] | None = None) -> Any:
-        """Plot channels over time, by default all; findings are shaded.
+    def plot(self, names: Sequence[str] | None = None, ax: Any = None) -> Any:
+        """Plot channels over time, by default all; findings are marked.
+
+        Parameters
+        ----------
+        names : str or sequence of str, optional
+        ax : Axes or array of Axes, optional
+            One for each channel.
 
         Returns
         -------
@@ -203,19 +209,23 @@ class Record:
         """
         import matplotlib.pyplot as plt
 
-        chosen = list(names or self._channels)
-        figure = plt.figure(figsize=(7.2, 0.6 + 1.1 * len(chosen)), layout="constrained")
-        axes = figure.subplots(len(chosen), 1, sharex=True, squeeze=False).ravel()
-        for ax, name in zip(axes, chosen, strict=True):
+        chosen = [names] if isinstance(names, str) else list(names or self._channels)
+        if ax is None:
+            figure = plt.figure(figsize=(5.4, 0.6 + 1.1 * len(chosen)), layout="constrained")
+            ax = figure.subplots(len(chosen), 1, sharex=True)
+        axes = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
+        if len(axes) != len(chosen):
+            raise RecordError(f"{len(axes)} axes were given for {len(chosen)} channels")
+        for panel, name in zip(axes, chosen, strict=True):
             group, _, unit = self._place(name)
             held = group in ("u", "rho")
             style = {"drawstyle": "steps-post"} if held else {"marker": ".", "markersize": 3}
-            ax.plot(self.time, self[name], color="#1b1d21", linewidth=0.8, **style)
-            ax.set_ylabel(f"{name} [{unit}]" if unit else name)
+            panel.plot(self.time, self[name], color="#1b1d21", linewidth=0.8, **style)
+            panel.set_ylabel(f"{name} [{unit}]" if unit else name)
             rows = [f.rows for f in self.findings() if f.channel == name]
             marks = {"marker": "|", "linestyle": "", "color": "#d55e00", "clip_on": False}
             if rows:
                 at = self.time[np.concatenate(rows)]
-                ax.plot(at, 0 * at, transform=ax.get_xaxis_transform(), **marks)
+                panel.plot(at, 0 * at, transform=panel.get_xaxis_transform(), **marks)
         axes[-1].set_xlabel("time [s]")
         return axes

@@ -124,7 +124,7 @@ def plot_signal(
 @takes(run="Run Estimate")
 def plot_run(
     run: "Run | Estimate",
-    signals: Sequence[str] | None = None,
+    signals: str | Sequence[str] | None = None,
     ax: Any = None,
     window: Window | None = None,
 ) -> Any:
@@ -133,7 +133,7 @@ def plot_run(
     Parameters
     ----------
     run : Run or Estimate
-    signals : sequence of str, optional
+    signals : str or sequence of str, optional
         Which signals; all states and faults by default.
     ax : Axes or array of Axes, optional
         One for each signal; a new figure with two columns by default.
@@ -149,7 +149,7 @@ def plot_run(
     Of signals without bounds truth and estimate are drawn; where a fault detector ran, its
     alarms shade the panels of the faults. Void and recovering instants are shaded everywhere.
     """
-    names = run.estimated if signals is None else tuple(signals)
+    names = _chosen(run, signals)
     with style():
         flat = grid(len(names), ax)
         for panel, name in zip(flat, names, strict=True):
@@ -162,7 +162,7 @@ def plot_run(
 @takes(runs="Run dict")
 def plot_errors(
     runs: "Run | Mapping[str, Run]",
-    signals: Sequence[str] | None = None,
+    signals: str | Sequence[str] | None = None,
     ax: Any = None,
     window: Window | None = None,
 ) -> Any:
@@ -172,7 +172,7 @@ def plot_errors(
     ----------
     runs : Run or mapping of label to Run
         Several runs share the axes, for instance wide and narrow bounds.
-    signals : sequence of str, optional
+    signals : str or sequence of str, optional
         Which signals; all states and faults by default.
     ax : Axes or array of Axes, optional
         One for each signal.
@@ -188,7 +188,7 @@ def plot_errors(
     if not labelled:
         raise ReportError("there is no run to plot.")
     first = next(iter(labelled.values()))
-    names = first.estimated if signals is None else tuple(signals)
+    names = _chosen(first, signals)
     start = max(_settled(run) for run in labelled.values())
     shown = (float(first.t[start]), float(first.t[-1])) if window is None else window
     with style():
@@ -217,6 +217,11 @@ def plot_errors(
             panel.set_ylabel(f"error of {first[name].label}")
         name_lines(flat, flat[0])
         return flat
+
+
+def _chosen(run: Any, signals: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return the signals asked for, all that are estimated by default."""
+    return run.estimated if signals is None else tuple(np.atleast_1d(signals).tolist())
 
 
 def _finite(bound: FloatArray) -> FloatArray:

@@ -14,7 +14,8 @@ from obsynth.evaluate import (
     plot_widths,
 )
 from obsynth.evaluate.plotting.layout import thin
-from obsynth.symbolic import ObsynthError
+from obsynth.symbolic import ObsynthError, RecordError
+from obsynth.symbolic.records import three_tank_leak
 
 pytestmark = pytest.mark.usefixtures("no_window")
 
@@ -65,7 +66,7 @@ def test_signals_without_estimate_are_drawn_alone(toy_run):
 def test_the_grid_shows_every_estimated_signal(toy_run):
     axes = toy_run.plot()
     assert [ax.get_ylabel() for ax in axes] == ["a [cm]", "b", "f [V]"]
-    chosen = plot_run(toy_run, ["b"], window=(5.0, 15.0))
+    chosen = plot_run(toy_run, "b", window=(5.0, 15.0))
     assert chosen[0].get_xlim() == (5.0, 15.0)
     with pytest.raises(ReportError, match="2 axes were given for 3 signals"):
         plot_run(toy_run, ax=axes[:2])
@@ -137,6 +138,7 @@ def test_letters_are_nine_pixels_high_on_a_page_of_400(toy_run):
     widths = {"wide": [1.0, 2.0, 3.0], "narrow": [0.5, 0.25, 1.0]}
     drawn = [
         toy_run.plot(),
+        three_tank_leak().plot(),
         plot_errors({"one": toy_run, "two": toy_run}),
         plot_signal(toy_run, "a"),
         plot_alarms(toy_run, toy_run.f > 0.5),
@@ -148,6 +150,14 @@ def test_letters_are_nine_pixels_high_on_a_page_of_400(toy_run):
         assert len(found) > 5 and min(found.values()) >= 9.0, found
         edges = figure.get_tightbbox()
         assert edges.x0 >= -0.02 and edges.x1 <= figure.get_figwidth() + 0.02
+
+
+def test_a_record_is_drawn_into_the_axes_that_are_given(toy_run):
+    record, axes = three_tank_leak(), toy_run.plot()
+    (ax,) = record.plot("y1", ax=axes[0])
+    assert ax is axes[0] and np.array_equal(ax.get_lines()[-1].get_ydata(), record["y1"])
+    with pytest.raises(RecordError, match="3 axes were given for 2 channels"):
+        record.plot(["y1", "y2"], ax=axes)
 
 
 def test_the_settings_of_the_user_stay_untouched(toy_run):
