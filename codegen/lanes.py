@@ -1,6 +1,6 @@
 """The values of a step on many inputs at once: what leads where."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -45,9 +45,15 @@ class Lanes:
     values: in their order, without those that no result needs
     places: of the operands of every value
     results: port, entry, place of the value
+    instead: operations in place of the usual ones, by their names
     """
 
-    def __init__(self, step: ca.Function, real: Real) -> None:
+    def __init__(
+        self,
+        step: ca.Function,
+        real: Real,
+        instead: Mapping[str, Callable[..., Any]] | None = None,
+    ) -> None:
         self.values, results = read_tape(step, real)
         self.real = real
         at = {id(value): k for k, value in enumerate(self.values)}
@@ -57,7 +63,7 @@ class Lanes:
         self._numbers = np.array(numbers, real.type).reshape(-1, 1)
         self.results = [(port, i, at[id(value)]) for port, i, value in results]
         self._told = {k for *_, k in self.results}
-        self._table = lane_operations(real)
+        self._table = {**lane_operations(real), **(instead or {})}
         zero: Any = real.type(0.0)
         self._table["choose"] = lambda c, a, b: np.where(c != 0, a, b) + zero
 

@@ -21,8 +21,9 @@ value, and a bound e of their distance. With a~ = a + e_a computed in place of a
 and never by more than the two intervals are apart, which settles comparisons. A comparison that is
 open in a cell is taken apart: where it may be wrong, its operands are as close as their errors, and
 a choice between branches that meet there is still a small error. Rounding
-adds u 2^floor(log2 |computed value|) (library functions u |computed value| a unit), and for all but
-sums half the smallest number; the exact interval of a
+adds u 2^floor(log2 |value|), half the distance of the numbers there; to sums of doubles u |value|,
+which holds for those of GCC's library too (`SOFT`); to library functions u |value| a unit; and to
+all but sums half the smallest number. The exact interval of a
 constant is the one that derivations take, see `derive.intervals.program`. Two facts make it sharp:
 a sum or difference of inputs with whole coefficients lies in what the box says of that form, and
 a - b is exact where a and b are within a factor of two of each other (Sterbenz), or one is zero.
@@ -60,6 +61,10 @@ _UNDERFLOW = {"double": TINY, "single": 2.0**-145}
 _WAVES = ("sine", "cosine", "tangent")
 _TESTS = (ca.OP_LT, ca.OP_LE, ca.OP_SIGN)
 _MOST_CELLS = 4096
+SOFT = 1.0 + 2.0**-31
+"""In GCC's library for ARM, where no FPU has doubles, a sum of opposite signs whose exponents are
+33 apart is rounded down if it loses its first bit: it is then above (1 - 2^-32) of a power of two,
+and less than its last place, u of that power, away."""
 _ZERO: Interval = (np.zeros((2, 1)), np.zeros((2, 1)))
 
 
@@ -283,8 +288,10 @@ class _Tape:
     def _round(self, node: Node, units: float, exact: BoolArray, sums: bool) -> None:
         underflow = 0.0 if sums else _UNDERFLOW[self.precision]
         size = node.size[1]
-        # to nearest: half the distance of the numbers between two powers of two
-        at = size if units > 1.0 else np.ldexp(1.0, np.frexp(size)[1] - 1)
+        if sums and self.precision == "double":
+            at = SOFT * size
+        else:
+            at = size if units > 1.0 else np.ldexp(1.0, np.frexp(size)[1] - 1)
         step = np.where(exact, 0.0, raised(units * self.unit * at, 2) + underflow)
         step = np.where(size == 0.0, 0.0, step)
         lo, hi = down(node.lo[1] - step), up(node.hi[1] + step)

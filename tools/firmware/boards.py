@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from libgcc import soft_sum
 
 from obsynth.codegen.description import describe
-from obsynth.codegen.vectors import record
+from obsynth.codegen.kernel import DOUBLE, RESULTS
+from obsynth.codegen.lanes import Lanes
+from obsynth.codegen.vectors import as_ports, record
 
 HERE = Path(__file__).parent
 FLAGS = ("-Wall", "-Wextra", "-Werror", "-O2")
@@ -20,6 +23,8 @@ CORES: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "M7": ("mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard")),
 }
 """Boards of QEMU and flags of the compiler; M3 has no FPU, that of M4F has no double."""
+SOFT = ("M3", "M4F")
+"""Where operations on doubles are those of GCC's library."""
 
 TICK, TURNS = 40, 100_000
 """Instructions a tick of SysTick (25 MHz, one instruction a nanosecond), turns of the loop."""
@@ -144,3 +149,15 @@ def recorded(observer: Any) -> tuple[np.ndarray, np.ndarray]:
     given = [np.concatenate([step.before, step.inputs]) for step in steps]
     made = [np.concatenate([step.results, [step.status], step.after]) for step in steps]
     return np.array(given, description.real.type), np.array(made, description.real.type)
+
+
+def softened(observer: Any, records: np.ndarray) -> np.ndarray:
+    """Return what a step in doubles makes of records where its sums are those of GCC's library."""
+    description, count = describe(observer), observer.step.numel_in("memory")
+    instead = {"add": soft_sum, "sub": lambda a, b: soft_sum(a, -b)}
+    lanes = Lanes(observer.step, DOUBLE, instead)
+    found = lanes.run(as_ports(description, [(row[:count], row[count:]) for row in records]))
+    # status and next memory stand behind the others
+    behind = [RESULTS.index("status"), RESULTS.index("next")]
+    told = sorted(lanes.results, key=lambda r: (r[0] in behind and 1 + behind.index(r[0]), r[:2]))
+    return np.array([found[k] for *_, k in told]).T
