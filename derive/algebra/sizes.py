@@ -11,6 +11,7 @@ from typing import Any
 import sympy as sp
 
 from obsynth.derive.rigour.walks import once, replaced
+from obsynth.symbolic.display import short
 
 LARGEST_SIMPLIFY = 300
 """Parts of an expression up to which `sympy.simplify` is asked; its longest proof had 280."""
@@ -20,7 +21,6 @@ LARGEST_SUM = 20_000
 """Terms up to which products are multiplied out."""
 _ENDLESS = 10**12
 _LONGEST = 300
-_DIGITS = 12
 
 
 def size(expression: Any) -> int:
@@ -102,5 +102,4 @@ def text(expression: sp.Expr) -> str:
     parts = size(expression)
     if parts > _LONGEST:
         return f"(an expression of {parts:,} parts)"
-    long = {r: sp.Float(r, 6) for r in expression.atoms(sp.Rational) if len(str(r)) > _DIGITS}
-    return str(expression.xreplace(long))
+    return str(sp.sstr(short(expression), full_prec=False))
