@@ -124,9 +124,9 @@ def name_lines(axes: Sequence[Any], source: Any) -> None:
     order = sorted(range(len(words)), key=lambda i: _ORDER.get(words[i], len(_ORDER)))
     entries = [handles[i] for i in order], [words[i] for i in order]
     figure = source.figure
-    columns = max(
-        1, min(len(words), int(inches(figure) / (0.55 + 0.07 * max(map(len, words), default=0))))
-    )
+    room = int(inches(figure) / (0.55 + 0.07 * max(map(len, words), default=0)))
+    rows = -(-len(words) // max(1, room))
+    columns = -(-len(words) // max(1, rows))
     engine = figure.get_layout_engine()
     own = len(figure.axes) == len(axes) and not figure.legends
     if own and engine is not None and _constrained(engine):

@@ -133,7 +133,7 @@ def test_everything_is_shown():
     mpl.use("agg")
     ax = found.plot()
     assert [t.get_text() for t in ax.get_yticklabels()] == ["e1", "h2", "e3", "leak"]
-    assert "one (recommended)" in [t.get_text() for t in ax.get_legend().get_texts()]
+    assert "one (recommended)" in [t.get_text() for t in ax.figure.legends[0].get_texts()]
 
 
 def test_a_method_is_ended_when_its_time_is_up(capfd):
