@@ -181,10 +181,24 @@ class _Walker:
                 f"{self.where}: {node} leaves cases open; end it with (expression, True)",
                 where=self.where,
             )
-        result = self.visit(otherwise)
+        tests = [one for _, test in cases for one in sp.ordered(test.atoms(Relational))]
+        tested = [side for test in tests for side in test.args if side.args and not side.is_number]
+        result = self._piece(otherwise, tested)
         for value, condition in reversed(cases):
-            result = ca.if_else(self.visit(condition), self.visit(value), result)
+            result = ca.if_else(self.visit(condition), self._piece(value, tested), result)
         return result
+
+    def _piece(self, value: sp.Expr, tested: Sequence[sp.Expr]) -> ca.SX:
+        """Write a piece that is affine in what is tested by that very node.
+
+        Where a test goes wrong by rounding, both pieces are then seen to be nearly the same.
+        """
+        offset, rest = value.as_coeff_Add()
+        for side in tested:
+            factor = rest / side
+            if factor.is_number and factor != 0:
+                return self._double(factor) * self.visit(side) + self._double(offset)
+        return self.visit(value)
 
     def _condition(self, node: sp.Basic) -> ca.SX:
         if isinstance(node, BooleanTrue | BooleanFalse):

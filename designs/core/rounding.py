@@ -53,7 +53,7 @@ from obsynth.designs.core.rounding_rules import (
     over,
     propagated,
 )
-from obsynth.symbolic.arrays import BoolArray, FloatArray
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 _LARGEST = {"double": float(np.finfo(np.float64).max), "single": float(np.finfo(np.float32).max)}
 # above half the smallest positive number, and above `ULPS` of it
@@ -128,7 +128,7 @@ class _Tape:
         ]
         self.known: dict[int, Interval] = {}
         self.right: dict[int, BoolArray] = {}
-        self.open: tuple[int, list[int], list[Node]] | None = None
+        self.open: tuple[int, list[int], list[Node], IntArray] | None = None
         writer: dict[int, int] = {}
         for k in range(function.n_instructions()):
             out, args = function.instruction_output(k), function.instruction_input(k)
@@ -144,26 +144,25 @@ class _Tape:
     def branch(self) -> bool:
         """Take the open comparison apart; whether there was room for it.
 
-        Cells where it is right, computed or not, and cells where it may be wrong, in which its
-        operands are as close as their errors.
+        Cells where it is right, computed or not, and once more those where it may be wrong, in
+        which its operands are as close as their errors.
         """
-        if self.open is None or 2 * self.cells[0] > _MOST_CELLS:
+        if self.open is None or self.cells[0] + self.open[-1].size > _MOST_CELLS:
             return False
-        k, places, operands = self.open
+        k, places, operands, wrong = self.open
         count = self.cells[0]
-        again = np.concatenate([np.arange(count), np.arange(count)])
-        wrong = again.size - count
+        again = np.concatenate([np.arange(count), wrong])
         self.cells = (again.size,)
         self.box = [(lo[:, again], hi[:, again]) for lo, hi in self.box]
         self.known = {i: (lo[again], hi[again]) for i, (lo, hi) in self.known.items()}
         self.right = {i: side[again] for i, side in self.right.items()}
-        self.right[k] = np.arange(again.size) < wrong
+        self.right[k] = np.arange(again.size) < count
         near = up(np.sum([node.e for node in operands], axis=0))
         other = [node.range for node in operands[::-1]] if len(operands) == 2 else [_ZERO]
         for place, (lo, hi) in zip(places, other, strict=True):
             old = self.known.get(place, (-np.inf, np.inf))
             low, high = (np.full(again.size, side) for side in (-np.inf, np.inf))
-            low[count:], high[count:] = down(lo[0] - near), up(hi[0] + near)
+            low[count:], high[count:] = down(lo[0] - near)[wrong], up(hi[0] + near)[wrong]
             self.known[place] = np.maximum(old[0], low), np.minimum(old[1], high)
         return True
 
@@ -192,7 +191,8 @@ class _Tape:
                 if k in self.right:
                     node.e = np.where(self.right[k], 0.0, node.e)
                 elif self.open is None and node.e.any():
-                    self.open = k, [place[a] for a in args], [work[a] for a in args]
+                    parts = [place[a] for a in args], [work[a] for a in args]
+                    self.open = k, *parts, np.flatnonzero(node.e)
             work[out[0]], place[out[0]] = node, k
         return found
 

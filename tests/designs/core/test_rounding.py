@@ -4,9 +4,12 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
+import sympy as sp
 from tapes import TYPES, errors, sample
 
 from obsynth.designs.core.rounding import rounding_bound
+from obsynth.symbolic import lookup
+from obsynth.symbolic.convert import sx_function
 
 
 def bound(function, lo, hi, precision, **known):
@@ -315,3 +318,17 @@ def test_comparisons_are_taken_apart(kink):
     a = (near / (0.37 * b.astype(float))).astype(np.float32)
     seen = errors(function, [np.array([a, b], dtype=float)], "single").max()
     assert seen <= found <= limit
+
+
+def test_pieces_meet_where_a_test_of_a_quotient_goes_wrong():
+    """A table of x / v, as a wind turbine's: its pieces are written by the node that is tested.
+
+    Mutant: pieces written by themselves, as 37 x / (40 v) - 27/200; the bound is 1.6e-3 then.
+    """
+    x, v = sp.symbols("x v", real=True)
+    ratio = 10 * x / v
+    value = v**3 * lookup(ratio, [0, 2, 6, 8, 10, 30], [0, 0.05, 0.42, 0.48, 0.45, 0]) / x
+    function = sx_function("f", {"v": [x, v]}, {"y": sp.Matrix([value / 10**6])})
+    lo, hi = (np.array(ends)[:, None] for ends in ((0.8, 4.0), (2.2, 14.0)))
+    assert bound(function, lo, hi, "double")[0] < 1e-17
+    assert bound(function, lo, hi, "single")[0] < 1e-9
