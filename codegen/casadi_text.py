@@ -49,9 +49,8 @@ def _shortest(literal: re.Match[str]) -> str:
 def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
     """Write the arithmetic of a step as static C functions.
 
-    CasADi's C passes arrays of pointers, work vectors and a memory index, exports some
-    fifteen symbols and brings its own types. What is kept of it is the sequence of
-    operations, statement by statement, with the arguments as plain arrays.
+    What is kept of CasADi's C is the sequence of operations, statement by statement, with plain
+    arrays as arguments: no work vectors, memory index, exported symbols and types of its own.
     """
     function = scalar_function(step)
     text = _casadi_text(function)

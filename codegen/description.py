@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import DOUBLE, REALS, STEP_INPUTS, Machine, Real
 from obsynth.codegen.names import project_name, unique
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.files import stored_text
 from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
@@ -48,20 +49,16 @@ class Port:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """An observer as the templates see it.
+    """An observer as the templates see it, with C names.
 
-    name: C name of the project
-    sample_time: seconds
-    fields: the memory in order
     theta: the measured scheduling signals; empty where the step does not read them
     scheduling: their places among all scheduling signals of the plant
     start (n_memory,): the initialised memory that ``NAME_init_default`` sets
-    model_hash: SHA-256 of the plant's stored form
+    model_hash, design_hash, certificate_hash: SHA-256 of the plant's stored form, of the record of
+        the design with the options of a detector, of the claims without margins, whose last digits
+        are the machine's
     design: the stored design, as `Observer.save` writes it
-    detector: options of a fault detector; empty for an observer
-    design_hash: SHA-256 of the record of the design, with those options
     claims: names of what is proved, from the stored equations on
-    certificate_hash: SHA-256 of its claims, without margins, whose last digits are the machine's
     real: the type that the step computes in
     """
 
@@ -279,31 +276,16 @@ def _check_step(step: ca.Function, model: Plant, n_memory: int, n_theta: int) ->
             )
 
 
-def midpoints(box: FloatArray) -> FloatArray:
-    """Return the middle of every range; the number closest to zero in one that is open."""
-    lower, upper = np.asarray(box, dtype=float).reshape(-1, 2).T
-    open_end = np.isinf(lower) | np.isinf(upper)
-    inside = np.clip(0.0, lower, upper)
-    result: FloatArray = inside.copy()
-    result[~open_end] = 0.5 * (lower[~open_end] + upper[~open_end])
-    return result
-
-
-def nominal_values(model: Plant, kind: Literal["x", "u", "rho"]) -> FloatArray:
-    """Return the nominal values; the middle of the range where none is declared."""
-    signals = {"x": model.x, "u": model.u}[kind] if kind != "rho" else model.rho
-    values = midpoints(model.box(kind))
-    for i, signal in enumerate(signals):
-        if signal.nominal is not None:
-            values[i] = float(signal.nominal)
-    return values
+def midpoints(model: Plant, kind: str) -> FloatArray:
+    """Return the middle of every range; zero without one."""
+    return np.array([s.middle for s in getattr(model, kind)], dtype=float)
 
 
 def _start(
     observer: Observer | FaultDetector, memory: FloatArray | None, n_memory: int
 ) -> FloatArray:
     given = "memory=" if memory is not None else "what memory0 returned"
-    value = observer.memory0(nominal_values(observer.model, "x")) if memory is None else memory
+    value = observer.memory0(operating_values(observer.model, "x")) if memory is None else memory
     start = np.array(value, dtype=float)
     if start.shape != (n_memory,):
         raise CodegenError(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.description import Description, midpoints, nominal_values
+from obsynth.codegen.description import Description, midpoints
 from obsynth.codegen.kernel import Machine
+from obsynth.derive.equilibrium import operating_values
 from obsynth.symbolic.arrays import FloatArray
 
 _KINDS = ("u", "d", "f", "w", "p", "rho")
@@ -25,9 +26,8 @@ def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
 class Drive:
     """Inputs, measurements and scheduling along random trajectories of the plant.
 
-    The trajectories serve to reach the memories and branches that a step meets in service.
-    Whether they are admissible does not matter: states that leave their declared range
-    are put back on its border.
+    Whether they are admissible does not matter: states that leave their declared range are put back
+    on its border.
     """
 
     def __init__(self, description: Description, rng: np.random.Generator) -> None:
@@ -36,11 +36,9 @@ class Drive:
         self._observer = description.observer
         self._plant = Machine(model.function())
         self._slope = Machine(_input_slope(model.function()))
-        self._nominal = nominal_values(model, "x")
+        self._nominal = operating_values(model, "x")
         self._x_box = _finite(self._box("x"), self._nominal)
-        self._boxes = {
-            kind: _finite(self._box(kind), midpoints(self._box(kind))) for kind in _KINDS
-        }
+        self._boxes = {kind: _finite(self._box(kind), midpoints(model, kind)) for kind in _KINDS}
         self._sequence = 0
         self._rest = False
         self._x = self._nominal
@@ -62,12 +60,12 @@ class Drive:
         return y
 
     def begin(self, length: int) -> FloatArray | None:
-        """Start a trajectory of `length` samples; return the observer's memory for it.
+        """Start a trajectory of `length` samples; return the observer's memory, None for the
+        default.
 
-        None stands for the default memory. Every second trajectory starts from a guess of
-        its own, and two thirds of them carry a fault that grows from a random instant. Half of
-        them are kept near where they start, with small faults, so that observers whose
-        guarantee holds in a small region are seen at work in it.
+        Every second one starts from a guess of its own, and two thirds carry a fault that grows
+        from a random instant. Half of them are kept near where they start, with small faults, so
+        that observers whose guarantee holds in a small region are seen at work in it.
         """
         rng = self.rng
         self._sequence += 1

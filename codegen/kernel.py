@@ -1,6 +1,7 @@
 """The arithmetic of one step: its type, what both writers share, and CasADi's virtual machine."""
 
 import math
+import typing
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -43,16 +44,14 @@ _MOVES = frozenset({"input", "output", "const", "assign"})
 
 @dataclass(frozen=True)
 class Kernel:
-    """C text of the arithmetic of one step.
+    """C text of the arithmetic of one step, by one of the backends.
 
-    backend: who wrote it
     functions: static functions; the last one is ``NAME_kernel``
     arguments: what it reads and writes: some of ``memory, u, y, theta, next, xhat, ...``, or of
         ``state, in, out``
     library: what it calls from ``math.h``, sorted
     own: functions beyond those of IEEE 754 that are written out, with their units in the last place
-    operations: instructions of the CasADi function, a measure of its length
-    counts: how often it does what, by CasADi's names of operations
+    operations, counts: instructions of the CasADi function, and how often it does what
     """
 
     backend: str
@@ -121,10 +120,7 @@ class Real:
     type: type[np.floating[Any]]
 
     def rounded(self, value: float) -> float:
-        """Return the number of the type next to a constant; refuse one that would be infinite.
-
-        What underflow takes of a constant is counted by the design, as all rounding is.
-        """
+        """Return the nearest number of the type, which a design counts; refuse infinities."""
         with np.errstate(over="ignore"):
             near = float(self.type(value))
         if math.isinf(near) and not math.isinf(value):
@@ -157,31 +153,53 @@ REALS: Mapping[str, Real] = {real.precision: real for real in (DOUBLE, SINGLE)}
 """Types that a step can compute in, by precision."""
 
 
-class Machine:
-    """A CasADi function of vectors as one of NumPy vectors, through buffers: ten times as fast.
+def dense(function: ca.Function) -> ca.Function:
+    """Return the same function with dense inputs and outputs, as buffers write only nonzeros."""
+    sparse = any(function.nnz_in(i) != function.numel_in(i) for i in range(function.n_in()))
+    sparse |= any(function.nnz_out(i) != function.numel_out(i) for i in range(function.n_out()))
+    if not sparse:
+        return function
+    args = [ca.MX.sym(f"a{i}", function.size_in(i)) for i in range(function.n_in())]
+    results = [ca.densify(r) for r in function.call(args)]
+    return ca.Function(function.name(), args, results, function.name_in(), function.name_out())
 
-    function: inputs and outputs are vectors; structural zeros become zeros
+
+class Call:
+    """A CasADi function behind fixed NumPy buffers: about a microsecond a call.
+
+    Buffers that are given may serve several functions, but not as argument and result of one.
     """
 
-    def __init__(self, function: ca.Function) -> None:
-        # The function itself is kept as one call, so that nothing is simplified anew.
-        ports = [ca.MX.sym(f"i{i}", function.numel_in(i)) for i in range(function.n_in())]
-        outputs = [ca.densify(out) for out in function.call(ports, False, True)]
-        dense = ca.Function("dense", ports, outputs)
-        buffer: Any
-        buffer, self._run = dense.buffer()
-        self._arguments = [np.zeros(dense.numel_in(i)) for i in range(dense.n_in())]
-        self._results = [np.zeros(dense.numel_out(i)) for i in range(dense.n_out())]
-        for i, array in enumerate(self._arguments):
-            buffer.set_arg(i, array.data)
-        for i, array in enumerate(self._results):
-            buffer.set_res(i, array.data)
-        # The buffer holds the addresses of the arrays for as long as it is called.
+    def __init__(
+        self,
+        function: ca.Function,
+        args: list[FloatArray] | None = None,
+        results: list[FloatArray] | None = None,
+    ) -> None:
+        if args is None:
+            args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        if results is None:
+            results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        self.args, self.results = args, results
+        # CasADi's own stubs describe neither call as its Python layer takes it.
+        buffer, self.evaluate = typing.cast(Any, function).buffer()
+        for i, argument in enumerate(self.args):
+            buffer.set_arg(i, memoryview(typing.cast(Any, argument)))
+        for i, result in enumerate(self.results):
+            buffer.set_res(i, memoryview(typing.cast(Any, result)))
+        # The buffer owns the pointers, so it has to live as long as the arrays.
         self._buffer = buffer
+
+
+class Machine(Call):
+    """A CasADi function of vectors as one of NumPy vectors, ten times as fast."""
+
+    def __init__(self, function: ca.Function) -> None:
+        super().__init__(dense(function))
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
         """Return the results as new vectors."""
-        for array, value in zip(self._arguments, arguments, strict=True):
+        for array, value in zip(self.args, arguments, strict=True):
             array[:] = value
-        self._run()
-        return [result.copy() for result in self._results]
+        self.evaluate()
+        return [result.copy() for result in self.results]

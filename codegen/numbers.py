@@ -21,11 +21,10 @@ _UNTOLD = {"next", "status", "mean_status"}
 
 @dataclass(eq=False)
 class _Facts:
-    """What holds in one case.
+    """What holds in one case, possible unless it contradicts itself.
 
-    known: tests by their identity; waiting: those whose operands are not decided by it yet
+    known, waiting: tests by their identity, and those whose operands are not decided yet
     below: pairs of which the first is at most the second; numbers: what is none other
-    possible: False where the case contradicts itself
     """
 
     known: dict[int, bool] = field(default_factory=dict)

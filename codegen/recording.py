@@ -59,11 +59,7 @@ class Word:
         return int(self.patterns(np.nan))
 
     def patterns(self, values: Any) -> Any:
-        """Return bit patterns of any shape.
-
-        Every NaN has the same one: which of the NaNs an operation returns is not defined, neither
-        by IEEE 754 nor by C.
-        """
+        """Return bit patterns of any shape, one for all NaNs, as IEEE 754 defines no more."""
         with np.errstate(over="ignore"):
             numbers: Any = np.array(values).astype(self.real.type)
         numbers[np.isnan(numbers)] = np.nan
@@ -82,16 +78,11 @@ class Word:
 
 @dataclass(frozen=True)
 class Vectors:
-    """Vectors as the C programs read them.
+    """Vectors as the C programs read them: one record a line, see the README of a project.
 
-    word: of the real type
-    text: one record a line, see the README of a generated project
-    small: words of the self-test, see `small_words`
-    few: how many steps the self-test has
-    count: number of steps
+    small, few: words of the self-test, see `small_words`, and how many steps it has
     values: how many numbers the runner has to compare: results, statuses and memories
-    kinds: how many steps of which kind
-    statuses: how often the steps returned which status
+    kinds, statuses: how many steps of which kind, and of which status
     """
 
     word: Word

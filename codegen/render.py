@@ -11,10 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.description import Description, Port, midpoints, nominal_values
+from obsynth.codegen.description import Description, Port, midpoints
 from obsynth.codegen.kernel import DOUBLE, Kernel, Machine, Real
 from obsynth.codegen.names import c_comment
 from obsynth.codegen.recording import Vectors
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.observer import STATUS
 from obsynth.symbolic.arrays import FloatArray
 
@@ -51,10 +52,10 @@ def _example(description: Description) -> list[tuple[str, ...]]:
     """Return u, y and theta of a plant that starts in its nominal state."""
     model = description.observer.model
     plant = Machine(model.function())
-    x, u = nominal_values(model, "x"), nominal_values(model, "u")
-    d, w, p, rho = (midpoints(model.box(kind)) for kind in ("d", "w", "p", "rho"))
+    x, u = operating_values(model, "x"), operating_values(model, "u")
+    d, w, p, rho = (midpoints(model, kind) for kind in ("d", "w", "p", "rho"))
     if description.scheduling:
-        rho = nominal_values(model, "rho")
+        rho = operating_values(model, "rho")
     theta = rho[list(description.scheduling)]
     rows = []
     for _ in range(_EXAMPLE_STEPS):
@@ -140,7 +141,7 @@ def template_values(
     observer, sizes = description.observer, description.sizes
     signals = {"u": description.u, "y": description.y, "theta": description.theta}
     signals |= {"x": description.x, "f": description.f}
-    start = nominal_values(observer.model, "x")
+    start = operating_values(observer.model, "x")
     return {
         "name": description.name,
         "macro": description.name.upper(),

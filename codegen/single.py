@@ -66,9 +66,8 @@ _NAMES: Mapping[str, Any] = {
 class SingleMachine:
     """A CasADi function of vectors in IEEE single precision, an operation a time.
 
-    Every constant is rounded to the nearest number, every operation is one of NumPy's float32, and
-    functions beyond those of IEEE 754 are our own. Arguments of shape (n,), or (n, lanes) to
-    evaluate many at once; results are float32.
+    Every constant is rounded to the nearest number, and functions beyond those of IEEE 754 are our
+    own. Arguments are (n,), or (n, lanes) to evaluate many at once; results are float32.
     """
 
     def __init__(self, function: ca.Function) -> None:

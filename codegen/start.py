@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.codegen.description import nominal_values
 from obsynth.codegen.kernel import DOUBLE, REALS, Real
+from obsynth.derive.equilibrium import operating_values
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import Observer
@@ -43,11 +43,9 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first memory, and what it is made of.
+    """A first memory, for the start values of its parameters, and what it is made of.
 
-    memory (n_memory,): for the start values of the parameters
-    parameters: parts of the guess, then pairs of ends of ranges
-    guesses: how many parts of the guess there are
+    parameters: parts of the guess, so many as there are guesses, then pairs of ends of ranges
     rules: entries of the memory that depend on parameters v, in C; ``outward(v, way)`` is the next
         number of single precision that way
     largest: numbers of larger size are no start values
@@ -75,7 +73,7 @@ def start_of(
     inner = observer.observer if isinstance(observer, FaultDetector) else observer
     real, largest = REALS[inner.precision], LIMITS[inner.precision].finite
     fixed = {
-        "guess": np.asarray(nominal_values(model, "x") if guess is None else guess, dtype=float),
+        "guess": np.asarray(operating_values(model, "x") if guess is None else guess, dtype=float),
         "x_range": x_range,
         "f_range": f_range,
     }

@@ -42,11 +42,9 @@ _LONGEST = 60
 
 @dataclass(eq=False)
 class _Value:
-    """One value of the tape.
+    """One value of the tape, read by so many others.
 
-    nan: whether it may be none
-    minus: whether what is written may be -0
-    uses: how many read it
+    nan, minus: whether it may be none, and whether what is written may be -0
     signed: whether the sign of a zero is seen by anything
     product: whether its expression holds a product
     """

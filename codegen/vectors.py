@@ -66,11 +66,10 @@ def record(
 ) -> tuple[Recorder, dict[str, int]]:
     """Run the step on its machine; return what was recorded, and how many steps of which kind.
 
-    Trajectories of the plant, some with failing signals, lead to memories that are met in service;
-    stretches of them are recorded, most of all healthy ones. From the memories of these start steps
-    on both sides of every limit that the step compares something with, and steps with a few numbers
-    that are random, extreme or not finite. The others follow `NAME_init` without an initialised
-    memory.
+    Stretches of trajectories of the plant are recorded, some with failing signals, most of them
+    healthy. From the memories of these start steps on both sides of every limit that the step
+    compares something with, and steps with a few numbers that are random, extreme or not finite.
+    The others follow `NAME_init` without an initialised memory.
     """
     if count < MINIMUM:
         raise CodegenError(

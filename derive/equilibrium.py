@@ -60,41 +60,32 @@ class Equilibrium(Tabled):
 
 def operating_values(model: Plant, kind: str) -> FloatArray:
     """Nominal values of one kind of signal: declared, else the middle of the range, else zero."""
-    values = []
-    for signal in getattr(model, kind):
-        if signal.nominal is not None:
-            values.append(float(signal.nominal))
-        elif signal.value is not None:
-            values.append(float(signal.value))
-        elif np.isfinite(signal.lower) and np.isfinite(signal.upper):
-            values.append(0.5 * (signal.lower + signal.upper))
-        else:
-            values.append(0.0)
-    return np.array(values, dtype=float)
+    return np.array([s.usual for s in getattr(model, kind)], dtype=float)
+
+
+def _finite(values: FloatArray, names: tuple[str, ...], what: str) -> FloatArray:
+    """Refuse what is not one finite number for each name."""
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise DerivationError(
+            f"{what} needs one finite number for each of {', '.join(names) or 'no inputs'}; "
+            f"given was {values.tolist()}",
+            symbols=names,
+            given=values,
+        )
+    return values
 
 
 def _inputs(model: Plant, u: ArrayLike | None) -> FloatArray:
-    names = model.names("u")
     if u is None:
         for signal in model.u:
-            if signal.nominal is None and not (
-                np.isfinite(signal.lower) and np.isfinite(signal.upper)
-            ):
+            if signal.nominal is None and not signal.bounded:
                 raise DerivationError(
                     f"the input {signal.name} has neither a nominal value nor a range; give "
                     f"u= or declare it with nominal=",
                     symbol=signal.name,
                 )
         return operating_values(model, "u")
-    values = np.atleast_1d(np.asarray(u, dtype=float))
-    if values.shape != (len(names),) or not np.isfinite(values).all():
-        raise DerivationError(
-            f"u needs one finite number for each of {', '.join(names) or 'no inputs'}; "
-            f"given was {values.tolist()}",
-            symbols=names,
-            given=values,
-        )
-    return values
+    return _finite(np.atleast_1d(np.asarray(u, dtype=float)), model.names("u"), "u")
 
 
 def _residual_functions(model: Plant) -> tuple[ca.Function, ca.Function]:
@@ -235,13 +226,7 @@ def operating_point(model: Plant, at: Any = None) -> Equilibrium:
         rest = (operating_values(model, kind) for kind in ("p", "rho"))
         point = Equilibrium(x, u, np.nan, *rest)
     for kind, values in (("x", point.x), ("u", point.u)):
-        names = model.names(kind)
-        if values.shape != (len(names),) or not np.isfinite(values).all():
-            raise DerivationError(
-                f"the point of operation needs one finite number for each of {', '.join(names)}; "
-                f"given was {values.tolist()}",
-                symbols=names,
-            )
+        _finite(values, model.names(kind), "the point of operation")
     if np.isnan(point.residual):
         left = np.array(_residual_functions(model)[0](point.x, point.u, point.p, point.rho))
         point = replace(point, residual=float(np.abs(left).max(initial=0.0)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.codegen.build import find_compiler
 from obsynth.codegen.errors import BuildError
-from obsynth.evaluate.truth import Call
+from obsynth.codegen.kernel import Call
 from obsynth.symbolic.arrays import FloatArray
 
 CACHE = "OBSYNTH_CACHE"

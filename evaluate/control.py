@@ -183,13 +183,7 @@ def _of_observer(observer: Observer | FaultDetector) -> Any:
     def evaluate(t: float, memory: FloatArray, u: FloatArray, params: Any) -> list[FloatArray]:
         return [np.array(part).ravel() for part in step(memory, *np.split(u, ends))]
 
-    labels = []
-    for i, part in enumerate(step.name_out()[1:], start=1):
-        group = {"x": "x", "f": "f", "a": "f", "m": "f"}.get(part[0])
-        end = part.removeprefix("x_").removeprefix("f_")
-        end = "hat" if part in ("xhat", "fhat") else end
-        named = () if group is None else model.names(group)
-        labels += [f"{n}_{end}" for n in named] if len(named) == step.numel_out(i) else [part]
+    labels = [label for part in step.name_out()[1:] for label in observer.outputs[part]]
     measured = [s.name for s in model.rho if s.measured] if len(sizes) > 2 else []
     return _system(
         lambda *given: evaluate(*given)[0],

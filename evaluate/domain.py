@@ -37,12 +37,10 @@ class StatusCount:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Domain(Shown):
-    """Where truth and estimate stood relative to the box of the guarantee.
+    """Where truth and estimate stood relative to the box of the guarantee, (N + 1,) each.
 
-    x_inside, xhat_inside (N + 1,): true where every state is inside its range
     left: one sentence for each state that left, with the first instant and how far
-    status: bits of the status that occurred
-    voids: stretches of void and recovering instants
+    status, voids: bits of the status that occurred; stretches of void and recovering instants
     """
 
     x_inside: NDArray[np.bool_]

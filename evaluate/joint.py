@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import MEAN_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
@@ -24,9 +25,7 @@ from obsynth.evaluate.checked import (
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import (
-    Call,
     continuous_plant,
-    dense,
     parameter_text,
     parameters,
     same_signals,
@@ -293,20 +292,19 @@ def _with_feedback(
             points = [(2 * per * k + within + i) / (2.0 * per) for i in range(3)]
             v[:] = first[j]
             loop.measure.evaluate()
-            v[:n_u] = start = control(points[0])
-            if within == 0:
-                u[k] = start
-            loop.next_v[:] = middle[j]
-            loop.first.evaluate()
-            v[:] = middle[j]
-            v[:n_u] = control(points[1])
-            loop.second.evaluate()
-            v[:n_u] = control(points[1])
-            loop.next_v[:] = last[j]
-            loop.third.evaluate()
-            v[:] = last[j]
-            v[:n_u] = control(points[2])
-            loop.last.evaluate()
+            for stage, now, ahead, at in zip(
+                loop.stages,
+                (first, middle, middle, last),
+                (middle, middle, last, last),
+                (0, 1, 1, 2),
+                strict=True,
+            ):
+                v[:] = now[j]
+                v[:n_u] = control(points[at])
+                loop.next_v[:] = ahead[j]
+                stage.evaluate()
+                if at == within == 0:
+                    u[k] = v[:n_u]
             loop.z[:] = loop.next_z
             if within == 2 * (per - 1):
                 z[k + 1] = loop.z
@@ -338,31 +336,14 @@ class _Stages:
             return Call(_scalar(ca.Function("stage", inputs, outputs)), args, results)
 
         self.measure = stage([z, v], [output(z, v)], now, [self.y])
-        slope = rates(z, v)
-        self.first = stage(
-            [z, v, ahead],
-            [slope, output(z + h / 2 * slope, ahead)],
-            [*now, self.next_v],
-            [slopes[0], self.y],
-        )
-        slope = rates(z + h / 2 * k1, v)
-        self.second = stage(
-            [z, v, k1, ahead],
-            [slope, output(z + h / 2 * slope, ahead)],
-            [*now, slopes[0], self.next_v],
-            [slopes[1], self.y],
-        )
-        slope = rates(z + h / 2 * k2, v)
-        self.third = stage(
-            [z, v, k2, ahead],
-            [slope, output(z + h * slope, ahead)],
-            [*now, slopes[1], self.next_v],
-            [slopes[2], self.y],
-        )
-        slope = rates(z + h * k3, v)
-        self.last = stage(
-            [z, v, k1, k2, k3],
-            [z + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope)],
-            [*now, *slopes],
-            [self.next_z],
-        )
+        self.stages = []
+        earlier: list[Any] = []
+        reached, buffers = z, earlier[:]
+        for k, weight, slope in zip((k1, k2, k3), (h / 2, h / 2, h), slopes, strict=True):
+            rate = rates(reached, v)
+            after = output(z + weight * rate, ahead)
+            given, shared = [z, v, *earlier, ahead], [*now, *buffers, self.next_v]
+            self.stages.append(stage(given, [rate, after], shared, [slope, self.y]))
+            reached, earlier, buffers = z + weight * k, [k], [slope]
+        following = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(reached, v))
+        self.stages.append(stage([z, v, k1, k2, k3], [following], [*now, *slopes], [self.next_z]))

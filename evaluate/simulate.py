@@ -6,6 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
@@ -22,7 +23,7 @@ from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.joint import joint
 from obsynth.evaluate.run import Run
-from obsynth.evaluate.truth import Call, Truth, dense
+from obsynth.evaluate.truth import Truth
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.taking import takes

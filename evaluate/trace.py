@@ -17,11 +17,9 @@ from obsynth.symbolic.table import Table, Tabled
 class Trace(Tabled):
     """One signal over time: truth, estimate and interval, all about the same instants.
 
-    Signals without an estimate (inputs, outputs, disturbances) have None there.
-    With ``fault_delay = 1`` a fault's trace ends one sample before the run, as
-    its claims arrive one sample late. ``alarm`` is what a fault detector said at
-    these instants, which is about the instant ``fault_delay`` earlier. ``status`` came with the
-    interval.
+    Signals without an estimate (inputs, outputs, disturbances) have None there. With ``fault_delay
+    = 1`` a fault's trace ends one sample before the run, as its claims arrive one sample late;
+    ``alarm`` is about the instant ``fault_delay`` earlier.
     """
 
     name: str
@@ -121,9 +119,8 @@ def take(run: Any, name: str) -> Trace:
 
 @dataclass(frozen=True)
 class Violation:
-    """A signal that was outside its interval.
+    """A signal that was outside its interval at so many instants of the whole run.
 
-    count: violated instants in the whole run
     instants, amounts: the first few instants k, and how far outside the truth was
     worst, worst_at: the largest amount and its instant
     """

@@ -1,17 +1,18 @@
 """The truth of a simulation: one step of the plant, discrete or integrated."""
 
-import typing
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from obsynth.codegen.kernel import dense
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.discretise import PREFIX
+from obsynth.symbolic.discretise import PREFIX, runge_kutta
 
 
 class Truth:
@@ -160,7 +161,7 @@ def continuous_plant(model: Plant, why: str) -> Plant:
 
 def parameters(model: Plant) -> FloatArray:
     """Return the constant parameters of the truth: nominal, else mid-range."""
-    return np.array([_nominal(signal) for signal in model.p], dtype=np.float64)
+    return operating_values(model, "p")
 
 
 def parameter_text(model: Plant, p: FloatArray) -> str:
@@ -168,12 +169,6 @@ def parameter_text(model: Plant, p: FloatArray) -> str:
     if not p.size:
         return ""
     return "; " + ", ".join(f"{s.name} = {v:g}" for s, v in zip(model.p, p, strict=True))
-
-
-def _nominal(signal: Any) -> float:
-    if signal.nominal is not None:
-        return float(signal.nominal)
-    return 0.5 * (float(signal.lower) + float(signal.upper))
 
 
 def _symbols(plant: Plant) -> tuple[ca.SX, ...]:
@@ -194,51 +189,8 @@ def _held(plant: Plant, Ts: float, substeps: int, p: FloatArray) -> ca.Function:
     def rate(state: Any) -> Any:
         return _call(plant, state, u, d, f, w, p, rho)[0]
 
-    h = Ts / substeps
     state: Any = x
     for _ in range(substeps):
-        k1 = rate(state)
-        k2 = rate(state + h / 2 * k1)
-        k3 = rate(state + h / 2 * k2)
-        k4 = rate(state + h * k3)
-        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        state = runge_kutta(rate, state, Ts / substeps)
     y = _call(plant, x, u, d, f, w, p, rho)[1]
     return ca.Function("truth", [x, u, d, f, w, rho], [state, y])
-
-
-def dense(function: ca.Function) -> ca.Function:
-    """Return the same function with dense inputs and outputs, as buffers write only nonzeros."""
-    sparse = any(function.nnz_in(i) != function.numel_in(i) for i in range(function.n_in()))
-    sparse |= any(function.nnz_out(i) != function.numel_out(i) for i in range(function.n_out()))
-    if not sparse:
-        return function
-    args = [ca.MX.sym(f"a{i}", function.size_in(i)) for i in range(function.n_in())]
-    results = [ca.densify(r) for r in function.call(args)]
-    return ca.Function(function.name(), args, results, function.name_in(), function.name_out())
-
-
-class Call:
-    """A CasADi function behind fixed NumPy buffers: about a microsecond a call.
-
-    Buffers that are given may serve several functions, but not as argument and result of one.
-    """
-
-    def __init__(
-        self,
-        function: ca.Function,
-        args: list[FloatArray] | None = None,
-        results: list[FloatArray] | None = None,
-    ) -> None:
-        if args is None:
-            args = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        if results is None:
-            results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        self.args, self.results = args, results
-        # CasADi's own stubs describe neither call as its Python layer takes it.
-        buffer, self.evaluate = typing.cast(Any, function).buffer()
-        for i, argument in enumerate(self.args):
-            buffer.set_arg(i, memoryview(typing.cast(Any, argument)))
-        for i, result in enumerate(self.results):
-            buffer.set_res(i, memoryview(typing.cast(Any, result)))
-        # The buffer owns the pointers, so it has to live as long as the arrays.
-        self._buffer = buffer

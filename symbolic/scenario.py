@@ -180,7 +180,7 @@ class Scenario(Tabled):
         u = None
         if not self.feedback:
             u = self._fit("inputs", self._samples("inputs"), model.names("u"))
-        middle = [_middle(s.lower, s.upper, s.nominal) for s in model.rho]
+        middle = [s.usual for s in model.rho]
         return {
             "u": u,
             "d": self._fit("unknown_inputs", self._samples("unknown_inputs"), model.names("d")),
@@ -289,10 +289,3 @@ def _needed(function: Callable[..., Any], unknown: int = 1) -> int:
         return unknown
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(p.kind in positional and p.default is p.empty for p in parameters)
-
-
-def _middle(lower: float, upper: float, nominal: float | None) -> float:
-    if nominal is not None:
-        return nominal
-    middle = (lower + upper) / 2.0
-    return middle if np.isfinite(middle) else 0.0

@@ -164,6 +164,16 @@ class Signal:
         """True when both bounds are finite."""
         return math.isfinite(self.lower) and math.isfinite(self.upper)
 
+    @property
+    def middle(self) -> float:
+        """The middle of the range, zero without one."""
+        return 0.5 * (self.lower + self.upper) if self.bounded else 0.0
+
+    @property
+    def usual(self) -> float:
+        """The nominal value, the middle of the range where none is declared."""
+        return self.middle if self.nominal is None else float(self.nominal)
+
 
 def one_line(text: Any, what: str, longest: int, **facts: Any) -> str:
     """Return a text that stands in titles and guarantees: one line of printable characters."""

@@ -15,8 +15,9 @@ import sympy as sp
 
 import obsynth as ob
 from methods import METHODS, observer_of
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.guard import HORIZON
-from obsynth.evaluate.truth import Call, Truth, dense
+from obsynth.evaluate.truth import Truth
 
 KINDS = ("glitch", "drop-out", "excursion", "fault jump", "burst")
 CALM = "calm"

@@ -53,7 +53,6 @@ def _cancelled(expression: sp.Expr, may_vanish: Callable[[sp.Expr], bool]) -> sp
 class Divisor:
     """A homogeneous linear form by which a term is divided.
 
-    form: the form: one signal, or a combination of several
     weights: position of every signal among states, then inputs, and its coefficient in the form.
         The term is (term / form) times the sum of weight times signal
     """
@@ -66,10 +65,7 @@ class Divisor:
 class Factorisation:
     """f = A x + B u + offset with matrices that depend on x and u.
 
-    A: state coefficients
-    B: input coefficients
-    offset: terms in which neither a state nor an input can be factored out
-    linear_A, linear_B: the part of A and B that comes from terms with a constant coefficient
+    ``linear_A`` and ``linear_B`` are what comes from terms with a constant coefficient.
     """
 
     A: sp.Matrix
@@ -175,11 +171,10 @@ def factorise(
 ) -> Factorisation:
     """Write every row as A(x, u) x + B(x, u) u + offset.
 
-    Every term goes to the first of its `divisors`: a state that is a factor (the row's own state
-    before others); an input that is a factor; the state in which it vanishes, for a term in one
-    state (sqrt(h) = (sqrt(h)/h) h); the homogeneous linear form through which alone it depends on
-    the states (two columns for phi(x1 - x3)); otherwise to the offset. `quasi_lpv` weighs all
-    choices against each other.
+    Every term goes to the first of its `divisors`, else to the offset: a state that is a factor
+    (the row's own first); an input that is; the state in which alone it stands and vanishes
+    (sqrt(h) = (sqrt(h)/h) h); the linear form through which alone it depends on the states (phi(x1
+    - x3)). `quasi_lpv` weighs all choices against each other.
     """
     n, n_u = len(states), len(inputs)
     columns, linear = sp.zeros(n, n + n_u), sp.zeros(n, n + n_u)

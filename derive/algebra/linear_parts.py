@@ -18,12 +18,7 @@ from obsynth.symbolic.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class LinearPart:
-    """A constant matrix, exactly and as doubles.
-
-    exact: exact entries
-    value: nearest doubles
-    rounding: bounds of |exact - value|; zero where the entry is a double
-    """
+    """A constant matrix, exactly and as doubles, with bounds of |exact - value|."""
 
     exact: sp.Matrix
     value: FloatArray
@@ -90,14 +85,12 @@ def constant_columns(
 class IdentityProof:
     """Proof that the parts of a split add up to the plant, row by row.
 
-    The matrices of the identity are exact: A and B are the rational numbers that their doubles
-    are, and g takes up the difference to the plant's own coefficients. D, B_f, W1, C and W2 belong
-    to signals that g must not contain, so they stay as the plant has them, and ``rounding``
-    bounds how far the doubles handed to a design are away.
+    A and B are the rational numbers that their doubles are, and g takes up the difference to the
+    plant's own coefficients. D, B_f, W1, C and W2 belong to signals that g must not contain, so
+    they stay as the plant has them.
 
-    methods: how every row of the dynamics, then every row of the outputs, was proved:
-        ``"syntactic"``, ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was
-        found
+    methods: how every row of the dynamics, then of the outputs, was proved: ``"syntactic"``,
+        ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was found
     rounding: bounds of |exact - double| for D, B_f, W1, C, W2, D_f
     """
 

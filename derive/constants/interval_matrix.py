@@ -21,13 +21,10 @@ MOST_SIGNS = 16
 
 @dataclass(frozen=True, eq=False)
 class IntervalExtreme:
-    """Largest eigenvalue or norm over an interval matrix.
+    """Largest eigenvalue or norm over an interval matrix: bounded, and attained at a member.
 
-    upper: guaranteed bound for every matrix of the interval
-    attained: guaranteed lower bound of the value at ``matrix``
-    matrix: A matrix of the interval where the value is ``attained``
-    exact: true when all sign matrices were looked at, so that only rounding lies between the two;
-        False for the cheap bound, centre plus norm of the radius
+    Exact when all sign matrices were looked at, so that only rounding lies between the two; else
+    the cheap bound, centre plus norm of the radius.
     """
 
     upper: float

@@ -8,8 +8,9 @@ import sympy as sp
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
 from obsynth.derive.constants.interval_matrix import augment
-from obsynth.derive.constants.matrix_maximum import EntryRanges, Hull, matrix_maximum
+from obsynth.derive.constants.matrix_maximum import Hull, matrix_maximum
 from obsynth.derive.errors import DerivationError
+from obsynth.derive.intervals.ranges import Ends
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
@@ -163,7 +164,7 @@ def _inner(ball: Maximum, shift: float) -> InnerBound:
     return InnerBound(beta, 2.0 * shift, ball.upper)
 
 
-def _known(bounds: JacobianBounds, entries: MatrixEntries, shift: int) -> EntryRanges:
+def _known(bounds: JacobianBounds, entries: MatrixEntries, shift: int) -> Ends:
     """Take the ranges of J over from its bounds; columns of the entries are moved by a shift."""
     index = [bounds.variables.index(name) for name in entries.names]
     at = [(i, j - shift) for i, j in entries.places]
@@ -171,12 +172,12 @@ def _known(bounds: JacobianBounds, entries: MatrixEntries, shift: int) -> EntryR
     points = np.nan_to_num(points).reshape(-1, 2, len(index))
     low = np.array([bounds.min[place] for place in at])
     high = np.array([bounds.max[place] for place in at])
-    return EntryRanges(low, high, points[:, 0], points[:, 1])
+    return Ends(low, high, points[:, 0], points[:, 1])
 
 
 def _halves(
     bounds: JacobianBounds, entries: MatrixEntries, exact: sp.Matrix, rtol: float, effort: str
-) -> EntryRanges:
+) -> Ends:
     """Ranges of the symmetric part; bounded anew only where two entries of J meet."""
     found = _known(bounds, entries, 0)
     meeting = []
@@ -196,7 +197,7 @@ def _halves(
         found.points_lower[k], found.points_upper[k] = ends
     if meeting:
         anew = entries.take(meeting)
-        ranges = EntryRanges.of(anew, rtol, effort, "(J + J')/2")
+        ranges = anew.ranges(rtol, effort, "(J + J')/2")
         columns = [entries.names.index(name) for name in anew.names]
         for row, k in enumerate(meeting):
             found.lower[k], found.upper[k] = ranges.lower[row], ranges.upper[row]

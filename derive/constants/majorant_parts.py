@@ -9,7 +9,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum
-from obsynth.derive.constants.matrix_maximum import EntryRanges, matrix_maximum
+from obsynth.derive.constants.matrix_maximum import matrix_maximum
 from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries, matrix_entries
 from obsynth.derive.rigour import rational, up
@@ -146,6 +146,6 @@ def largest_together(
         if i in rows
     }
     chosen = matrix_entries(scaled, entries.model)
-    ranges = EntryRanges.of(chosen, min(rtol, 1e-6), effort, "scaled dg/dx")
+    ranges = chosen.ranges(min(rtol, 1e-6), effort, "scaled dg/dx")
     norm = matrix_maximum(chosen, ranges, np.zeros((2 * n, 2 * n)), None, rtol, effort)
     return replace(norm, upper=norm.upper**2 * UP, attained=max(norm.attained, 0.0) ** 2 / UP)

@@ -9,7 +9,7 @@ from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum, largest_over_box
 from obsynth.derive.constants.interval_matrix import augment, eigenvalue_over_interval
 from obsynth.derive.constants.symmetric_field import SymmetricField
-from obsynth.derive.intervals.ranges import Status
+from obsynth.derive.intervals.ranges import Ends, Status
 from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.rigour import UNIT_ROUNDOFF, down, largest_eigenvalue, perron_bound, up
 from obsynth.symbolic.arrays import FloatArray
@@ -18,33 +18,8 @@ _TINY = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class EntryRanges:
-    """Guaranteed ranges of the entries of a matrix function, and where they are extreme.
-
-    lower, upper: the ranges
-    points_lower, points_upper: points with values near the ends, in the order of the variables of
-        the entries
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    points_lower: FloatArray
-    points_upper: FloatArray
-
-    @classmethod
-    def of(cls, entries: MatrixEntries, rtol: float, effort: str, what: str) -> "EntryRanges":
-        """Bound the entries of a matrix function over its box."""
-        found = entries.ranges(rtol, effort, what)
-        return cls(found.lower, found.upper, found.points_lower, found.points_upper)
-
-
-@dataclass(frozen=True, eq=False)
 class Hull:
-    """Matrices whose convex hull holds all values of a matrix function, up to a radius.
-
-    vertices: N = 0 where they are not known
-    radius: elementwise
-    """
+    """Matrices whose convex hull holds a matrix function, up to a radius; none if not known."""
 
     vertices: FloatArray
     radius: FloatArray
@@ -77,7 +52,7 @@ class Hull:
 
 def matrix_maximum(
     entries: MatrixEntries,
-    ranges: EntryRanges,
+    ranges: Ends,
     fixed: FloatArray,
     hull: Hull | None = None,
     rtol: float = 1e-6,
@@ -140,7 +115,7 @@ def _larger(a: Maximum, b: Maximum, rtol: float) -> Maximum:
 
 def _block(
     entries: MatrixEntries,
-    ranges: EntryRanges,
+    ranges: Ends,
     fixed: FloatArray,
     hull: Hull | None,
     block: list[int],

@@ -13,10 +13,8 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class FieldRange:
-    """What the matrices and their derivatives can be over a batch of boxes.
+    """Matrices and their derivatives over a batch of boxes: within centre +- radius.
 
-    centre, radius: the matrices lie within centre +- radius
-    slope_centre, slope_radius: so do their partial derivatives
     smooth: where the derivatives say how the matrices change over the box
     """
 
@@ -29,12 +27,10 @@ class FieldRange:
 
 @dataclass(frozen=True, eq=False)
 class SymmetricField:
-    """S(z) = fixed + sum over e of s_e(z) at (row_e, column_e) and its mirror image.
+    """S(z) = fixed + sum over e of s_e(z) at (row_e, column_e), row <= column, and its mirror.
 
-    problem: the expressions s_e with their gradients and the box
-    rows, columns: place of every expression, row <= column
-    fixed: symmetric part that does not depend on z
-    lower, upper: guaranteed ranges of the expressions over the whole box
+    The problem holds the expressions s_e with their gradients and the box, `lower` and `upper`
+    their guaranteed ranges over all of it.
     """
 
     problem: Problem

@@ -30,10 +30,8 @@ class Extended:
 
     plant: states (x, followed faults), inputs (u, measured scheduling), disturbances v; its rows
         are ``T0 F`` and ``f + step``
-    followed: names of the faults that are states
-    free: names of the unknown inputs and faults that are taken away
-    D0, L0, T0: exact matrices, shapes (N, k), (N, m), (N, N)
-    picked: outputs that L0 reads
+    followed, free: faults that are states; unknown inputs and faults that are taken away
+    D0, L0, T0: exact matrices, shapes (N, k), (N, m), (N, N); L0 reads the outputs ``picked``
     """
 
     plant: Plant

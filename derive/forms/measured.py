@@ -10,13 +10,7 @@ from obsynth.symbolic.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """An output that shows one state: y = scale * state + noise.
-
-    output: name of the output
-    state: the state
-    scale: exact factor, not zero
-    noise: disturbances in the output with their exact factors
-    """
+    """An output that shows one state: y = scale * state + noise, the scale exact and not zero."""
 
     output: str
     state: sp.Symbol
@@ -57,11 +51,7 @@ def known_signals(model: Plant) -> frozenset[str]:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A signal of the plant that is known at run time, exactly or up to two ends.
-
-    signal: the signal of the plant
-    ends: its lower and upper end, as functions of what is known; equal where it is known exactly
-    """
+    """A signal of the plant that lies between two functions of what is known at run time."""
 
     signal: sp.Symbol
     ends: tuple[sp.Expr, sp.Expr]

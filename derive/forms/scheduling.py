@@ -31,11 +31,7 @@ _PREFIXES = ("rho", "sigma", "zeta", "varrho")
 
 @dataclass(frozen=True, eq=False)
 class Lift:
-    """A secant that is bounded through the derivative whose mean it is.
-
-    signal: A symbol with the range of the derivative
-    meaning: the secant, in the signals of the plant
-    """
+    """A secant with a symbol that has the range of the derivative whose mean it is."""
 
     signal: Signal
     meaning: sp.Expr
@@ -45,13 +41,9 @@ class Lift:
 class SchedulingVariable:
     """A function of the signals on which matrices depend affinely, with its range.
 
-    symbol: what it is called; a signal that schedules by itself keeps its name
-    expression: the function of the plant's signals
-    lower, upper: guaranteed range over the box, rounded outwards
-    attained_lower, attained_upper: values that are reached
-    status: how good the range is
-    signals: signals it depends on
-    unmeasured: those of them whose values are not known on line
+    A signal that schedules by itself keeps its name as the symbol; the range over the box is
+    rounded outwards, its attained ends are reached, and of the signals those are listed that are
+    not known on line.
     """
 
     symbol: sp.Symbol
@@ -89,7 +81,6 @@ def _tidy(value: float) -> str:
 class AffineSchedule:
     """A matrix as constant + sum of variables times directions, exactly.
 
-    variables: the scheduling variables
     entries: every entry that is not zero, through positions in ``variables``
     methods: how every varying entry was proved to be affine
     exact: true when the variables depend on disjoint sets of signals, so that they take their

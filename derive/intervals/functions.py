@@ -166,30 +166,12 @@ def equal(a: Interval, b: Interval) -> Interval:
 
 def boundary_weight(a: Interval, b: Interval) -> Interval:
     """Share of a in the derivative of min(a, b): 1 where a < b, 0 where a > b, any at a tie."""
-    return np.where(a[1] < b[0], 1.0, 0.0), np.where(a[0] > b[1], 0.0, 1.0)
+    return less(a, b)[0], less_equal(a, b)[1]
 
 
 def logical_not(a: Interval) -> Interval:
     """Negate a truth value."""
     return np.where(a[1] == 0.0, 1.0, 0.0), np.where(a[0] > 0.0, 0.0, 1.0)
-
-
-def conjunction(a: Interval, b: Interval) -> Interval:
-    """Join two truth values by and."""
-    return np.minimum(a[0], b[0]), np.minimum(a[1], b[1])
-
-
-def disjunction(a: Interval, b: Interval) -> Interval:
-    """Join two truth values by or."""
-    return np.maximum(a[0], b[0]), np.maximum(a[1], b[1])
-
-
-def if_else_zero(condition: Interval, a: Interval) -> Interval:
-    """Return a where the condition holds, 0 elsewhere; the hull of both where it is open."""
-    true, false = condition[0] > 0.0, condition[1] == 0.0
-    lo = np.where(true, a[0], np.where(false, 0.0, np.minimum(a[0], 0.0)))
-    hi = np.where(true, a[1], np.where(false, 0.0, np.maximum(a[1], 0.0)))
-    return lo, hi
 
 
 def select(condition: Interval, a: Interval, b: Interval) -> Interval:

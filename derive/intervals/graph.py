@@ -35,11 +35,9 @@ class Node:
 
 @dataclass
 class Graph:
-    """Nodes in an order in which they can be evaluated, and the values of the constant ones.
+    """Nodes, operands before what is made of them, with the values of the constant ones.
 
-    nodes: operands always precede their node
-    constants: nodes that do not depend on the box, already evaluated
-    memory: what rewrites remember of nodes
+    What rewrites remember of nodes is their ``memory``.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -125,11 +123,7 @@ class _Step:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Ranges of the nodes that were asked for, over a batch.
-
-    table: lower and upper ends
-    row: row of every node that was asked for
-    """
+    """Ends of the ranges of the nodes that were asked for over a batch, with the row of each."""
 
     table: FloatArray
     row: dict[int, int]
@@ -141,11 +135,8 @@ class Values:
 
 
 class Schedule:
-    """Order of the nodes behind some outputs.
+    """Order of the nodes, operands first, behind those whose ranges are wanted.
 
-    graph: the nodes
-    live: nodes that are needed, operands first
-    wanted: nodes whose ranges are asked for
     breaks: for every output that is judged, the nodes under it that may jump or be undefined
     count: number of steps, each of them some calls of NumPy
     """

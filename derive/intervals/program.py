@@ -41,13 +41,9 @@ def constant_interval(value: float) -> tuple[float, float]:
 
 @dataclass
 class Program(Graph):
-    """A function of a box as a list of interval operations.
+    """A function of a box as a list of interval operations, see `from_casadi` and `enclose`.
 
-    n_variables: number of box variables
     outputs: node of every scalar output, in the order of the function's nonzeros
-
-    Build one with `Program.from_casadi`; evaluate it with
-    `obsynth.derive.intervals.program`.
     """
 
     n_variables: int = 0
@@ -143,7 +139,7 @@ class Program(Graph):
             self._breaks[output] = [
                 k
                 for k in self.decisive(output)
-                if self.nodes[k].op in PARTIAL | JUMPS and not self._divides_by_number(k)
+                if self.nodes[k].op in PARTIAL.keys() | JUMPS and not self._divides_by_number(k)
             ]
         return self._breaks[output]
 
@@ -176,9 +172,8 @@ class Program(Graph):
 class OutputRanges:
     """Ranges of outputs over a batch, and where their derivatives can be relied upon.
 
-    lower, upper: the ranges
-    rough: true where an operation under the output may jump or be undefined inside the box, so that
-        neither monotonicity nor the mean-value form says anything
+    An operation under a rough output may jump or be undefined in the box, so that neither
+    monotonicity nor the mean-value form says anything.
     """
 
     lower: FloatArray
@@ -209,22 +204,6 @@ def enclose(
     return OutputRanges(lo, hi, rough)
 
 
-_SENTENCES = {
-    "divide": "a division by an interval that contains zero",
-    "sqrt": "a square root of an interval that reaches below zero",
-    "nonnegative": "a square root of an interval that reaches below zero",
-    "log": "a logarithm of an interval that reaches zero",
-    "log1p": "a logarithm of an interval that reaches zero",
-    "power": "a power of an interval that reaches zero",
-    "power_const": "a fractional or negative power of an interval that reaches zero",
-    "tangent": "a tangent over a pole",
-    "asin": "an arc sine of an interval that leaves [-1, 1]",
-    "acos": "an arc cosine of an interval that leaves [-1, 1]",
-    "acosh": "an inverse hyperbolic cosine of an interval that reaches below 1",
-    "atanh": "an inverse hyperbolic tangent of an interval that reaches -1 or 1",
-}
-
-
 def first_failure(program: Program, lower: FloatArray, upper: FloatArray, output: int) -> str:
     """Name the first operation without a finite result in one box."""
     nodes = program.decisive(output)
@@ -233,5 +212,5 @@ def first_failure(program: Program, lower: FloatArray, upper: FloatArray, output
         node = program.nodes[index]
         finite = bool(np.isfinite(values.of(index)).all())
         if not finite and node.op != "input":
-            return _SENTENCES.get(node.op, f"an overflow in the operation {node.op!r}")
+            return PARTIAL.get(node.op, f"an overflow in the operation {node.op!r}")
     return "an unbounded box"

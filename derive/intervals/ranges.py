@@ -239,12 +239,7 @@ EFFORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """An expression without a finite bound.
-
-    index: which expression
-    operation: the first operation without a finite result
-    lower, upper: the sub-box where that happens
-    """
+    """An expression without a finite bound: the first operation without one, and the sub-box."""
 
     index: int
     operation: str
@@ -258,25 +253,32 @@ class Failure:
 
 
 @dataclass(frozen=True, eq=False)
-class Ranges:
-    """Guaranteed and attained ranges of m expressions of v variables.
+class Ends:
+    """Guaranteed ranges of m expressions of v variables, (m,), and where they are extreme, (m, v).
 
-    lower, upper (m,): guaranteed bounds, rounded outwards
+    points_lower, points_upper: points with values near the ends
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    points_lower: FloatArray
+    points_upper: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges(Ends):
+    """Guaranteed and attained ranges, rounded outwards.
+
     attained_lower, attained_upper (m,): values the expressions are guaranteed to reach or pass at
         ``points_lower`` and ``points_upper``, so that the true range lies between the two pairs
-    points_lower, points_upper (m, v): where
     gap (m,): guaranteed width minus attained width
     status_lower, status_upper, status: how good the bounds are; ``status`` is the worse of the two
     failures: expressions without a finite bound
     boxes, sweeps: work done
     """
 
-    lower: FloatArray
-    upper: FloatArray
     attained_lower: FloatArray
     attained_upper: FloatArray
-    points_lower: FloatArray
-    points_upper: FloatArray
     gap: FloatArray
     status_lower: list[Status]
     status_upper: list[Status]
@@ -343,10 +345,10 @@ def _ranges(problem: Problem, outcome: Outcome) -> Ranges:
     return Ranges(
         0.0 - outcome.bound[0::2],
         outcome.bound[1::2] + 0.0,
-        0.0 - outcome.attained[0::2],
-        outcome.attained[1::2],
         outcome.points[0::2],
         outcome.points[1::2],
+        0.0 - outcome.attained[0::2],
+        outcome.attained[1::2],
         gap.sum(axis=1),
         [pair[0] for pair in status],
         [pair[1] for pair in status],

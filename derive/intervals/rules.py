@@ -120,9 +120,9 @@ RULES: dict[str, Callable[..., Interval]] = {
     "equal": fn.equal,
     "boundary_weight": fn.boundary_weight,
     "logical_not": fn.logical_not,
-    "conjunction": fn.conjunction,
-    "disjunction": fn.disjunction,
-    "if_else_zero": fn.if_else_zero,
+    "conjunction": ar.minimum,
+    "disjunction": ar.maximum,
+    "if_else_zero": lambda condition, a: fn.select(condition, a, ar.point(0.0)),
     "select": fn.select,
 }
 
@@ -130,23 +130,24 @@ COMMUTATIVE = frozenset(
     {"add", "multiply", "minimum", "maximum", "equal", "conjunction", "disjunction", "hypotenuse"}
 )
 
-PARTIAL = frozenset(
-    {
-        "divide",
-        "sqrt",
-        "nonnegative",
-        "log",
-        "log1p",
-        "power",
-        "power_const",
-        "tangent",
-        "asin",
-        "acos",
-        "acosh",
-        "atanh",
-    }
-)
-"""Operations that are not defined everywhere."""
+_ROOT = "a square root of an interval that reaches below zero"
+_LOGARITHM = "a logarithm of an interval that reaches zero"
+
+PARTIAL = {
+    "divide": "a division by an interval that contains zero",
+    "sqrt": _ROOT,
+    "nonnegative": _ROOT,
+    "log": _LOGARITHM,
+    "log1p": _LOGARITHM,
+    "power": "a power of an interval that reaches zero",
+    "power_const": "a fractional or negative power of an interval that reaches zero",
+    "tangent": "a tangent over a pole",
+    "asin": "an arc sine of an interval that leaves [-1, 1]",
+    "acos": "an arc cosine of an interval that leaves [-1, 1]",
+    "acosh": "an inverse hyperbolic cosine of an interval that reaches below 1",
+    "atanh": "an inverse hyperbolic tangent of an interval that reaches -1 or 1",
+}
+"""Operations that are not defined everywhere, with what is wrong where they are not."""
 
 JUMPS = frozenset(
     {

@@ -39,15 +39,8 @@ _SHORT = 60
 class MatrixEntries:
     """Entries that are not identically zero, as functions of the signals they depend on.
 
-    exact: exact expressions, in the order of everything else here
-    values: the same, with numbers as symbols in ``constants``
-    variables: signals that occur; the first state where none does
-    names, symbols: their names and SymPy symbols
-    box: their ranges
-    constants: symbols that stand for numbers
-    constant_box: their enclosures
-    model: whose signals they are
-    quotients: what further symbols in the values stand for
+    ``values`` are the ``exact`` ones, numbers as symbols in ``constants``; where no signal occurs,
+    ``variables`` holds the first state. Further symbols in the values stand for ``quotients``.
     """
 
     exact: dict[Entry, sp.Expr]

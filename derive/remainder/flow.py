@@ -87,11 +87,10 @@ class FlowError(DerivationError):
 def flow_box(dynamics: System, step: float) -> tuple[FloatArray, FloatArray]:
     """Enclose all solutions over one step that start in the box.
 
-    A candidate box Y holds them when, for every state and both sides, Y reaches further out than
-    the rate on the slab between the box and Y can carry within a step: a solution that left Y
-    first through the upper face of state i would have spent the time since it last was at the
-    upper face of the box inside that slab, and would not have come far enough. Only rates on the
-    slabs count, so that a box into which the flow points hardly grows.
+    A candidate Y holds them when, for every state and both sides, Y reaches further out than the
+    rate on the slab between the box and Y can carry within a step: a solution that left Y first
+    through the upper face of state i would have spent the time since it last was at the upper face
+    of the box inside that slab. So a box into which the flow points hardly grows.
     """
     n = len(dynamics.names)
     low, high = dynamics.lower[:n], dynamics.upper[:n]

@@ -10,8 +10,8 @@ from obsynth.derive.errors import DerivationError, UnboundedError
 from obsynth.derive.intervals.program import Program, enclose
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges
 from obsynth.derive.intervals.rules import JUMPS
-from obsynth.derive.rigour import enclose_number
-from obsynth.symbolic.arrays import FloatArray
+from obsynth.derive.rigour import Interval, enclose_number
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 from obsynth.symbolic.discretise import Step, composed
 from obsynth.symbolic.plant import Plant
 
@@ -20,15 +20,10 @@ _HELD = ("u", "d", "f", "w", "p", "rho")
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """dx/dt = f(x, v) with v held over a step.
+    """dx/dt = f(x, v) with v held over a step, s the time within it.
 
-    x, v, s: states, held signals that occur, and the time within a step
-    rhs: f
-    names, held: names of states and held signals
-    lower, upper: the box
-    constants: constants of the plant
-    constant_box: their enclosures
-    rates: how fast held signals may move after all, per second; 0 where they do not
+    v: the held signals that occur
+    rates: how fast these may move after all, per second; 0 where they do not
     """
 
     x: ca.SX
@@ -90,10 +85,14 @@ class System:
         program = self.program(column)
         outputs = range(len(program.outputs))
         jumps = any(program.nodes[k].op in JUMPS for o in outputs for k in program.breaks(o))
-        if not jumps:
-            return False
-        found = enclose(program, box[:, :1], box[:, 1:], outputs, len(outputs))
-        return bool(found.rough.any())
+        return jumps and bool(self.rough(column, (box[:, :1], box[:, 1:])).any())
+
+    def rough(self, column: ca.SX, boxes: Interval) -> BoolArray:
+        """Where an expression may jump or be undefined, over a batch of boxes."""
+        program = self.program(column)
+        outputs = range(len(program.outputs))
+        found = enclose(program, *boxes, outputs, len(outputs))
+        return np.asarray(found.rough.any(axis=0))
 
 
 def system(

@@ -7,13 +7,13 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.errors import UnboundedError
-from obsynth.derive.intervals.program import enclose, evaluate
+from obsynth.derive.intervals.program import evaluate
 from obsynth.derive.remainder.flow import PIECES, flow_box, flow_tubes, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.system import System, step_derivatives, time_derivatives
 from obsynth.derive.remainder.trees import difference_term
 from obsynth.derive.rigour import Interval, enclose_number, up
 from obsynth.derive.rigour.interval import add, multiply, subtract
-from obsynth.symbolic.arrays import BoolArray, FloatArray
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.discretise import Step
 
 _QUARTERS = 4
@@ -35,13 +35,9 @@ def _interval(pair: tuple[float, float]) -> Interval:
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """One plant, method and step, with the box that solutions stay in until every quarter.
+    """One plant, method and step, with flow boxes until the end of every quarter of the step.
 
-    dynamics: the plant
-    formula: the formula of the step
-    Ts: sampling time
-    flows: flow boxes until the end of every quarter of the step
-    effort: how many pieces hulls are made of
+    The effort says how many pieces hulls are made of.
     """
 
     dynamics: System
@@ -186,17 +182,9 @@ class Work:
         for part in range(_PARTS):
             index = slice(part * count, (part + 1) * count)
             total = add(total, (parts[0][:, index], parts[1][:, index]))
-        kinked = _rough(dynamics, self.along(level - 1), tube)
-        kinked |= _rough(dynamics, self.of_step(level - 1), line)
+        kinked = dynamics.rough(self.along(level - 1), tube)
+        kinked |= dynamics.rough(self.of_step(level - 1), line)
         unknown = (
             kinked.reshape(_PARTS, count).any(axis=0) | np.isnan(total[0]) | np.isnan(total[1])
         )
         return np.where(unknown, -np.inf, total[0]), np.where(unknown, np.inf, total[1])
-
-
-def _rough(dynamics: System, column: ca.SX, boxes: Interval) -> BoolArray:
-    """Where an expression may jump or be undefined, over a batch of boxes."""
-    program = dynamics.program(column)
-    outputs = range(len(program.outputs))
-    found = enclose(program, boxes[0], boxes[1], outputs, len(outputs))
-    return np.asarray(found.rough.any(axis=0))

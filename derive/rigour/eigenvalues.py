@@ -24,10 +24,8 @@ def finite(matrices: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class Rotation:
-    """A batch of symmetric matrices seen in the basis of their approximate eigenvectors.
+    """Symmetric matrices A seen in the basis Q of their approximate eigenvectors, values ascending.
 
-    values: approximate eigenvalues, ascending
-    vectors: approximate eigenvectors Q as columns
     error: bound of the norm of Q'AQ - diag(values), radius of A included
     defect: bound of the norm of Q'Q - I, below 1/2; infinite where LAPACK gave nothing of use
     """

@@ -188,9 +188,8 @@ _CHUNK_ENTRIES = 2**17
 
 @dataclass(frozen=True, eq=False)
 class ProofResult:
-    """Which matrices are proved positive definite, and by how much.
+    """Which enclosures hold positive definite matrices only, and by how much.
 
-    proved: true only where every matrix of the enclosure is positive definite
     margin: guaranteed lower bound of the smallest eigenvalue; -inf where nothing is proved
     relative: the same after scaling the diagonal to about one: compare vertices by this
     """

@@ -90,11 +90,11 @@ def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
 def allowance(precision: str, n: int, product: float = 0.0) -> float:
     """Return what the rounding of one step may be, relative to the size of its terms.
 
-    What is added to a bound is this share of the sum of the magnitudes of all its terms, so that
-    cancellation does not matter. Making the terms takes at most 24 roundings one after the other;
-    every factor Q = I + M / mu of a transition over h 16 for its entries and n for the product, and
-    the terms with j factors have the weight of a Poisson variable with mean h mu, the `product`,
-    so that h mu factors count. Twice that, and 2^-42 in double precision.
+    What is added to a bound is this share of the sum of the magnitudes of all its terms. Making
+    these takes at most 24 roundings one after the other; every factor Q = I + M / mu of a
+    transition over h 16 for its entries and n for the product, and terms with j factors have the
+    weight of a Poisson variable with mean h mu, the `product`. Twice that, and 2^-42 in double
+    precision.
     """
     count = 2.0 * (24.0 + (16.0 + n) * (1.0 + product))
     return max(count * UNIT[precision], 2.0**-42)
@@ -233,11 +233,7 @@ def point(value: float) -> Interval:
 
 
 def widen(a: Interval, ulps: int) -> Interval:
-    """Push both ends outwards by a number of units in the last place.
-
-    An infinite end stands for numbers without limit, never for infinity itself: what overflows is
-    at least about the largest double.
-    """
+    """Push both ends outwards by a number of units in the last place; what overflows is large."""
     lo, hi = np.minimum(a[0], _MOST), np.maximum(a[1], -_MOST)
     return down(lo - ulps * _EPS * np.abs(lo)), up(hi + ulps * _EPS * np.abs(hi))
 
@@ -301,24 +297,25 @@ def _corners(operation: Callable[..., FloatArray], a: Interval, b: Interval) -> 
     return lo, hi
 
 
-def multiply(a: Interval, b: Interval) -> Interval:
-    """Return a * b for independent operands."""
+def _rounded_corners(operation: Callable[..., FloatArray], a: Interval, b: Interval) -> Interval:
+    """Step the corners outwards, but for zeros that no signs of the operands leave."""
     (al, ah), (bl, bh) = a, b
-    lo, hi = _corners(np.multiply, a, b)
+    lo, hi = _corners(operation, a, b)
     return (
         _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
         _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),
     )
 
 
+def multiply(a: Interval, b: Interval) -> Interval:
+    """Return a * b for independent operands."""
+    return _rounded_corners(np.multiply, a, b)
+
+
 def divide(a: Interval, b: Interval) -> Interval:
     """Return a / b; a divisor with zero at one end gives a half line, with zero inside nothing."""
     (al, ah), (bl, bh) = np.broadcast_arrays(*a), np.broadcast_arrays(*b)
-    lo, hi = _corners(np.divide, (al, ah), (bl, bh))
-    lo, hi = (
-        _keep_zero(lo, down(lo), lambda: ((al < 0) & (bh > 0)) | ((ah > 0) & (bl < 0))),
-        _keep_zero(hi, up(hi), lambda: ((ah > 0) & (bh > 0)) | ((al < 0) & (bl < 0))),
-    )
+    lo, hi = _rounded_corners(np.divide, (al, ah), (bl, bh))
     singular = (bl <= 0.0) & (bh >= 0.0)
     if not singular.any():
         return lo, hi
@@ -356,8 +353,7 @@ def power_int(a: Interval, n: int) -> Interval:
 def _squares_exactly(value: FloatArray) -> BoolArray:
     """Whether a square needs no rounding: up to 24 significant bits, far from under- and overflow.
 
-    Ends of boxes are such numbers more often than not, and 1 - x**2 has to be 0 at x = 1 for a root
-    of it to be defined.
+    1 - x**2 has to be 0 at x = 1 for a root of it to be defined.
     """
     with np.errstate(over="ignore"):
         short = value.astype(np.float32) == value

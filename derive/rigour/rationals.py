@@ -8,7 +8,7 @@ elimination over the integers; arrays of rationals (`exact`) have the operators 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -219,18 +219,17 @@ def exact(values: Any) -> Exact:
 
 def nearest(values: Exact) -> FloatArray:
     """Return the nearest doubles."""
-    result = np.zeros(values.shape)
-    for place, value in np.ndenumerate(values):
-        result[place] = float(_fraction(value))
-    return result
+    return _each(float, values)
 
 
 def above(values: Exact) -> FloatArray:
     """Return the smallest doubles that are not below the values."""
-    result = np.zeros(values.shape)
-    for place, value in np.ndenumerate(values):
-        result[place] = smallest_above(_fraction(value))
-    return result
+    return _each(smallest_above, values)
+
+
+def _each(rounding: Callable[[Fraction], float], values: Exact) -> FloatArray:
+    found = [rounding(_fraction(value)) for value in values.ravel()]
+    return np.array(found, dtype=float).reshape(values.shape)
 
 
 def inverse(matrix: Exact) -> Exact:

@@ -17,12 +17,10 @@ _RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Decoupling:
-    """Matrices that remove the unknown input from the estimation error.
+    """Matrices that remove the unknown input from the estimation error: E of eq. (13), as stored.
 
-    E: eq. (13), as stored
-    T: ``I + E C`` rounded to doubles
-    Pi: ``I + C E`` rounded to doubles
-    rank: rank of D and of C D: the number q of unknown inputs
+    T and Pi are ``I + E C`` and ``I + C E`` rounded to doubles, the rank is that of D and of C D.
+
     residual: largest entry of ``|(I + E C) D|`` for the stored doubles, computed exactly: 0 where
         the decoupling is exact
     projector: whether ``I + E C`` of the stored doubles is exactly a projector and equal to `T`
@@ -141,9 +139,7 @@ _MODE_TOLERANCE = 1e-9
 class Detectability:
     """Outcome of the test of Popov, Belevitch and Hautus at every vertex.
 
-    vertices: number of vertices tested
-    margin: smallest singular value found, with the columns scaled to norm one; 1 when no vertex has
-        a mode that does not decay by itself
+    margin: smallest singular value, with columns of norm one; 1 when every mode decays by itself
     hidden_modes: modes that no output sees at some vertex but that decay, the slowest last
     """
 
@@ -268,10 +264,8 @@ class WeakestMember:
     """The member of a Jacobian family that is hardest to observe, as far as a search finds it.
 
     margin: smallest singular value of [z I - A; C] with columns of size one, over the modes z that
-        do not decay
-    scalars: the scalars of the family there
-    matrix: the Jacobian there
-    mode: the mode; None when all modes decay by themselves everywhere
+        do not decay; there are the scalars, the matrix and the mode, None when all modes decay
+        everywhere
     members: how many were looked at
     """
 

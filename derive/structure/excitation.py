@@ -20,12 +20,10 @@ _MOST_POINTS = 6
 
 @dataclass(frozen=True, eq=False)
 class FaultEffect:
-    """How a fault enters: the derivative of dynamics and outputs by it, at fault zero.
+    """How a fault enters: the derivative of dynamics, then outputs, by it, at fault zero.
 
-    fault: its name
-    column: the derivative, dynamics first
     depends_on: signals that occur in it; empty for an additive fault
-    floor: guaranteed lower bound of the norm of the column over the box; None without finite ranges
+    floor: guaranteed lower bound of its norm over the box; None without finite ranges
     at: where the norm is smallest, as far as found
     """
 
@@ -69,11 +67,6 @@ class Excitation(Shown):
     visible_at_rest: int
     points: int | None
     limit: int
-
-    @property
-    def identifiable(self) -> bool:
-        """True when some excitation identifies all faults together."""
-        return self.points is not None
 
     @property
     def condition(self) -> str:

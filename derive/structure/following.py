@@ -12,7 +12,6 @@ from obsynth.derive.forms.extended import Extended, extend
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
-from obsynth.symbolic.signals import Signal
 
 RTOL = 1e-3
 """Of the bounds of the joint Jacobian."""
@@ -25,10 +24,7 @@ _HIDDEN = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """An extended plant, its joint Jacobian, and what is made of every fault.
-
-    reasons: why a fault is not followed, by its name
-    """
+    """An extended plant, its joint Jacobian, and why faults that are not followed are not."""
 
     extended: Extended
     bounds: JacobianBounds
@@ -121,7 +117,7 @@ def hidden_somewhere(extended: Extended) -> str | None:
     signals, v = (*plant.x, *plant.u, *plant.w), ca.vertcat(sx.x, sx.u, sx.w)
     J = ca.densify(ca.jacobian(ca.vertcat(sx.rhs, sx.y), ca.vertcat(sx.x, sx.w)))
     function, matters = ca.Function("J", [v], [J]), ca.which_depends(ca.vec(J), v, 1, False)
-    ends = [(_middle(s), s.lower, s.upper) if s.bounded else (0.0,) * 3 for s in signals]
+    ends = [(s.usual, s.lower, s.upper) if s.bounded else (0.0,) * 3 for s in signals]
     free = [k for k, s in enumerate(signals) if s.bounded and matters[k]]
     for pick in product(range(3), repeat=min(len(free), MOST_FREE)):
         at = {k: ends[k][place] for k, place in zip(free, pick, strict=False)}
@@ -136,10 +132,6 @@ def hidden_somewhere(extended: Extended) -> str | None:
                 f"gain serves there; measure {names[0]}, or narrow a range that this point is in"
             )
     return None
-
-
-def _middle(s: Signal) -> float:
-    return 0.5 * (s.lower + s.upper) if s.nominal is None else float(s.nominal)
 
 
 def _pair(

@@ -25,12 +25,7 @@ _POINTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Frozen:
-    """Derivatives of right-hand side and outputs at one point, without faults.
-
-    A, D, B_f: by states, unknown inputs and faults
-    C, C_d, D_f: the same of the outputs
-    point: where
-    """
+    """Derivatives of rows and outputs at one point, by states, unknown inputs and faults."""
 
     A: sp.Matrix
     D: sp.Matrix
@@ -42,11 +37,7 @@ class Frozen:
 
 
 def original(model: Plant) -> Plant:
-    """Return the continuous plant a model was discretised from, or the model itself.
-
-    What can be told apart does not depend on the discretisation, and the equations of a
-    Runge-Kutta step are long.
-    """
+    """Return the continuous plant behind a model, whose equations are shorter, or itself."""
     return model.continuous or model
 
 

@@ -36,11 +36,9 @@ _MOST_VERTICES = 512
 
 @dataclass(frozen=True)
 class Check:
-    """One line of a report.
+    """One line of a report: what was looked at, whether it passed, and what was found.
 
-    title: what was looked at
-    passed: outcome; None for a line that only informs, or that could not be reached
-    text: what was found, with names and numbers
+    It is None for a line that only informs, or that could not be reached.
     """
 
     title: str
@@ -50,12 +48,9 @@ class Check:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StructureReport(Shown):
-    """What the structure of a plant allows, line by line.
+    """What the structure of a plant allows, line by line, in the order in which a design needs it.
 
-    plant: name of the plant
-    checks: in the order in which a design needs them
-    split: the split, where there is one
-    bounds: the Jacobian bounds, where there are
+    Split and Jacobian bounds stand beside the lines, where there are any.
     """
 
     plant: str

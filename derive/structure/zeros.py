@@ -116,12 +116,9 @@ def _reduce(
 class PolytopeZeros(Shown):
     """Zeros from some signals to the outputs, at every vertex of the Jacobian family.
 
-    signals: the inputs of the system: unknown inputs, or these and the faults
-    zeros: at every vertex
     worst: the zero that decays least: largest modulus, or real part in continuous time
     decays: true when all of them decay, so that no motion of the signals can go on without a trace
         in the outputs
-    vertex: where the worst one was found
     """
 
     signals: tuple[str, ...]

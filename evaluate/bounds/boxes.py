@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.backward import contract
 from obsynth.designs.core.lifted import lift
 from obsynth.designs.core.limits import FAR
 from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.evaluate.bounds.problem import Problem
-from obsynth.evaluate.truth import Call, dense
 from obsynth.symbolic.arrays import FloatArray
 
 PASSES = 3

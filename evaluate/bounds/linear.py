@@ -31,9 +31,8 @@ _TOLERANCES = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
 class Solution:
     """What a linear program says.
 
-    value: of the objective by the solver, infinite where it found no point
+    value: by the solver, infinite where it found no point
     certified: what the objective is proved not to be below; infinite: proved to have no point
-    z, multipliers: of variables and rows
     """
 
     value: float

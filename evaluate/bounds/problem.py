@@ -27,13 +27,10 @@ Groups = Mapping[str, Sequence[str]]
 class Problem:
     """A record, a plant, and what of it may vary.
 
-    plant: discrete
     u, y: inputs with measured scheduling, and readings, NaN where there is none; (N, n_u), (N, m)
     groups: names of the disturbances that share a bound
-    group: of every disturbance, (n_w,)
-    shape, middle: of every disturbance, (n_w,)
-    box: ranges of v, (n_v, 2); those of the disturbances play no part
-    names: of v
+    group, shape, middle: of every disturbance, (n_w,)
+    box: ranges of v, (n_v, 2), by names; those of the disturbances play no part
     smallest: what the bounds of groups are at least, (n_groups,); 0 by default
     first: ends of the states at the first instant, (n, 2), where they are known better
     """
@@ -139,7 +136,7 @@ def pose(
     box = np.array([(0.0, 0.0) if s.name in held else (s.lower, s.upper) for s in kinds])
     for k, s in enumerate(kinds):
         if wanted is not None and s in plant.p and s.name not in wanted:
-            box[k] = 0.5 * (s.lower + s.upper) if s.nominal is None else s.nominal
+            box[k] = s.usual
     return Problem(
         plant,
         known,

@@ -14,10 +14,9 @@ CLOSED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What could have happened.
+    """What could have happened, v (N, n_v).
 
     bounds: that it needs, (n_groups,); infinite where none was found that meets the equations
-    v: (N, n_v)
     gap: by how much the equations and rates are not met, at most
     """
 
@@ -55,9 +54,8 @@ def explain(
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """A search among the trajectories of a problem.
+    """A search among the trajectories of a problem, v (n_v, N).
 
-    v: (n_v, N)
     zeros: what is zero of a trajectory that agrees with the readings
     off: disturbances less their middles, (n_w N,), one instant after the other
     rates: what is not positive of faults with a rate

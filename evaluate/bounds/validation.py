@@ -18,10 +18,8 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Tabled):
-    """Factors of the bounds that single windows of the record need.
+    """Factors of the bounds that single windows of the record need, (n,): attained, certified.
 
-    factors (n,): attained, by window
-    certified (n,): no window needs less
     free: number of bounds and parameters that were fitted
     """
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.codegen.kernel import dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.campaigns.facts import Job, Row
@@ -16,7 +17,6 @@ from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.progress import bar
 from obsynth.evaluate.run import percent
-from obsynth.evaluate.truth import dense
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes

@@ -19,10 +19,9 @@ class ExtendedKalman:
 
     Bounded signals of half range r have the variance r^2 / 3 of a uniform one; a fault is a random
     walk with steps of the standard deviation of its rate, of its half range where it may jump. An
-    unbounded signal has for half range what moves some state through its own. Parameters have
-    their nominal values. What is estimated at an instant is (x, f, the f before, d, w), so that
-    noise may enter dynamics and readings alike; faults are told one call late. Covariances are in
-    units of half ranges.
+    unbounded signal has for half range what moves some state through its own. What is estimated at
+    an instant is (x, f, the f before, d, w), in units of half ranges, so that noise may enter
+    dynamics and readings alike; faults are told one call late.
     """
 
     method = "extended Kalman filter, 3 sigma"

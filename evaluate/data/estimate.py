@@ -6,6 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import scheduling_columns, step_function
@@ -13,7 +14,7 @@ from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.trace import as_told
-from obsynth.evaluate.truth import Call, dense, sample_time
+from obsynth.evaluate.truth import sample_time
 from obsynth.symbolic import Plant, Record, read_record
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.scenarios import gentle

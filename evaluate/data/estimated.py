@@ -27,9 +27,8 @@ from obsynth.symbolic.table import Table, text
 
 @dataclass(frozen=True)
 class Refutation:
-    """Where a record and the assumptions of an observer cannot both be right.
+    """Where a record and the assumptions of an observer cannot both be right, first, and why.
 
-    instant, time: the first such instant, in rows of the record and in seconds
     signals: the readings each of which makes the instant void; else the signals whose sets miss
         their declared ranges. Empty where no single reading does
     """

@@ -132,7 +132,7 @@ class Study(Shown):
         names = {"t": _TIME, **outputs}
         said = []
         for signal in getattr(plant, kind):
-            value = _nominal(signal) if kind in ("u", "rho") else 0.0
+            value = signal.usual if kind in ("u", "rho") else 0.0
             text = given.get(signal.name, repr(value))
             said.append(self.told.expression((*path, signal.name), text, names))
         time, y = ca.SX.sym("t"), ca.SX.sym("y", len(outputs))
@@ -145,7 +145,7 @@ class Study(Shown):
         plant, path = self.model, ("scenario", field)
         given = self.told.table(path, self.told.data["scenario"].get(field, {}))
         self.told.known(path, given, plant.names("x"))
-        return np.array([float(given.get(s.name, _nominal(s))) for s in plant.x])
+        return np.array([float(given.get(s.name, s.usual)) for s in plant.x])
 
     @cached_property
     def record(self) -> Record | None:
@@ -225,8 +225,3 @@ def _is_method(kind: Any) -> bool:
 
 def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
-
-
-def _nominal(signal: Any) -> float:
-    middle = 0.5 * (signal.lower + signal.upper) if signal.bounded else 0.0
-    return middle if signal.nominal is None else float(signal.nominal)

@@ -88,10 +88,6 @@ def _about(plant: Plant, kind: str, share: float) -> tuple[FloatArray, FloatArra
     bounded = np.array([s.bounded for s in signals], dtype=bool)
     low, high = np.where(bounded[:, None], box, 0.0).T
     half = share * 0.5 * (high - low)
-    given = [s.nominal for s in signals]
-    middle = [
-        0.0 if kind == "f" else 0.5 * (a + b) if v is None else float(v)
-        for v, a, b in zip(given, low, high, strict=True)
-    ]
+    middle = [0.0 if kind == "f" else s.usual for s in signals]
     kept = np.where(bounded, np.clip(middle, low + half, high - half), middle)
     return np.asarray(kept, dtype=float), half

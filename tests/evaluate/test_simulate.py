@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from obsynth.codegen.kernel import dense
 from obsynth.evaluate import SimulationError, simulate
-from obsynth.evaluate.truth import dense
 from obsynth.symbolic import Plant
 
 CLAIMS = ("xhat", "fhat", "x_lower", "x_upper", "f_lower", "f_upper")

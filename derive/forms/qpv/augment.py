@@ -18,12 +18,10 @@ from obsynth.symbolic.signals import Role, Signal
 class Augmented:
     """A plant whose chosen faults are states that do not change.
 
-    model: the plant
-    states: its states, then the faults and losses that became states
-    faults: faults that stayed what they were
-    rows: right-hand sides, constants as numbers; zero (continuous time) or the fault itself
-        (discrete time) for an added state
-    outputs: the outputs, constants as numbers
+    states: its states, then the faults and losses that became states; `faults` stayed what they
+        were
+    rows, outputs: with constants as numbers; zero (continuous time) or the fault itself (discrete
+        time) for an added state
     """
 
     model: Plant

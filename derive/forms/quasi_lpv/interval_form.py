@@ -17,10 +17,8 @@ from obsynth.symbolic.shown import Shown
 class Ranging:
     """How ranges of the entries of a form are found.
 
-    matrix: the stacked matrix with symbols in place of the lifted secants
-    lifts: these symbols, with the ranges of the derivatives whose means they are
-    rtol: wanted gap
-    effort: of the interval engine
+    In the stacked matrix symbols stand for the lifted secants: ``lifts``, with the ranges of the
+    derivatives whose means they are.
     """
 
     matrix: sp.Matrix

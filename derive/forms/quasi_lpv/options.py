@@ -17,11 +17,9 @@ _JUMPS = (sp.Piecewise, sp.atan2, sp.floor, sp.ceiling, sp.Mod, sp.sign, sp.Heav
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """What a term contributes to one column.
+    """What a term contributes to one column: a coefficient, by the position of its signal.
 
-    position: of the signal, among states, then inputs
-    coefficient: its coefficient
-    slope: A derivative of the term. The coefficient is its mean along a way to the centre, so a
+    slope: a derivative of the term. The coefficient is its mean along a way to the centre, so a
         range of the slope over a box that holds the centre is one of the coefficient; None where
         the term has no such derivative
     moving: signals that change along this way; the others stay where they are
@@ -42,10 +40,8 @@ class Share:
 
 @dataclass(frozen=True, eq=False)
 class Option:
-    """One way to write a term: the sum of coefficient times signal, plus a rest.
+    """One way to write a term: the sum of coefficient times signal, plus a rest for the offset.
 
-    shares: coefficients of the signals
-    rest: what stays in the offset: the value at the centre, or all of a term without an option
     text: what the term is divided by: ``"x2"``, ``"x1 - x3"``, or signals one after the other,
         ``"x1, x2"``, for a telescoped secant
     """

@@ -120,12 +120,11 @@ _TIE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One way to write a row.
+    """One way to write a row: terms with a choice, and what they are divided by.
 
-    choices: terms with a choice and what they are divided by
     inflation: velocity inflation of the row; inf where a range is missing
     unmeasured: signals in the coefficients whose values are not known on line
-    score: what alternatives are ordered by: the inflation, with a penalty for unmeasured signals
+    score: the inflation with a penalty for these
     """
 
     choices: tuple[tuple[str, str], ...]
@@ -146,12 +145,10 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class RowRanking:
-    """The ways to write a row, the chosen one first.
+    """The ways to write a row, the chosen one first, then the others in order of their scores.
 
-    row: name of the state or output
-    alternatives: the chosen one, then the others in order of their scores; scores that differ by no
-        more than 2 % are equal, and the structurally simpler way is taken
-    total: how many ways there are; more than listed where there are many
+    Scores that differ by no more than 2 % are equal, and the structurally simpler way is taken. Of
+    many ways (``total``) not all are listed.
     """
 
     row: str

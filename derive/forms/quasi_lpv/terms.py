@@ -110,10 +110,8 @@ def decide_signs(rows: Sequence[sp.Expr], model: Plant, centre: Centre) -> list[
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An additive term of a row, in deviations from the centre.
+    """An additive term of a row among states, then outputs; symbols stand for deviations.
 
-    row: row among states, then outputs
-    expression: the term; the symbols stand for deviations from the centre
     options: how it can be written, the structurally preferred one first; never empty
     reason: why nothing but the offset is left for it; empty otherwise
     """

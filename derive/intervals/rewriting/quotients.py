@@ -23,13 +23,11 @@ from obsynth.derive.intervals.program import Program
 
 @dataclass(frozen=True, eq=False)
 class Quotient:
-    """One quotient N(z)/z**m.
+    """One quotient N(z)/z**m, m the order, at least 1.
 
     argument: z, in the variables, the constants and the symbols of earlier quotients
-    numerator: N, in ``symbol`` and the constants; smooth, with its first m derivatives (counting
-        itself) zero where ``symbol`` is
-    symbol: what stands for z in the numerator
-    order: m, at least 1
+    numerator: N, in ``symbol`` for z and the constants; smooth, with its first m derivatives
+        (counting itself) zero where ``symbol`` is
     """
 
     argument: ca.SX

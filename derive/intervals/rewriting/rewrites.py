@@ -19,10 +19,8 @@ _DEEP = 6
 
 @dataclass
 class Factors:
-    """A node as a product.
+    """A node as a product: a number (sign and power of two), and factors by twice their exponents.
 
-    number: sign and power of two
-    halves: twice the exponent of every factor
     roots: factors of which a root is taken, so that they may not be negative
     constants: nodes that do not depend on the box, with 1 above the line and -1 below. They never
         cancel: equal enclosures may stand for numbers that differ

@@ -7,7 +7,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from obsynth.derive.intervals.program import Program, enclose
+from obsynth.derive.intervals.program import OutputRanges, Program, enclose
 from obsynth.derive.rigour import up
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
@@ -18,12 +18,7 @@ _COST_CALL, _COST_NODE, _COST_BOX = 110.0, 2.0, 0.011
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """CasADi expressions behind a program.
-
-    column: the expressions
-    variables, extra: symbols of the box and of the constants
-    constant_box: enclosures of the constants
-    """
+    """CasADi expressions behind a program, of the symbols of the box and enclosed constants."""
 
     column: ca.SX
     variables: ca.SX
@@ -31,25 +26,8 @@ class Source:
     constant_box: list[tuple[float, float]]
 
 
-@dataclass(frozen=True, eq=False)
-class EntryRanges:
-    """Ranges of several outputs per row.
-
-    lower, upper: zero where a row has no such output
-    rough: where the first output may jump or be undefined in the box
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    rough: BoolArray
-
-
 class Entries:
-    """Several outputs of a program for every one of many entries.
-
-    program: the outputs
-    outputs: their positions, one row per entry; -1 for none
-    """
+    """Several outputs of a program, by position, for every one of many entries; -1 for none."""
 
     def __init__(self, program: Program, outputs: IntArray) -> None:
         self._program, self._outputs = program, outputs
@@ -59,14 +37,14 @@ class Entries:
 
     def enclose(
         self, entry: IntArray, lower: FloatArray, upper: FloatArray, judged: bool
-    ) -> EntryRanges:
-        """Enclose, for every box, the outputs that belong to its entry."""
+    ) -> OutputRanges:
+        """Enclose, for every box, the outputs of its entry, zero for none; rough is the first."""
         counts = np.bincount(entry, minlength=len(self._needs))
         some = np.flatnonzero(counts).tolist()
         if self._together(some, counts):
             return self._enclose(tuple(some), entry, lower, upper, judged)
         k, n = self._outputs.shape[1], len(entry)
-        result = EntryRanges(np.empty((k, n)), np.empty((k, n)), np.empty(n, dtype=bool))
+        result = OutputRanges(np.empty((k, n)), np.empty((k, n)), np.empty(n, dtype=bool))
         for e in some:
             index = np.flatnonzero(entry == e)
             part = self._enclose((e,), entry[index], lower[:, index], upper[:, index], judged)
@@ -104,12 +82,12 @@ class Entries:
         lower: FloatArray,
         upper: FloatArray,
         judged: bool,
-    ) -> EntryRanges:
+    ) -> OutputRanges:
         chosen, row = self._choice(some)
         found = enclose(self._program, lower, upper, chosen, len(some) if judged else 0)
         wanted = self._outputs[entry].T
         place, present = (row[wanted], np.arange(len(entry))), wanted >= 0
-        return EntryRanges(
+        return OutputRanges(
             np.where(present, found.lower[place], 0.0),
             np.where(present, found.upper[place], 0.0),
             found.rough[place[0][0], place[1]],
@@ -126,9 +104,8 @@ class Problem:
 
     program: outputs: first the expressions, then the structurally nonzero partial derivatives
     gradient: position of a partial derivative among the outputs; -1 where it is zero
-    relevant: whether an expression depends on a variable
-    affine: whether an expression is affine in a variable with the others held
-    lower, upper: the box
+    relevant, affine: whether an expression depends on a variable, and is affine in it with the
+        others held
     source: where it comes from, for those who need more derivatives or other variables
     """
 
@@ -170,7 +147,6 @@ class Rows(Batch):
     """A batch of boxes.
 
     goal: 2 e for the smallest value of the expression e, 2 e + 1 for the largest
-    lower, upper: the boxes
     bound: upper bound of the goal's expression over the box, so far
     """
 
@@ -195,10 +171,8 @@ class Rows(Batch):
 class RowRanges(Batch):
     """Value and gradient of every row's goal: of the expression or of its negative.
 
-    lower, upper: natural enclosure of the value
-    slope_lower, slope_upper: enclosure of the gradient; the whole line where the expression may
-        jump or be undefined in the box, zero where no gradient was asked for
-    rough: where the expression may jump or be undefined in the box
+    The gradient is the whole line where the expression is rough, may jump or be undefined in the
+    box, and zero where none was asked for.
     """
 
     lower: FloatArray
@@ -236,6 +210,11 @@ def shrink(
     return np.where(rises, rows.upper, rows.lower), np.where(falls, rows.lower, rows.upper)
 
 
+def radius_about(lower: FloatArray, upper: FloatArray, centre: FloatArray) -> FloatArray:
+    """Return how far boxes extend from points in them, up."""
+    return np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
+
+
 def mean_value_terms(
     lower: FloatArray,
     upper: FloatArray,
@@ -244,7 +223,7 @@ def mean_value_terms(
     slope_upper: FloatArray,
 ) -> FloatArray:
     """Bound |gradient| times distance from the centre, variable by variable."""
-    radius = np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
+    radius = radius_about(lower, upper, centre)
     size = np.maximum(np.abs(slope_lower), np.abs(slope_upper))
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(radius > 0.0, up(size * radius), 0.0)

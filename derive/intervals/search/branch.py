@@ -8,10 +8,10 @@ first and to second order, is told in docs/derivations.md.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,41 +40,28 @@ if TYPE_CHECKING:
 _PATIENCE = 2.0
 
 
-class Patience:
-    """Shows what a long search is doing; silent before two seconds and off a terminal."""
+@contextmanager
+def patience() -> Iterator[Callable[[str], None]]:
+    """Yield what shows a long search in a line; silent before two seconds and off a terminal."""
+    since = time.monotonic()
+    shown: list[Status | None] = []
 
-    def __init__(self) -> None:
-        self._since = time.monotonic()
-        self._status: Status | None = None
-        self._silent = False
+    def tell(text: str) -> None:
+        if not shown and time.monotonic() - since >= _PATIENCE:
+            from rich.console import Console
 
-    def tell(self, text: str) -> None:
-        """Show a line in place of the one before."""
-        if self._silent or time.monotonic() - self._since < _PATIENCE:
-            return
-        if self._status is not None:
-            self._status.update(text)
-            return
-        from rich.console import Console
+            console = Console(stderr=True)
+            shown.append(console.status(text) if console.is_terminal else None)
+            if shown[0] is not None:
+                shown[0].start()
+        elif shown and shown[0] is not None:
+            shown[0].update(text)
 
-        console = Console(stderr=True)
-        if not console.is_terminal:
-            self._silent = True
-            return
-        self._status = console.status(text)
-        self._status.start()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._status is not None:
-            self._status.stop()
+    try:
+        yield tell
+    finally:
+        if shown and shown[0] is not None:
+            shown[0].stop()
 
 
 _CHUNK = 8192
@@ -114,13 +101,10 @@ class Budget:
 class Outcome:
     """What was found for every goal (2 e: minus the expression e, 2 e + 1: the expression).
 
-    bound: guaranteed upper bounds
-    attained: guaranteed lower bounds of the value at ``points``
-    points: where these values are attained
+    bound, attained: guaranteed upper bounds, and guaranteed lower bounds of the value at ``points``
     noise: largest width of the enclosure of a value at a single point: what rounding alone costs
     finished: false where the budget ran out
     singular: goals without a finite bound, with a sub-box where that happens
-    boxes, sweeps: work done
     """
 
     bound: FloatArray
@@ -370,14 +354,14 @@ class Search:
         some = range(len(self.problem.gradient)) if expressions is None else list(expressions)
         wanted = np.isin(self.open.goal // 2, some)
         rows, others = self.open.take(wanted), self.open.take(~wanted)
-        with Patience() as patience:
+        with patience() as tell:
             while rows.count and self.boxes < budget.boxes and self.sweeps < budget.sweeps:
                 now = self.choose(rows)
                 rows = self.sweep(rows.take(now)).join(rows.take(~now))
                 if self.sweeps == 1 and rows.count:
                     self.sample(np.unique(rows.goal))
                 rows = rows.take(self.close(rows))
-                patience.tell(f"bounding: {self.boxes} boxes done, {rows.count} open")
+                tell(f"bounding: {self.boxes} boxes done, {rows.count} open")
         self.open = rows.join(others)
         return self.outcome()
 

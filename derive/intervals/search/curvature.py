@@ -14,35 +14,18 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import Program
-from obsynth.derive.intervals.search.batch import Entries, RowRanges, Rows, Source
+from obsynth.derive.intervals.rules import JUMPS
+from obsynth.derive.intervals.search.batch import Entries, RowRanges, Rows, Source, radius_about
 from obsynth.derive.rigour import Interval, down, up
 from obsynth.derive.rigour.interval import divide, multiply, subtract
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 # Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
 # quotients with a removable singularity it knows nothing at the singularity.
-_NOT_SMOOTH = frozenset(
-    {
-        "absolute",
-        "boundary_weight",
-        "ceiling",
-        "conjunction",
-        "copysign",
-        "disjunction",
-        "equal",
-        "floor",
-        "if_else_zero",
-        "less",
-        "less_equal",
-        "logical_not",
-        "maximum",
-        "meet",
-        "minimum",
-        "remainder",
-        "select",
-        "sign",
-    }
-)
+_NOT_SMOOTH = (JUMPS - {"arctangent2"}) | {
+    *("absolute", "minimum", "maximum", "meet", "select", "if_else_zero"),
+    *("logical_not", "conjunction", "disjunction"),
+}
 _ULP = 2.3e-16
 _TINY = 1e-300
 # Steps of the climb to the top of a concave goal.
@@ -51,10 +34,9 @@ _CLIMB = 4
 
 @dataclass(frozen=True, eq=False)
 class Hessians:
-    """Enclosures of second derivatives, in the sign of the goals.
+    """Enclosures of second derivatives in the sign of the goals, symmetric; zero if not usable.
 
-    lower, upper: symmetric; zero where nothing is known
-    usable: rows whose goal is twice differentiable all over the box, with finite bounds
+    A usable goal is twice differentiable all over the box, with finite bounds.
     """
 
     lower: FloatArray
@@ -72,11 +54,7 @@ class Hessians:
 
 
 class Curvatures:
-    """Programs of the second derivatives of expressions, made when they are first asked for.
-
-    source: the expressions
-    program: interval program of the expressions, which tells what they are made of
-    """
+    """Programs of the second derivatives of expressions, made when they are first asked for."""
 
     def __init__(self, source: Source, program: Program) -> None:
         self._source, self._program = source, program
@@ -139,10 +117,6 @@ class Curvatures:
         return Hessians(np.where(minus, -high, low), np.where(minus, -low, high), usable)
 
 
-def _radius(lower: FloatArray, upper: FloatArray, centre: FloatArray) -> FloatArray:
-    return np.where(upper > lower, up(np.maximum(upper - centre, centre - lower)), 0.0)
-
-
 def sharpened_slopes(
     lower: FloatArray,
     upper: FloatArray,
@@ -155,7 +129,7 @@ def sharpened_slopes(
 
     Shapes: at_centre, slopes (ndarray, ndarray), shape (v, N).
     """
-    reach = np.einsum("nij,jn->in", hessians.size, _radius(lower, upper, centre))
+    reach = np.einsum("nij,jn->in", hessians.size, radius_about(lower, upper, centre))
     reach = up(reach * (1.0 + (len(lower) + 4) * _ULP))
     reach[:, ~hessians.usable] = np.inf
     with np.errstate(invalid="ignore"):
@@ -174,7 +148,7 @@ def taylor_spread(
 
     Shapes: at_centre (ndarray, ndarray), shape (v, N).
     """
-    radius = _radius(lower, upper, centre)
+    radius = radius_about(lower, upper, centre)
     steep = np.maximum(np.abs(at_centre[0]), np.abs(at_centre[1]))
     bend = np.einsum("nii->in", hessians.upper)
     size = hessians.size

@@ -26,12 +26,9 @@ _AFFINE = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Expressions in fewer variables.
+    """Expressions in fewer variables, with the positions ``which`` of those that could be reduced.
 
-    column: the expressions that could be reduced, with quantities as variables
-    which: their positions among the original expressions
-    quantities: what the new variables stand for, in the original variables
-    symbols: the new variables
+    quantities: what the new variables, ``symbols``, stand for in the original ones
     used: quantities in each of the reduced expressions
     supports: original variables behind each quantity
     """
@@ -47,12 +44,10 @@ class Reduction:
 class SxGraph:
     """Instructions of SX expressions as a graph in which equal operations are one node.
 
-    column: expressions
-    variables, extra: symbols; only ``variables`` count as variables
-    nodes: casADi's operation, operands (always earlier nodes) and, for constants, the value, for
+    nodes: CasADi's operation, operands (always earlier nodes) and, for constants, the value, for
         inputs, which input and element
     roots: node of every expression
-    supports: variables of every node
+    supports: variables of every node, those in ``extra`` left aside
     """
 
     def __init__(self, column: ca.SX, variables: ca.SX, extra: ca.SX) -> None:

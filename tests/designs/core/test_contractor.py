@@ -25,6 +25,7 @@ from contracted import (
 )
 
 import obsynth as ob
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.contractor import CUTS, Contractor
 from obsynth.designs.core.core import Core, Known
@@ -33,7 +34,6 @@ from obsynth.designs.core.guard import Guard, Watch
 from obsynth.designs.core.half_widths import HalfWidths
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import fill
-from obsynth.evaluate.truth import Call, dense
 
 
 @functools.cache

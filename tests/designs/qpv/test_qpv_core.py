@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from methods import observer_of
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.qpv.step import build_core
-from obsynth.evaluate.truth import Call, Truth, dense
+from obsynth.evaluate.truth import Truth
 from obsynth.symbolic.scenarios.qpv_example import _equilibrium
 
 
