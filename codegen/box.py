@@ -11,11 +11,7 @@ _SEQUENCES, _LENGTH = 4, 50
 
 
 def input_box(description: Description) -> dict[str, list[list[float]]]:
-    """Return ends of every entry of ``memory, u, y, theta``.
-
-    They are the smallest around the steps of trajectories of the plant within its ranges, and the
-    declared ranges of inputs and scheduling.
-    """
+    """Return ends of ``memory, u, y, theta``: around trajectories of the plant, and as declared."""
     step = machine_of(description.observer.step, description.real)
     drive, found = Drive(description, np.random.default_rng(0)), []
     for _ in range(_SEQUENCES):

@@ -47,11 +47,7 @@ def _shortest(literal: re.Match[str]) -> str:
 
 
 def generate_kernel(step: ca.Function, prefix: str) -> Kernel:
-    """Write the arithmetic of a step as static C functions.
-
-    What is kept of CasADi's C is the sequence of operations, statement by statement, with plain
-    arrays as arguments: no work vectors, memory index, exported symbols and types of its own.
-    """
+    """Write the arithmetic of a step as static C functions: CasADi's statements on plain arrays."""
     function = scalar_function(step)
     text = _casadi_text(function)
     found = _FUNCTION.findall(text)

@@ -24,11 +24,7 @@ def _finite(box: FloatArray, nominal: FloatArray) -> FloatArray:
 
 
 class Drive:
-    """Inputs, measurements and scheduling along random trajectories of the plant.
-
-    Whether they are admissible does not matter: states that leave their declared range are put back
-    on its border.
-    """
+    """Inputs, measurements and scheduling along random trajectories, kept in the ranges."""
 
     def __init__(self, description: Description, rng: np.random.Generator) -> None:
         model = description.observer.model
@@ -60,12 +56,10 @@ class Drive:
         return y
 
     def begin(self, length: int) -> FloatArray | None:
-        """Start a trajectory of `length` samples; return the observer's memory, None for the
-        default.
+        """Start a trajectory of so many samples; return the memory, None for the default.
 
-        Every second one starts from a guess of its own, and two thirds carry a fault that grows
-        from a random instant. Half of them are kept near where they start, with small faults, so
-        that observers whose guarantee holds in a small region are seen at work in it.
+        Every second one starts from a guess of its own, two thirds carry a growing fault, and half
+        of them stay near their start, for observers whose guarantee holds in a small region.
         """
         rng = self.rng
         self._sequence += 1

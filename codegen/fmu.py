@@ -237,8 +237,7 @@ def _pack(path: Path, contents: dict[str, bytes]) -> None:
 def _variables(description: Description, start: Start, inputs: Sequence[str]) -> list[Variable]:
     """Return the variables in the order of their references: parameters, inputs, then outputs.
 
-    Among the outputs real ones come before booleans, and booleans before integers.
-    inputs: start values of u, y and theta, as lists of C
+    Real outputs come before booleans, these before integers; inputs: lists of C of start values.
     """
     found = list(start.parameters)
     for kind, values in zip(_INPUTS, inputs, strict=True):

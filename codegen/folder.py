@@ -23,9 +23,7 @@ def complete_folder(
 ) -> Iterator[Path]:
     """Give a new folder to write to; it takes the target's place when all went well.
 
-    A manifest lists what was written, so that a later call may replace exactly that; what
-    `check_target` says holds before and after the block. If the block raises, or is
-    interrupted, the target stays as it was.
+    A manifest lists what was written, so that a later call may replace exactly that.
     """
     target = check_target(folder, kind, overwrite=overwrite, built=built)
     target.parent.mkdir(parents=True, exist_ok=True)

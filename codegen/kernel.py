@@ -44,14 +44,12 @@ _MOVES = frozenset({"input", "output", "const", "assign"})
 
 @dataclass(frozen=True)
 class Kernel:
-    """C text of the arithmetic of one step, by one of the backends.
+    """C text of the arithmetic of one step; the last of the functions is ``NAME_kernel``.
 
-    functions: static functions; the last one is ``NAME_kernel``
-    arguments: what it reads and writes: some of ``memory, u, y, theta, next, xhat, ...``, or of
-        ``state, in, out``
-    library: what it calls from ``math.h``, sorted
-    own: functions beyond those of IEEE 754 that are written out, with their units in the last place
-    operations, counts: instructions of the CasADi function, and how often it does what
+    arguments: some of ``memory, u, y, theta, next, xhat, ...``, or ``state, in, out`` library: what
+    it calls from ``math.h``, sorted own: functions beyond those of IEEE 754 that are written out,
+    with their units in the last place operations, counts: instructions of the CasADi function, and
+    how often it does what
     """
 
     backend: str

@@ -42,9 +42,7 @@ def _passed(name: str, operands: list[Any]) -> list[Any]:
 class Lanes:
     """What the tape's writer makes of a step, evaluated by NumPy in its type.
 
-    values: in their order, without those that no result needs
-    places: of the operands of every value
-    results: port, entry, place of the value
+    places: of the operands of every value; results: port, entry, place of the value
     instead: operations in place of the usual ones, by their names
     """
 
@@ -97,8 +95,8 @@ class Lanes:
     def matter(self, found: Sequence[Any]) -> list[Any]:
         """Return (lanes,) for all values, whether a small change of each reaches a result.
 
-        Of a choice the branch that is taken, and the test where the branches differ; of a
-        comparison what is near to its limit.
+        Of a choice, the test matters where the branches differ; of a comparison, what is near its
+        limit.
         """
         lanes = found[0].shape
         told: list[Any] = [np.zeros(lanes, bool) for _ in self.values]

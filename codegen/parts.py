@@ -14,8 +14,8 @@ def in_parts(
 ) -> tuple[list[str], list[str]]:
     """Return static functions, and the body that calls them, for statements of a kernel.
 
-    Every name ``t0, t1, ...`` is defined once. Those of use beyond their part go by way of
-    two arrays, of numbers and of truth values; a place that nobody reads any more is taken again.
+    Of ``t0, t1, ...`` those of use beyond their part go by way of two arrays, whose places are
+    taken again.
     """
     if len(lines) <= _LONG:
         return [], [*loads, *lines, "", *stores]

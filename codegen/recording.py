@@ -110,8 +110,7 @@ class Step:
 class Recorder:
     """The state of a C program that runs through the vectors, kept by a machine.
 
-    machine: (memory, u, y[, theta]) -> the results of the step
-    calls: what was done, in order: N, D or M with the memory that they left, or S with a step
+    calls: N, D or M with the memory that they left, or S with a step
     """
 
     description: Description
@@ -232,11 +231,7 @@ def _few(steps: Sequence[Step]) -> list[Step]:
 
 
 def small_words(steps: Iterable[Step], word: Word) -> Iterable[int]:
-    """Return the words of the self-test, step by step.
-
-    1 and the memory before, or 0 where it is what the step before has left; inputs, status,
-    results, the memory afterwards mixed into one word.
-    """
+    """Return the words of the self-test: 1 and the memory before, or 0; then a mix of the rest."""
     left: FloatArray | None = None
     for step in steps:
         carried = left is step.before

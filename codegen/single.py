@@ -64,11 +64,7 @@ _NAMES: Mapping[str, Any] = {
 
 
 class SingleMachine:
-    """A CasADi function of vectors in IEEE single precision, an operation a time.
-
-    Every constant is rounded to the nearest number, and functions beyond those of IEEE 754 are our
-    own. Arguments are (n,), or (n, lanes) to evaluate many at once; results are float32.
-    """
+    """A CasADi function of vectors (n,) or (n, lanes) in IEEE single precision, as float32."""
 
     def __init__(self, function: ca.Function) -> None:
         tape = scalar_function(function)

@@ -66,8 +66,7 @@ def start_of(
 ) -> Start:
     """Return what `memory0` returns, and the numbers on which its entries depend as sums.
 
-    The guess, or ranges of states or of faults, are left out where a start value is not finite,
-    nothing depends on them, or something does in another way.
+    What is not finite, or something depends on in another way, is left out.
     """
     model = observer.model
     inner = observer.observer if isinstance(observer, FaultDetector) else observer
@@ -126,8 +125,6 @@ def _rules(
     real: Real,
 ) -> tuple[tuple[int, str], ...]:
     """Return entries of the memory as copies, middles or sums; none if that is not what they are.
-
-    Copies and middles may be rounded to the type of the step, ends of ranges outwards.
 
     Each start, flattened, is a part of the vector of parameters v; all of them have to matter.
     """

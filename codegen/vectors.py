@@ -66,10 +66,9 @@ def record(
 ) -> tuple[Recorder, dict[str, int]]:
     """Run the step on its machine; return what was recorded, and how many steps of which kind.
 
-    Stretches of trajectories of the plant are recorded, some with failing signals, most of them
-    healthy. From the memories of these start steps on both sides of every limit that the step
-    compares something with, and steps with a few numbers that are random, extreme or not finite.
-    The others follow `NAME_init` without an initialised memory.
+    From memories along trajectories start steps on both sides of every limit that the step compares
+    something with, and steps with numbers that are random, extreme or not finite; the last ones
+    follow `NAME_init`.
     """
     if count < MINIMUM:
         raise CodegenError(

@@ -141,8 +141,7 @@ def broken_assumptions(
 ) -> tuple[str, ...]:
     """Say which ranges and rates of the observer's discrete model a run did not keep.
 
-    truths: every group of signals, (N + 1, n) each. Rates are per step, with a relative slack of
-    1e-9, because differences of sampled ramps carry rounding errors.
+    truths: (N + 1, n) each; rates have a slack of 1e-9, as sampled ramps carry rounding errors.
     """
     model = observer.model
     said = outside_box(truths["x"], state_box(observer), model.names("x"), "range")

@@ -48,9 +48,8 @@ def joint(
 ) -> Run:
     """Integrate plant and observer together; see :func:`obsynth.simulate`.
 
-    Every signal but the states enters a Runge-Kutta step by three values: at its
-    beginning, in its middle and at its end. A feedback (k, y) reads the output
-    of each stage. A fault detector decides afterwards, from the bounds at the samples.
+    Signals enter a Runge-Kutta step by their values at its beginning, middle and end; a feedback
+    (k, y) reads the output of each stage.
     """
     if isinstance(observer, FaultDetector):
         run = joint(model, observer.observer, scenario, seed, substeps)

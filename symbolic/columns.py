@@ -18,11 +18,7 @@ CLOCK = ("t", "time", "timestamp", "datetime")
 
 
 class Columns:
-    """Columns of a frame by name, (N,), read as numbers where they are asked for.
-
-    frame: as it came, the index as a column; clock: the index, if it is a time; used: columns that
-    were asked for
-    """
+    """Columns of a frame by name, (N,), read as numbers where they are asked for, then `used`."""
 
     def __init__(self, frame: Any, source: str) -> None:
         self.source, self.units = source, frame.attrs.get("units", {})

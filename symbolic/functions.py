@@ -126,9 +126,6 @@ def _fold(binary: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 class NamedFunction:
     """A function by its name in text, its SymPy constructor and its CasADi builder.
 
-    name: the name in text
-    sympy: builds the SymPy expression from SymPy arguments
-    casadi: builds the SX expression from SX arguments
     least, most: how many arguments it takes; ``most=None`` is any number
     """
 

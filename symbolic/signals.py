@@ -252,11 +252,7 @@ def exact_number(value: Any, what: str) -> sp.Expr:
 def make_signals(
     role: Role, names: str | Sequence[str], *, limits: Any = None, **keywords: Any
 ) -> tuple[Signal, ...]:
-    """Make the signals of one declaration, with keywords of `_one`.
-
-    Every keyword is one value for all symbols or a list with one per symbol;
-    ``limits`` is one pair or a list of pairs.
-    """
+    """Make the signals of one declaration; keywords of `_one` are one value, or one per symbol."""
     found = expand_names(names, str(role))
     if limits is not None and keywords.get("bound") is not None:
         raise PlantError(f"{role} {found[0]}: give bound= or range=, not both", symbol=found[0])

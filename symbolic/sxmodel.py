@@ -143,11 +143,7 @@ _COMPARE: dict[Any, Callable[[Any, Any], bool]] = {
 
 
 class _Evaluator:
-    """Values of sub-expressions with the magnitude of what went into them.
-
-    The magnitude is what rounding errors are relative to: terms of a sum add up without
-    their signs, and a function passes on what a change of its arguments does to it.
-    """
+    """Values of sub-expressions with the magnitude that rounding errors are relative to."""
 
     def __init__(self, values: Mapping[sp.Symbol, Any]) -> None:
         self.values = values
@@ -250,8 +246,7 @@ class SxModel:
 def build_sx(plant: Plant, constants: Literal["value", "symbol"]) -> SxModel:
     """Convert a complete plant to SX and compare the two forms at random points.
 
-    A step of higher order is composed in SX from the derivatives of the continuous plant,
-    which keeps the graph small; these are what is compared then.
+    Of a step of higher order the derivatives are compared, from which it is composed in SX.
     """
     if constants not in ("value", "symbol"):
         raise PlantError(f"constants= is 'value' or 'symbol', not {constants!r}")

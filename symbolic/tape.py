@@ -106,10 +106,7 @@ def from_tape(
 ) -> list[sp.Expr]:
     """Convert the scalar outputs of an SX function of dense columns to SymPy.
 
-    arguments: the symbols of every input, entry by entry
-    labels: what each output is called in messages
-
-    PlantError names an operation without a SymPy form, and the output.
+    arguments: the symbols of every input, entry by entry; labels: what outputs are called in errors
     """
     work: dict[int, Any] = {}
     results: list[sp.Expr] = [sp.Integer(0)] * function.n_out()

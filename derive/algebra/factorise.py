@@ -171,10 +171,8 @@ def factorise(
 ) -> Factorisation:
     """Write every row as A(x, u) x + B(x, u) u + offset.
 
-    Every term goes to the first of its `divisors`, else to the offset: a state that is a factor
-    (the row's own first); an input that is; the state in which alone it stands and vanishes
-    (sqrt(h) = (sqrt(h)/h) h); the linear form through which alone it depends on the states (phi(x1
-    - x3)). `quasi_lpv` weighs all choices against each other.
+    Every term goes to the first of its `divisors`, else to the offset; `quasi_lpv` weighs all
+    choices against each other.
     """
     n, n_u = len(states), len(inputs)
     columns, linear = sp.zeros(n, n + n_u), sp.zeros(n, n + n_u)

@@ -83,15 +83,10 @@ def constant_columns(
 
 @dataclass(frozen=True, eq=False)
 class IdentityProof:
-    """Proof that the parts of a split add up to the plant, row by row.
+    """Proof that the parts of a split add up to the plant: a method for every row, "" without one.
 
-    A and B are the rational numbers that their doubles are, and g takes up the difference to the
-    plant's own coefficients. D, B_f, W1, C and W2 belong to signals that g must not contain, so
-    they stay as the plant has them.
-
-    methods: how every row of the dynamics, then of the outputs, was proved: ``"syntactic"``,
-        ``"expand"``, ``"cancel"`` or ``"simplify"``; empty where no proof was found
-    rounding: bounds of |exact - double| for D, B_f, W1, C, W2, D_f
+    A and B are the rational numbers that their doubles are, and g takes up the difference;
+    rounding: bounds of |exact - double| for D, B_f, W1, C, W2, D_f.
     """
 
     methods: tuple[str, ...]

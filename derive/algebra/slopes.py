@@ -17,8 +17,8 @@ def slope(row: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
 def jacobian(rows: sp.Matrix, symbols: Sequence[sp.Symbol]) -> sp.Matrix:
     """Differentiate rows; what jumps is flat beside its jump.
 
-    Everything here is real, which SymPy does not always know: it leaves the derivative of a sign
-    undone then, as it does that of a floor, and later takes hours over what it left.
+    SymPy leaves the derivative of a sign or a floor undone, and later takes hours over what it
+    left.
     """
     if not symbols:
         return sp.zeros(len(rows), 0)

@@ -46,12 +46,7 @@ def is_zero(expression: sp.Expr) -> str:
 
 @dataclass(frozen=True, eq=False)
 class FormProof:
-    """Proof that the parts of a form add up to the plant, row by row.
-
-    rows: names of the rows: states, then outputs
-    methods: how every row was proved: ``"syntactic"``, ``"expand"``, ``"cancel"``, ``"simplify"``,
-        or that it is numerically zero at 60 digits only
-    """
+    """Proof that a form is the plant: how each of its rows was proved, or how many digits agree."""
 
     rows: tuple[str, ...]
     methods: tuple[str, ...]

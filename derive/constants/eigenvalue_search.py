@@ -47,12 +47,8 @@ _SMALL = 1e-3
 class Maximum:
     """A largest value over a box: guaranteed from above, attained from below.
 
-    upper: guaranteed: no point of the box has a larger value
-    attained: guaranteed lower bound of the value at ``at``
-    at: the point, by symbol; symbols that do not matter are left out
-    status: how far the two are apart
-    method: where the upper bound comes from
-    boxes: boxes looked at
+    at: the point of the attained value, by symbol; symbols that do not matter are left out method:
+    where the upper bound comes from
     """
 
     upper: float

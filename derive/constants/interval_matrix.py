@@ -23,8 +23,7 @@ MOST_SIGNS = 16
 class IntervalExtreme:
     """Largest eigenvalue or norm over an interval matrix: bounded, and attained at a member.
 
-    Exact when all sign matrices were looked at, so that only rounding lies between the two; else
-    the cheap bound, centre plus norm of the radius.
+    Exact up to rounding when all sign matrices were looked at.
     """
 
     upper: float
@@ -56,11 +55,7 @@ def sign_patterns(coupled: BoolArray, most: int = MOST_SIGNS) -> FloatArray | No
 
 
 def eigenvalue_over_interval(centre: FloatArray, radius: FloatArray) -> IntervalExtreme:
-    """Bound the largest eigenvalue of all symmetric matrices of an interval.
-
-    D. Hertz, The extreme eigenvalues and stability of real symmetric interval matrices, IEEE
-    Transactions on Automatic Control 37(4), 1992.
-    """
+    """Bound the largest eigenvalue of all symmetric matrices of an interval (Hertz 1992)."""
     patterns = sign_patterns(radius > 0.0)
     if patterns is None:
         lower, upper = largest_eigenvalue(centre[None])

@@ -23,11 +23,8 @@ UP = 1.0 + 2.0**-50
 class RowMajorant:
     """phi^2 <= e' R e for one row of g: phi = g_i(a) - g_i(b), e = a - b, R diagonal.
 
-    row: row of g, from 0
-    diagonal (n,): of R
-    entries (n,): guaranteed bounds of |dg_i/dx_j|
-    largest: sup over the box of sum_j (dg_i/dx_j)^2 / R_jj, at most 1: guaranteed, attained, and
-        where
+    entries (n,): guaranteed bounds of |dg_i/dx_j|; largest: sup of sum_j (dg_i/dx_j)^2 / R_jj, at
+    most 1
     """
 
     row: int

@@ -60,10 +60,9 @@ def matrix_maximum(
 ) -> Maximum:
     """Bound the largest eigenvalue of fixed + entries (at both places) over the box.
 
-    The matrix is cut into its connected blocks; entries that are mere rounding (below 1e-13 of the
-    largest one) do not connect and are added as a perturbation at the end. A block whose entries
-    share one row and column has the eigenvalue sqrt(sum of squares), a scalar; the others take the
-    smallest of the bounds by sign matrices, by vertices and by branch and bound.
+    Block by block; entries below 1e-13 of the largest one do not connect blocks and are added as a
+    perturbation. A block in one row and column has sqrt(sum of squares), the others the smallest of
+    the bounds by sign matrices, by vertices and by branch and bound.
     """
     size = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
     largest = max(float(size.max(initial=0.0)), float(np.abs(fixed).max(initial=0.0)))

@@ -29,8 +29,7 @@ class FieldRange:
 class SymmetricField:
     """S(z) = fixed + sum over e of s_e(z) at (row_e, column_e), row <= column, and its mirror.
 
-    The problem holds the expressions s_e with their gradients and the box, `lower` and `upper`
-    their guaranteed ranges over all of it.
+    `lower` and `upper` are guaranteed ranges of the s_e over the box of the problem.
     """
 
     problem: Problem

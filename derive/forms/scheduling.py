@@ -41,9 +41,8 @@ class Lift:
 class SchedulingVariable:
     """A function of the signals on which matrices depend affinely, with its range.
 
-    A signal that schedules by itself keeps its name as the symbol; the range over the box is
-    rounded outwards, its attained ends are reached, and of the signals those are listed that are
-    not known on line.
+    A signal that schedules by itself keeps its name; the range is rounded outwards, its attained
+    ends are reached, and unmeasured signals are those not known on line.
     """
 
     symbol: sp.Symbol
@@ -79,12 +78,9 @@ def _tidy(value: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class AffineSchedule:
-    """A matrix as constant + sum of variables times directions, exactly.
+    """A matrix as constant + sum of variables times directions, exactly, by proved ``methods``.
 
-    entries: every entry that is not zero, through positions in ``variables``
-    methods: how every varying entry was proved to be affine
-    exact: true when the variables depend on disjoint sets of signals, so that they take their
-        values independently of each other
+    exact: true when the variables depend on disjoint sets of signals
     """
 
     variables: tuple[SchedulingVariable, ...]

@@ -128,13 +128,7 @@ class Vertices(Shown, Blocks):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VaryingForm(Blocks):
-    """A plant as constant plus varying matrices, stacked in one; each block is an attribute.
-
-    matrix: all blocks stacked, exact, as functions of the plant's signals
-    layout: where the blocks are
-    schedule: the same matrix, affine in the scheduling variables
-    proof: that the form is the plant
-    """
+    """A plant as constant plus varying matrices, stacked in one; each block is an attribute."""
 
     matrix: sp.Matrix
     layout: Layout

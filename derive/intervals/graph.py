@@ -135,11 +135,7 @@ class Values:
 
 
 class Schedule:
-    """Order of the nodes, operands first, behind those whose ranges are wanted.
-
-    breaks: for every output that is judged, the nodes under it that may jump or be undefined
-    count: number of steps, each of them some calls of NumPy
-    """
+    """Order of the nodes behind those that are wanted; ``breaks``: those that may jump."""
 
     def __init__(
         self,

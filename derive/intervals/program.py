@@ -170,11 +170,7 @@ class Program(Graph):
 
 @dataclass(frozen=True)
 class OutputRanges:
-    """Ranges of outputs over a batch, and where their derivatives can be relied upon.
-
-    An operation under a rough output may jump or be undefined in the box, so that neither
-    monotonicity nor the mean-value form says anything.
-    """
+    """Ranges of outputs over a batch; what is rough may jump or be undefined in the box."""
 
     lower: FloatArray
     upper: FloatArray

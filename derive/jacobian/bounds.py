@@ -46,10 +46,9 @@ _CORNERS = (*_SWITCHES, *_STEPS, sp.Piecewise, sp.Abs, sp.Max, sp.Min)
 def refuse_jumps(model: Plant, outputs: bool = False) -> None:
     """Check that the right-hand side of a plant, or its outputs too, is continuous over its box.
 
-    Off its switching surfaces a row is smooth or has kinks. Two of them meet in no more than edges,
-    round which every path leads: it is enough that the limits from both sides and the value on the
-    surface agree, provably, on every surface by itself, with all switches that it moves together.
-    A step of a discretisation is as continuous as the derivatives, wherever it evaluates them.
+    Off its switching surfaces a row is smooth or has kinks, and two surfaces meet in no more than
+    edges: it is enough that the limits from both sides and the value agree, provably, on every
+    surface by itself, with all switches that it moves together.
     """
     box = {s.symbol: (s.lower, s.upper) for s in model.signals}
     shown = [*zip(model.output_names, model.output, strict=True)] if outputs else []

@@ -29,11 +29,7 @@ _POINTS = 16
 
 
 def jacobian_entries(split_or_model: Split | Plant, wrt: str) -> MatrixEntries:
-    """Collect the entries of a Jacobian that are not structurally zero.
-
-    wrt: "states" or "inputs" of the right-hand side; "joint" of it and the outputs below it, by
-        states and disturbances
-    """
+    """Collect the entries of a Jacobian that are not structurally zero, `wrt` as for bounds."""
     part = split_or_model if isinstance(split_or_model, Split) else None
     model = split_or_model.model if isinstance(split_or_model, Split) else split_or_model
     kinds = COLUMNS[wrt]

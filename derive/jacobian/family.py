@@ -167,15 +167,10 @@ def entry_name(entry: Entry) -> str:
 
 @dataclass(frozen=True, eq=False)
 class AffineDependence:
-    """An entry that is an affine function of others, with the proof.
+    """An entry that is an affine function of others, with the proof that the difference is zero.
 
-    entry: row and column, from 0
-    coefficients: exact coefficient of every entry it is written through; empty for a constant entry
-    constant: exact constant
-    proof: how the difference was proved to be zero
-    shared: names of the variables on which the entries depend
-    size: largest magnitude of the entry at the samples; the text does not add constants to it that
-        the rounding of a matrix has left
+    shared: names of the variables on which the entries depend size: largest magnitude at the
+    samples; the text drops constants that only rounding has left
     """
 
     entry: Entry

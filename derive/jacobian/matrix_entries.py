@@ -39,8 +39,8 @@ _SHORT = 60
 class MatrixEntries:
     """Entries that are not identically zero, as functions of the signals they depend on.
 
-    ``values`` are the ``exact`` ones, numbers as symbols in ``constants``; where no signal occurs,
-    ``variables`` holds the first state. Further symbols in the values stand for ``quotients``.
+    ``values`` are the ``exact`` ones, numbers as symbols in ``constants``, further symbols for
+    ``quotients``; ``variables`` is the first state where no signal occurs.
     """
 
     exact: dict[Entry, sp.Expr]

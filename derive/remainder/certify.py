@@ -150,11 +150,7 @@ def _bounds(work: Work, rtol: float) -> tuple[Interval, int, FloatArray]:
 
 
 def _held_bounds(work: Work, rtol: float) -> tuple[Interval, int, FloatArray, int]:
-    """Intersect what holds with everything held, and tell the highest order that was used.
-
-    Lower orders come first: where enclosures of higher derivatives grow faster than powers of the
-    step shrink, the sequence stops.
-    """
+    """Intersect what holds with everything held, lower orders first; tell the highest order."""
     dynamics, highest = work.dynamics, work.formula.order + 1
     box, effort = work.whole_box, work.effort
     jerk = dynamics.ranges(work.along(2), work.flow, "J f over the flow box", rtol, effort)

@@ -106,8 +106,7 @@ def gains(found: Interval, better: Interval, others: FloatArray) -> bool:
 def other_unknowns(plant: Plant, Ts: float) -> FloatArray:
     """Estimate half widths of what disturbances and moving faults add to a state in a step, (n,).
 
-    States into which neither enters have the noise of a reading that depends on them, and the
-    others a small share of their range. Slopes are those in the middle of the ranges.
+    Other states have the noise of a reading of them, or a small share of their range.
     """
     sx = plant.sx()
     pairs = (sx.rhs, sx.w), (sx.rhs, sx.f), (sx.y, sx.w), (sx.y, sx.x)

@@ -36,11 +36,7 @@ def hull_over_pieces(
 
 
 def plan_cuts(program: Program, box: FloatArray, pieces: int) -> list[int]:
-    """Choose which variables to halve.
-
-    Every variable is halved once for a trial; the cuts go where they promise most, each one half
-    of what the one before it gave.
-    """
+    """Choose which variables to halve by a trial each; a cut gives half of what the last gave."""
     used = sorted({j for k in range(len(program.outputs)) for j in program.support(k)})
     axes = [j for j in used if box[j, 1] > box[j, 0]]
     if not axes or pieces < 2:
@@ -89,8 +85,7 @@ def flow_box(dynamics: System, step: float) -> tuple[FloatArray, FloatArray]:
 
     A candidate Y holds them when, for every state and both sides, Y reaches further out than the
     rate on the slab between the box and Y can carry within a step: a solution that left Y first
-    through the upper face of state i would have spent the time since it last was at the upper face
-    of the box inside that slab. So a box into which the flow points hardly grows.
+    there would have spent the time since it left the box inside that slab.
     """
     n = len(dynamics.names)
     low, high = dynamics.lower[:n], dynamics.upper[:n]

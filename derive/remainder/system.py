@@ -20,11 +20,7 @@ _HELD = ("u", "d", "f", "w", "p", "rho")
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """dx/dt = f(x, v) with v held over a step, s the time within it.
-
-    v: the held signals that occur
-    rates: how fast these may move after all, per second; 0 where they do not
-    """
+    """dx/dt = f(x, v), s the time within a step; the signals v are held but for their ``rates``."""
 
     x: ca.SX
     v: ca.SX

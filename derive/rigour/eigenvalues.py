@@ -104,11 +104,7 @@ def largest_eigenvalue(
 
 
 def perron_bound(matrix: FloatArray) -> FloatArray:
-    """Bound the largest eigenvalue of nonnegative symmetric matrices.
-
-    For every positive vector v it is at most max_i (R v)_i / v_i (Collatz and Wielandt); v is close
-    to the eigenvector, so that little is lost.
-    """
+    """Bound the largest eigenvalue of nonnegative symmetric matrices by max_i (R v)_i / v_i."""
     k = matrix.shape[1]
     usable = finite(matrix)
     safe = np.where(usable[:, None, None], matrix, 0.0)

@@ -88,10 +88,9 @@ def product_up(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def allowance(precision: str, n: int, product: float = 0.0) -> float:
-    """Return what the rounding of one step may be, relative to the size of its terms.
+    """Return what the rounding of one step may be, relative to the sum of the sizes of its terms.
 
-    What is added to a bound is this share of the sum of the magnitudes of all its terms. Making
-    these takes at most 24 roundings one after the other; every factor Q = I + M / mu of a
+    A term takes at most 24 roundings one after the other; every factor Q = I + M / mu of a
     transition over h 16 for its entries and n for the product, and terms with j factors have the
     weight of a Poisson variable with mean h mu, the `product`. Twice that, and 2^-42 in double
     precision.

@@ -151,11 +151,10 @@ class Detectability:
 def augmented_pair(
     split: Split, decoupling: Decoupling, M: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """State and faults after the unknown inputs are removed.
+    """Return state and faults after the unknown inputs are removed, M (n, n) a Jacobian of g.
 
-    Equations (14)-(17) of Buciakowski et al. with M added to A; sensor faults, which the paper
-    does not have, enter through D_f. M (n, n) is a Jacobian of g; the pair is [T (A + M),
-    T B_f + E D_f; 0, I] (0 in place of I in continuous time) and [C, D_f].
+    [T (A + M), T B_f + E D_f; 0, I] (0 in place of I in continuous time) and [C, D_f], eqs.
+    (14)-(17) of Buciakowski et al. with sensor faults.
     """
     n, n_f = split.B_f.shape
     keep = np.eye(n_f) if split.model.Ts is not None else np.zeros((n_f, n_f))
@@ -192,9 +191,8 @@ def _hidden(matrix: FloatArray, outputs: FloatArray, mode: complex) -> tuple[flo
 def detectability(split: Split, bounds: JacobianBounds) -> Detectability:
     """Test that state and faults can be detected at every vertex of the Jacobian family.
 
-    The pair [T (A + M), T B_f; 0, I], [C, 0] must not have a mode of modulus >= 1 (real part >= 0
-    in continuous time) that leaves all outputs at zero. Necessary for a design; the matrix
-    inequalities are what suffices.
+    No mode of modulus >= 1 (real part >= 0) of `augmented_pair` may leave all outputs at zero:
+    necessary, while the matrix inequalities suffice.
     """
     decoupling = unknown_input_condition(split)
     model = split.model
@@ -264,9 +262,7 @@ class WeakestMember:
     """The member of a Jacobian family that is hardest to observe, as far as a search finds it.
 
     margin: smallest singular value of [z I - A; C] with columns of size one, over the modes z that
-        do not decay; there are the scalars, the matrix and the mode, None when all modes decay
-        everywhere
-    members: how many were looked at
+    do not decay; mode: None when all decay everywhere
     """
 
     margin: float
@@ -300,9 +296,9 @@ def pair_margin(A: FloatArray, C: FloatArray, discrete: bool) -> tuple[float, co
 def weakest_member(split: Split, bounds: JacobianBounds) -> WeakestMember:
     """Search the Jacobian family for a member whose state or faults cannot be detected.
 
-    Detectable vertices do not make a detectable polytope: with x2 seen through s x2 only, both
-    s = -1 and s = 1 are fine and s = 0 is not. The search looks at the middle, at scalars that
-    pass through zero, at random members, and improves the worst of them.
+    Detectable vertices do not make a detectable polytope: with x2 seen through s x2 only, s = -1
+    and s = 1 are fine and s = 0 is not. So the middle, zeros of scalars and random members are
+    looked at.
     """
     from scipy.optimize import minimize
 

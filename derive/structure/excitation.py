@@ -56,11 +56,8 @@ class FaultEffect:
 class Excitation(Shown):
     """What has to move for constant faults to be identified together.
 
-    effects: one per fault
-    visible_at_rest: how many independent combinations of constant faults one operating point shows
-    points: how many different operating points are needed for all of them; 1: constant signals are
-        enough; None: no number found is
-    limit: largest number of points that was tried
+    visible_at_rest: how many combinations of constant faults one operating point shows points: how
+    many operating points show all of them, None beyond ``limit``
     """
 
     effects: tuple[FaultEffect, ...]

@@ -76,10 +76,8 @@ def follow(model: Plant, divided: Sequence[str] = (), bounded: Sequence[str] = (
 def untold(extended: Extended, middle: FloatArray, again: Sequence[str] = ()) -> dict[str, str]:
     """Return the faults that no output tells from other states, and why; refuse modes of states.
 
-    Of several that nothing tells from each other, the one with the smallest range goes first.
-
-    middle: of the extended plant's joint Jacobian, (N + m, N + n_v)
-    again: disturbances of it that are read as followed faults again
+    middle: joint Jacobian of the extended plant, (N + m, N + n_v); again: disturbances of it that
+    are read as followed faults. Of several faults that with the smallest range goes first.
     """
     A, C, half = _pair(extended, middle, again)
     names = [*extended.plant.names("x"), *again]

@@ -19,19 +19,12 @@ _ROUNDING = 1e-12
 def system_zeros(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> Numbers:
     """Finite invariant zeros: where the Rosenbrock pencil [A - z I, B; C, D] loses rank.
 
-    The algorithm of Emami-Naeini and Van Dooren removes from the pencil everything that is
-    infinite or singular by orthogonal transformations, for any number of inputs and outputs and
-    any normal rank; what is left has an invertible D, and its zeros are eigenvalues. A (n, n),
-    B (n, k), C (m, n), D (m, k); the largest modulus first, a multiple zero as often as it occurs,
-    hidden modes as far as they lower the rank.
+    Emami-Naeini and Van Dooren (Automatica 1982) remove what is infinite or singular by orthogonal
+    transformations; the zeros are eigenvalues of what is left, the largest modulus first.
 
-    Rounding the entries of a system splits a zero of multiplicity k by about eps^(1/k), 1e-4 for
-    k = 4, in exact arithmetic too: the doubles next to 3.6, 4.32 and 1.728 are not the
-    coefficients of a cube. What a relative change of the entries of 1e-12 makes coincide is
-    returned as one zero, their mean, which rounding hardly moves.
-
-    A. Emami-Naeini, P. Van Dooren, Computation of zeros of linear multivariable systems,
-    Automatica 18(4), 1982.
+    Rounding splits a zero of multiplicity k by about eps^(1/k): what a relative change of the
+    entries of 1e-12 makes coincide is returned as one zero, their mean, which rounding hardly
+    moves.
     """
     size = float(np.abs(A).max(initial=0.0)) or 1.0
     B, D = _unit_columns(B / size, D)
@@ -116,9 +109,7 @@ def _reduce(
 class PolytopeZeros(Shown):
     """Zeros from some signals to the outputs, at every vertex of the Jacobian family.
 
-    worst: the zero that decays least: largest modulus, or real part in continuous time
-    decays: true when all of them decay, so that no motion of the signals can go on without a trace
-        in the outputs
+    worst: the zero that decays least, at `vertex`: largest modulus, or real part in continuous time
     """
 
     signals: tuple[str, ...]
@@ -171,8 +162,7 @@ def invariant_zeros(split: Split, M: FloatArray, signals: Signals = "all") -> Nu
 def separable_faults(split: Split, M: FloatArray) -> tuple[tuple[str, ...], int, int]:
     """Faults that can be told apart from all others and from unknown inputs; rank, signals.
 
-    The normal rank of the transfer matrix from unknown inputs and faults to the outputs is taken
-    at a few fixed points off the axes, where a rank below it has probability zero.
+    The normal rank is that at fixed points off the axes.
     """
     names = split.model.names("f")
     inputs, direct = _entering(split, "all")
@@ -199,9 +189,8 @@ def zeros_over_polytope(
 ) -> PolytopeZeros:
     """Compute the invariant zeros of a plant at every vertex of its Jacobian family.
 
-    From the unknown inputs to the outputs, zeros that decay are what an observer that decouples
-    them needs (strong detectability, Hautus 1983). From unknown inputs and faults together, they
-    are what reconstructing the faults with a stable inverse needs.
+    Those from unknown inputs have to decay for a decoupling observer (strong detectability, Hautus
+    1983), those from faults as well for a stable inverse.
     """
     model = split.model
     names = model.names("d") + (model.names("f") if signals == "all" else ())

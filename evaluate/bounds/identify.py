@@ -210,9 +210,8 @@ def _information(
 ) -> tuple[FloatArray, list[dict[str, float]]]:
     """Return deviations of parameters, and directions that nothing is known of.
 
-    Deviations come from the least squares of the disturbances as a function of the parameters,
-    q' H q to second order; disturbances that are even in their bounds have the variance 1/3. What
-    is not determined would not show in the outputs if nothing disturbed the states.
+    Least squares of the disturbances, of variance 1/3; what is not determined would not show in the
+    outputs if nothing disturbed the states.
     """
     shown = default_groups(problem.plant).get("outputs", ())
     quiet = [name in shown for name in problem.plant.names("w")]

@@ -17,11 +17,9 @@ SIGMAS = 3.0
 class ExtendedKalman:
     """The filter of a discrete plant, with a step like an observer's and sets of three sigma.
 
-    Bounded signals of half range r have the variance r^2 / 3 of a uniform one; a fault is a random
-    walk with steps of the standard deviation of its rate, of its half range where it may jump. An
-    unbounded signal has for half range what moves some state through its own. What is estimated at
-    an instant is (x, f, the f before, d, w), in units of half ranges, so that noise may enter
-    dynamics and readings alike; faults are told one call late.
+    Bounded signals of half range r have the variance r^2 / 3; a fault is a random walk by its rate,
+    or by its half range; an unbounded signal has for half range what moves some state through its
+    own. Estimated is (x, f, the f before, d, w) in half ranges; faults are told one call late.
     """
 
     method = "extended Kalman filter, 3 sigma"

@@ -143,13 +143,7 @@ def _constrained(engine: Any) -> bool:
 
 
 def thin(t: FloatArray, values: FloatArray, columns: int = 500) -> tuple[FloatArray, FloatArray]:
-    """Keep first, smallest, largest and last value of each of `columns` slices in time.
-
-    At a resolution of `columns` pixels the picture is the same as that of all
-    points, as every column shows its whole extent.
-
-    Shapes: t, values (N,), t, values (at most 4 * columns,).
-    """
+    """Keep first, smallest, largest and last of each of `columns` slices: the same picture."""
     n = len(t)
     if n <= 4 * columns:
         return t, values

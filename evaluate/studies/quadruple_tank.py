@@ -56,12 +56,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, eq=False)
 class QuadrupleTank:
-    """What the study found on the euler model with Ts = 1 s.
-
-    refusals: of (51) as printed, and of the direct LMI at the printed gamma
-    designs: widest first; the last one ships
-    runs: of the certified designs, FS1 and FS2 for each seed
-    """
+    """What the study found on the euler model, Ts = 1 s; the last of the designs ships."""
 
     model: "Plant"
     split: "Split"

@@ -11,7 +11,21 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from obsynth.symbolic.signals import Signal
+
 FINITE = 1e300
+
+
+@dataclass
+class ToySignal:
+    """What the generator looks at of a signal, names that no plant would have included."""
+
+    name: str
+    unit: str
+    lower: float = -np.inf
+    upper: float = np.inf
+    nominal: float | None = None
+    bounded, middle, usual = Signal.bounded, Signal.middle, Signal.usual
 
 
 @dataclass
@@ -37,21 +51,24 @@ class ToyPlant:
     def box(self, kind: str) -> np.ndarray:
         return np.array(self.boxes[kind], dtype=float).reshape(-1, 2)
 
-    def _signals(self, kind: str, names: tuple[str, ...], unit: str) -> tuple[SimpleNamespace, ...]:
+    def _signals(self, kind: str, names: tuple[str, ...], unit: str) -> tuple[ToySignal, ...]:
         nominal = 4.0 if kind == "u" else None
-        return tuple(SimpleNamespace(name=name, unit=unit, nominal=nominal) for name in names)
+        ends = self.box(kind).tolist()
+        return tuple(
+            ToySignal(name, unit, *pair, nominal) for name, pair in zip(names, ends, strict=False)
+        )
 
     @property
-    def x(self) -> tuple[SimpleNamespace, ...]:
+    def x(self) -> tuple[ToySignal, ...]:
         return self._signals("x", ("h_1", "h_2"), "cm")
 
     @property
-    def u(self) -> tuple[SimpleNamespace, ...]:
-        return self._signals("u", ("v*/",), "V")[: len(self.boxes["u"])]
+    def u(self) -> tuple[ToySignal, ...]:
+        return self._signals("u", ("v*/",), "V")
 
     @property
-    def f(self) -> tuple[SimpleNamespace, ...]:
-        return self._signals("f", ("φ",), "V")[: len(self.boxes["f"])]
+    def f(self) -> tuple[ToySignal, ...]:
+        return self._signals("f", ("φ",), "V")
 
     def function(self) -> ca.Function:
         names = ("x", "u", "d", "f", "w", "p", "rho")

@@ -479,7 +479,7 @@ def test_every_operation_of_casadi_that_c99_has(toy: Any, make_step: Any, tmp_pa
     )
     count = len(one)
     names = tuple(f"x{i}" for i in range(count))
-    signals = tuple(type(toy.model.u[0])(name=name, unit="", nominal=None) for name in names)
+    signals = tuple(type(toy.model.u[0])(name, "", 1.0, 50.0) for name in names)
     wide = type("Wide", (type(toy.model),), {"x": signals})()
     wide.boxes["x"] = [(1.0, 50.0)] * count
     plant = toy.model.function()

@@ -16,13 +16,7 @@ from obsynth.symbolic.signals import Role, Signal
 
 @dataclass(frozen=True, eq=False)
 class Augmented:
-    """A plant whose chosen faults are states that do not change.
-
-    states: its states, then the faults and losses that became states; `faults` stayed what they
-        were
-    rows, outputs: with constants as numbers; zero (continuous time) or the fault itself (discrete
-        time) for an added state
-    """
+    """A plant whose chosen faults and losses are states that do not change; `faults` are left."""
 
     model: Plant
     states: tuple[Signal, ...]
@@ -37,11 +31,7 @@ class Augmented:
 
 
 def augment_plant(model: Plant, augment: Any = "process", effectiveness: Any = ()) -> Augmented:
-    """Turn faults into states with the dynamics f' = 0.
-
-    Equation (4) of Rotondo, Buciakowski and Witczak; a loss phi_j of effectiveness enters as
-    B (I - diag(phi)) u.
-    """
+    """Turn faults into states with f' = 0; a loss phi_j of effectiveness is B (I - diag(phi)) u."""
     chosen = _faults(model, augment)
     losses, scaled = _losses(model, effectiveness)
     left = tuple(s for s in model.f if s not in chosen)

@@ -23,11 +23,7 @@ _OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset":
 
 
 class QPVLayout(Layout):
-    """Columns [c A N M B D B_f G] over the rows of the dynamics, then of the outputs.
-
-    A row of N holds the matrix N_i row by row, a row of M the rows of M_1, M_2, ... one after the
-    other.
-    """
+    """Columns [c A N M B D B_f G]; a row of N holds N_i row by row, one of M those of all M_j."""
 
     @classmethod
     def of(cls, n: int, m: int, n_u: int, n_d: int, n_f: int, n_w: int) -> QPVLayout:

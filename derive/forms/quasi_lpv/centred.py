@@ -16,11 +16,9 @@ from obsynth.symbolic.shown import Shown
 class CentredForm(Shown):
     """Nominal matrices plus a remainder: A(rho) = A + Delta, Delta in a polytope and in a box.
 
-    A, B: nominal matrices, (n, n), (n, n_u)
-    A_vertices, B_vertices: vertices of the remainder in common order, (N, n, n), (N, n, n_u)
-    A_lower, A_upper, B_lower, B_upper: its elementwise bounds, rounded outwards
-    A_radius, B_radius: what rounding may add elementwise beyond the hull of the vertices
-    exact: whether the vertices are those of the hull itself
+    The remainder has vertices (N, n, n), (N, n, n_u), and elementwise bounds, rounded outwards; the
+    radius is what rounding may add beyond the hull of the vertices, and exact tells whether that
+    hull is the remainder itself.
     """
 
     A: FloatArray

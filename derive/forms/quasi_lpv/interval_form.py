@@ -15,11 +15,7 @@ from obsynth.symbolic.shown import Shown
 
 @dataclass(frozen=True, eq=False)
 class Ranging:
-    """How ranges of the entries of a form are found.
-
-    In the stacked matrix symbols stand for the lifted secants: ``lifts``, with the ranges of the
-    derivatives whose means they are.
-    """
+    """How ranges of entries of a form are found; ``lifts`` are symbols with ranges of slopes."""
 
     matrix: sp.Matrix
     lifts: tuple[Lift, ...]

@@ -102,8 +102,8 @@ class Widths:
 def _is_hard(coefficient: sp.Expr) -> bool:
     """Tell whether the slope is likely to have a better bound, found sooner, than the secant.
 
-    So it is for nested functions, and for quotients by sinc and its like in several variables,
-    whose natural extension contains zero until the boxes are small.
+    The natural extension of a quotient by sinc in several variables holds zero until boxes are
+    small.
     """
     if coefficient.count_ops() > _LONG:
         return True
@@ -120,11 +120,10 @@ _TIE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One way to write a row: terms with a choice, and what they are divided by.
+    """One way to write a row, with its velocity inflation, infinite where a range is missing.
 
-    inflation: velocity inflation of the row; inf where a range is missing
-    unmeasured: signals in the coefficients whose values are not known on line
-    score: the inflation with a penalty for these
+    unmeasured: signals in the coefficients whose values are not known on line, for which the score
+    has a penalty
     """
 
     choices: tuple[tuple[str, str], ...]
@@ -147,8 +146,7 @@ class Alternative:
 class RowRanking:
     """The ways to write a row, the chosen one first, then the others in order of their scores.
 
-    Scores that differ by no more than 2 % are equal, and the structurally simpler way is taken. Of
-    many ways (``total``) not all are listed.
+    Of many ways (``total``) not all are listed.
     """
 
     row: str

@@ -80,8 +80,7 @@ def _numbers(model: Plant, kind: str, values: Any) -> tuple[sp.Expr, ...]:
 def decide_signs(rows: Sequence[sp.Expr], model: Plant, centre: Centre) -> list[sp.Expr]:
     """Write sign(g) and |g| without a kink where g keeps its sign on the box and at the centre.
 
-    A secant from the centre to a point of the box exists in closed form only for what is smooth
-    between them.
+    Secants exist in closed form only for what is smooth between the centre and the point.
     """
     kinked = sorted(
         {a for row in rows for a in row.atoms(sp.sign, sp.Abs)}, key=sp.default_sort_key

@@ -144,11 +144,7 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Rows(Batch):
-    """A batch of boxes.
-
-    goal: 2 e for the smallest value of the expression e, 2 e + 1 for the largest
-    bound: upper bound of the goal's expression over the box, so far
-    """
+    """A batch of boxes: goal 2 e for the smallest value of expression e, 2 e + 1 for the other."""
 
     goal: IntArray
     lower: FloatArray

@@ -118,11 +118,7 @@ class Outcome:
 
 
 class Search:
-    """A search that can be interrupted and taken up again.
-
-    problem: expressions, gradients and box
-    rtol: wanted gap between guaranteed and attained range, relative to the attained width
-    """
+    """A search that can be taken up again; rtol is relative to the width of the attained range."""
 
     def __init__(self, problem: Problem, rtol: float) -> None:
         goals = 2 * len(problem.gradient)

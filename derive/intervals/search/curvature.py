@@ -234,11 +234,7 @@ def concave_bounds(
     evaluate: Callable[[Rows], RowRanges],
     is_open: Callable[[Rows], BoolArray],
 ) -> FloatArray:
-    """Bound goals that are concave over their boxes.
-
-    A concave f lies below every tangent, f(x) <= f(c) + f'(c) (x - c). Whatever c is, the bound
-    holds; at the top of the box it is the largest value, up to rounding.
-    """
+    """Bound goals that are concave over their boxes: they lie below every tangent."""
     bound, index = rows.bound.copy(), np.arange(rows.count)
     at = start
     for _ in range(_CLIMB):
