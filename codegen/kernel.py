@@ -46,10 +46,10 @@ _MOVES = frozenset({"input", "output", "const", "assign"})
 class Kernel:
     """C text of the arithmetic of one step; the last of the functions is ``NAME_kernel``.
 
-    arguments: some of ``memory, u, y, theta, next, xhat, ...``, or ``state, in, out`` library: what
-    it calls from ``math.h``, sorted own: functions beyond those of IEEE 754 that are written out,
-    with their units in the last place operations, counts: instructions of the CasADi function, and
-    how often it does what
+    arguments: some of ``memory, u, y, theta, next, xhat, ...``, or ``state, in, out``
+    library: what it calls from ``math.h``, sorted
+    own: functions beyond those of IEEE 754 that are written out, with their units in the last place
+    operations, counts: instructions of the CasADi function, and how often it does what
     """
 
     backend: str

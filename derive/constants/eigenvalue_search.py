@@ -15,14 +15,14 @@ boxes is left at a corner. t is the value attained so far, below which no bound 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from obsynth.derive.constants.interval_matrix import sign_patterns
 from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
 from obsynth.derive.intervals.ranges import Status
-from obsynth.derive.intervals.search.batch import Batch
+from obsynth.derive.intervals.search.batch import Rows
 from obsynth.derive.rigour import (
     UNIT_ROUNDOFF,
     down,
@@ -32,7 +32,7 @@ from obsynth.derive.rigour import (
     rotate,
     up,
 )
-from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.arrays import FloatArray
 
 EIGENVALUE_BUDGETS = {"fast": 500, "normal": 20_000, "tight": 400_000}
 _MOST_NUMBERS = 2_000_000
@@ -47,8 +47,8 @@ _SMALL = 1e-3
 class Maximum:
     """A largest value over a box: guaranteed from above, attained from below.
 
-    at: the point of the attained value, by symbol; symbols that do not matter are left out method:
-    where the upper bound comes from
+    at: the point of the attained value, by symbol; symbols that do not matter are left out
+    method: where the upper bound comes from
     """
 
     upper: float
@@ -74,13 +74,6 @@ class Maximum:
     def __str__(self) -> str:
         text = f"{self.upper:.8g} ({self.status.word}, gap {self.gap:.1e}; {self.method})"
         return f"{text} at {self.where}" if self.at else text
-
-
-@dataclass(frozen=True, eq=False)
-class _Boxes(Batch):
-    lower: FloatArray
-    upper: FloatArray
-    bound: FloatArray
 
 
 def interval_bound(field: SymmetricField, centre: FloatArray, radius: FloatArray) -> FloatArray:
@@ -110,7 +103,7 @@ class _Expansion:
     loss: FloatArray
 
 
-def _anchor(boxes: _Boxes, found: FieldRange) -> FloatArray:
+def _anchor(boxes: Rows, found: FieldRange) -> FloatArray:
     """Pick the point where the top eigenvalue seems largest: a corner where slopes have a sign."""
     top = np.linalg.eigh(np.where(np.isfinite(found.centre), found.centre, 0.0))[1][:, :, -1]
     slope = np.einsum("na,nvab,nb->vn", top, found.slope_centre, top)
@@ -120,7 +113,7 @@ def _anchor(boxes: _Boxes, found: FieldRange) -> FloatArray:
 
 
 def expansion_bound(
-    field: SymmetricField, boxes: _Boxes, found: FieldRange, best: float
+    field: SymmetricField, boxes: Rows, found: FieldRange, best: float
 ) -> _Expansion:
     """Bound the largest eigenvalue by the Schur complement, see the head of this module."""
     anchor = _anchor(boxes, found)
@@ -270,7 +263,7 @@ def _search(
     chunk = max(8, min(1024, _MOST_NUMBERS // (v * field.size**2)))
     low, high = field.problem.lower, field.problem.upper
     span = np.where(high > low, high - low, 1.0)[:, None]
-    boxes = _Boxes(low[:, None], high[:, None], np.array([np.inf]))
+    boxes = Rows(np.zeros(1, np.int64), low[:, None], high[:, None], np.array([np.inf]))
     closed, count = best, 0
     attained, best = best, max(best, level)
     while boxes.bound.size and count < budget:
@@ -295,21 +288,8 @@ def _search(
         score = np.where(np.isfinite(grown.loss.T) & (bound < np.inf), grown.loss.T, width / span)
         score = np.where(score.max(axis=0) > 0.0, score, width / span)[:, rest]
         axis = np.argmax(np.where(width[:, rest] > 0.0, score, -1.0), axis=0)
-        kept = _Boxes(now.lower[:, rest], now.upper[:, rest], bound[rest])
-        boxes = later.join(_halves(kept, axis))
+        boxes = later.join(replace(now, bound=bound).take(rest).halves(axis))
         settled = boxes.bound <= best + tolerance
         closed = max(closed, float(boxes.bound[settled].max(initial=-np.inf)))
         boxes = boxes.take(~settled)
     return max(closed, float(boxes.bound.max(initial=-np.inf))), attained, where, count
-
-
-def _halves(boxes: _Boxes, axis: IntArray) -> _Boxes:
-    columns = np.arange(len(axis))
-    if not len(axis):
-        return boxes
-    low, high = boxes.lower[axis, columns], boxes.upper[axis, columns]
-    middle = np.clip(0.5 * low + 0.5 * high, low, high)
-    upper, lower = boxes.upper.copy(), boxes.lower.copy()
-    upper[axis, columns] = middle
-    lower[axis, columns] = middle
-    return _Boxes(boxes.lower, upper, boxes.bound).join(_Boxes(lower, boxes.upper, boxes.bound))

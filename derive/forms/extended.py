@@ -28,8 +28,8 @@ _LARGEST_DENOMINATOR = 10**6
 class Extended:
     """A plant whose states are those of another and its faults, with known and bounded signals.
 
-    plant: states (x, followed faults), inputs (u, measured scheduling), disturbances v D0, L0, T0:
-    exact matrices, shapes (N, k), (N, m), (N, N); L0 reads the outputs ``picked``
+    plant: states (x, followed faults), inputs (u, measured scheduling), disturbances v
+    D0, L0, T0: exact matrices, shapes (N, k), (N, m), (N, N); L0 reads the outputs ``picked``
     """
 
     plant: Plant

@@ -169,8 +169,8 @@ def entry_name(entry: Entry) -> str:
 class AffineDependence:
     """An entry that is an affine function of others, with the proof that the difference is zero.
 
-    shared: names of the variables on which the entries depend size: largest magnitude at the
-    samples; the text drops constants that only rounding has left
+    shared: names of the variables on which the entries depend
+    size: largest magnitude at the samples; the text drops constants that only rounding has left
     """
 
     entry: Entry

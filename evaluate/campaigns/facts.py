@@ -1,7 +1,6 @@
 """What is kept of one run of a campaign: a row of numbers."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,8 @@ from obsynth.evaluate.simulate import simulate
 from obsynth.evaluate.trace import Trace
 from obsynth.symbolic import ObsynthError, Plant, Scenario
 
-Row = Mapping[str, Any]
+Row = dict[str, Any]
+KEYS = ("design", "scenario", "truth", "seed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +37,7 @@ class Job:
 
     def run(self) -> list[Row]:
         """Return a row for every run; one that is refused says why."""
-        return [{**self._head(seed), **self._facts(seed)} for seed in self.seeds]
-
-    def _head(self, seed: int) -> Row:
-        return {
-            "design": self.design,
-            "scenario": self.scenario,
-            "truth": self.truth,
-            "seed": seed,
-        }
+        return [dict(zip(KEYS, key, strict=True)) | self._facts(key[-1]) for key in self.keys]
 
     def _facts(self, seed: int) -> Row:
         start = time.perf_counter()

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.files import write_whole
-from obsynth.evaluate.campaigns.facts import Job, Row
+from obsynth.evaluate.campaigns.facts import KEYS, Job, Row
 from obsynth.evaluate.data.tables import write_columns
 from obsynth.evaluate.errors import ReportError, SimulationError
 from obsynth.symbolic.arrays import FloatArray
 
 _PLAN = "campaign.json"
-KEYS = ("design", "scenario", "truth", "seed")
 
 
 def fingerprint(jobs: Sequence[Job]) -> dict[str, str]:

@@ -70,6 +70,11 @@ class ToyPlant:
     def f(self) -> tuple[ToySignal, ...]:
         return self._signals("f", ("φ",), "V")
 
+    def __getattr__(self, kind: str) -> tuple[ToySignal, ...]:
+        if kind not in ("d", "w", "p", "rho"):
+            raise AttributeError(kind)
+        return self._signals(kind, tuple(f"{kind}{k}" for k in range(len(self.boxes[kind]))), "")
+
     def function(self) -> ca.Function:
         names = ("x", "u", "d", "f", "w", "p", "rho")
         s = {name: ca.SX.sym(name, len(self.boxes[name])) for name in names}

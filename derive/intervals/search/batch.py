@@ -1,6 +1,6 @@
 """Rows of boxes, each with the goal it serves, and what one evaluation says about them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -156,6 +156,16 @@ class Rows(Batch):
         lower, upper, bound = self.lower.copy(), self.upper.copy(), self.bound.copy()
         lower[:, which], upper[:, which], bound[which] = other.lower, other.upper, other.bound
         return Rows(self.goal, lower, upper, bound)
+
+    def halves(self, axis: IntArray, facets: BoolArray | bool = False) -> "Rows":
+        """Return every box cut along an axis, the lower parts first; or two facets of it."""
+        columns = np.arange(self.count)
+        low, high = self.lower[axis, columns], self.upper[axis, columns]
+        middle = np.clip(0.5 * low + 0.5 * high, low, high)
+        upper, lower = self.upper.copy(), self.lower.copy()
+        upper[axis, columns] = np.where(facets, low, middle)
+        lower[axis, columns] = np.where(facets, high, middle)
+        return replace(self, upper=upper).join(replace(self, lower=lower))
 
     @property
     def count(self) -> int:

@@ -296,8 +296,7 @@ class Search:
             return rows
         rows, terms, width = self.cut(rows, terms, width, to_facets)
         if rows.count <= _SMALL_BATCH:
-            twice = np.concatenate([to_facets, to_facets], axis=1)
-            rows, terms, width = self.cut(rows, terms, width, twice)
+            rows, terms, width = self.cut(rows, terms, width, np.tile(to_facets, (1, 2)))
         return rows
 
     def cut(
@@ -308,19 +307,12 @@ class Search:
         score = np.where(usable, terms, width)
         axis = np.argmax(np.where(rows.upper > rows.lower, score, -1.0), axis=0)
         columns = np.arange(rows.count)
-        lo, hi = rows.lower[axis, columns], rows.upper[axis, columns]
         facets = to_facets[axis, columns] & usable
-        middle = np.clip(0.5 * (lo + hi), lo, hi)
-        upper, lower = rows.upper.copy(), rows.lower.copy()
-        upper[axis, columns] = np.where(facets, lo, middle)
-        lower[axis, columns] = np.where(facets, hi, middle)
-        first = Rows(rows.goal, rows.lower, upper, rows.bound)
-        both = first.join(Rows(rows.goal, lower, rows.upper, rows.bound))
         left = np.ones_like(width)
         left[axis, columns] = np.where(facets, 0.0, 0.5)
         with np.errstate(invalid="ignore"):
             terms, width = terms * left, width * left
-        return both, np.concatenate([terms, terms], axis=1), np.concatenate([width, width], axis=1)
+        return rows.halves(axis, facets), np.tile(terms, (1, 2)), np.tile(width, (1, 2))
 
     # -- the loop ----------------------------------------------------------------
 

@@ -45,8 +45,9 @@ class SxGraph:
     """Instructions of SX expressions as a graph in which equal operations are one node.
 
     nodes: CasADi's operation, operands (always earlier nodes), and the value of a constant or which
-    input and element roots, supports: nodes of the expressions; variables of every node, those in
-    ``extra`` left aside
+        input and element
+    roots, supports: nodes of the expressions; variables of every node, those in ``extra`` left
+        aside
     """
 
     def __init__(self, column: ca.SX, variables: ca.SX, extra: ca.SX) -> None:
