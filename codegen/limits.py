@@ -113,19 +113,11 @@ class Limits:
             )
         ladder = ladder[np.isfinite(ladder)]
 
+        sizes = [1] * 4
+        for port, entry in (self.lanes.values[k].place for k in self._inputs):
+            sizes[port] = max(sizes[port], entry + 1)
+
         def ports(values: Any) -> list[Any]:
-            sizes = [
-                1
-                + max(
-                    (
-                        v.place[1]
-                        for v in self.lanes.values
-                        if v.name == "input" and v.place[0] == i
-                    ),
-                    default=0,
-                )
-                for i in range(4)
-            ]
             return [np.tile(values, (size, 1)) for size in sizes]
 
         needed = self.lanes.needed([*ks, *(p for k in ks for p in self.lanes.places[k])])

@@ -65,13 +65,22 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     return Decoupling(E, T, Pi, q, residual, bool(projector))
 
 
+def column_sizes(matrix: FloatArray | Numbers) -> FloatArray:
+    """Return the norms of the columns, 1 for zeros."""
+    size = np.linalg.norm(matrix, axis=0)
+    return np.asarray(np.where(size > 0.0, size, 1.0))
+
+
 def scaled_rank(matrix: FloatArray | Numbers) -> int:
     """Rank of a matrix with columns of size one."""
     if matrix.size == 0:
         return 0
-    size = np.linalg.norm(matrix, axis=0)
-    scaled = matrix / np.where(size > 0.0, size, 1.0)
-    return int(np.linalg.matrix_rank(scaled, tol=_RANK_TOLERANCE))
+    return int(np.linalg.matrix_rank(matrix / column_sizes(matrix), tol=_RANK_TOLERANCE))
+
+
+def mode_text(mode: complex) -> str:
+    """Return six digits of a mode, without an imaginary part of zero."""
+    return f"{mode.real:.6g}" if mode.imag == 0 else f"{mode:.6g}"
 
 
 def unknown_input_condition(split: Split) -> Decoupling:
@@ -181,8 +190,7 @@ def _modes(matrix: FloatArray, n: int, discrete: bool) -> tuple[list[complex], l
 def _hidden(matrix: FloatArray, outputs: FloatArray, mode: complex) -> tuple[float, Numbers]:
     """Smallest singular value of [mode I - A; C] with scaled columns, and the null vectors."""
     pencil = np.vstack([mode * np.eye(len(matrix)) - matrix, outputs.astype(complex)])
-    size = np.linalg.norm(pencil, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
+    size = column_sizes(pencil)
     _, values, vectors = np.linalg.svd(pencil / size)
     null = vectors[values <= _RANK_TOLERANCE].conj().T / size[:, None]
     return float(values[-1]), np.asarray(null, dtype=np.complex128)
@@ -274,9 +282,8 @@ class WeakestMember:
     def __str__(self) -> str:
         if self.mode is None:
             return f"all modes decay by themselves ({self.members} members of the family)"
-        mode = f"{self.mode.real:.6g}" if self.mode.imag == 0 else f"{self.mode:.6g}"
         return (
-            f"smallest margin {self.margin:.2g}, mode {mode} "
+            f"smallest margin {self.margin:.2g}, mode {mode_text(self.mode)} "
             f"({self.members} members of the family, a search and no proof)"
         )
 

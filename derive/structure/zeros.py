@@ -7,7 +7,7 @@ import numpy as np
 
 from obsynth.derive.jacobian.bounds import JacobianBounds
 from obsynth.derive.split import Split
-from obsynth.derive.structure.conditions import Numbers, scaled_rank
+from obsynth.derive.structure.conditions import Numbers, column_sizes, mode_text, scaled_rank
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.shown import Shown
 
@@ -69,8 +69,7 @@ def _coincide(offsets: Numbers) -> bool:
 
 def _unit_columns(upper: FloatArray, lower: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scale the columns of [upper; lower] to size one; zeros do not change."""
-    size = np.sqrt((upper**2).sum(axis=0) + (lower**2).sum(axis=0))
-    size = np.where(size > 0.0, size, 1.0)
+    size = column_sizes(np.vstack([upper, lower]))
     return upper / size, lower / size
 
 
@@ -139,8 +138,7 @@ def list_zeros(zeros: Numbers) -> str:
     """Write zeros with six digits, a multiple one once with the number of times it occurs."""
     listed = zeros.tolist()
     return ", ".join(
-        (f"{z.real:.6g}" if z.imag == 0 else f"{z:.6g}")
-        + (f" ({listed.count(z)} times)" if listed.count(z) > 1 else "")
+        mode_text(z) + (f" ({listed.count(z)} times)" if listed.count(z) > 1 else "")
         for z in dict.fromkeys(listed)
     )
 
