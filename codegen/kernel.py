@@ -3,7 +3,7 @@
 import math
 import typing
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -187,6 +187,12 @@ class Call:
             buffer.set_res(i, memoryview(typing.cast(Any, result)))
         # The buffer owns the pointers, so it has to live as long as the arrays.
         self._buffer = buffer
+
+
+def row_of(sizes: Sequence[int]) -> tuple[FloatArray, list[FloatArray]]:
+    """Return one row of numbers for buffers of these sizes, and its parts."""
+    row = np.zeros(sum(sizes))
+    return row, np.split(row, np.cumsum(sizes)[:-1])
 
 
 class Machine(Call):

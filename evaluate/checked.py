@@ -183,6 +183,12 @@ def step_function(observer: Observer | FaultDetector, model: Plant) -> ca.Functi
     return step
 
 
+def claims_of(step: ca.Function, log: FloatArray) -> dict[str, FloatArray]:
+    """Take what a step returned behind its memory, a row for each instant, apart by name."""
+    ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
+    return dict(zip(step.name_out()[1:], np.split(log, ends, axis=1), strict=True))
+
+
 def scheduling_columns(function: ca.Function, model: Plant, word: str) -> list[int]:
     """Return which scheduling signals step or ode reads; refuse inputs that do not fit."""
     given = tuple(function.name_in())

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from obsynth.codegen.kernel import Call, dense
+from obsynth.codegen.kernel import Call, dense, row_of
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
     broken_assumptions,
+    claims_of,
     finite,
     first_memory,
     refuse_algebraic_loop,
@@ -133,19 +133,17 @@ def _loop(
     kinds = ("u", "d", "f", "w", "rho")
     given, sizes = np.hstack([fields[kind] for kind in kinds]), [fields[k].shape[1] for k in kinds]
     # both functions read one row of signals and write one row of results
-    row, places = np.empty(given.shape[1]), np.cumsum(sizes)[:-1]
-    signals = np.split(row, places)
+    row, signals = row_of(sizes)
     whole, moving = compiled(dense(function), N + 1), compiled(truth.function, N + 1)
-    made = np.empty(sum(moving.numel_out(i) for i in range(2)))
-    state, following = np.empty(len(model.x)), made[: len(model.x)]
-    plant = Call(moving, [state, *signals], [following, made[len(model.x) :]])
+    state, (_, made) = np.empty(len(model.x)), row_of([moving.numel_out(i) for i in range(2)])
+    plant = Call(moving, [state, *signals], made)
     memory, moved = (np.empty(whole.numel_in(0)) for _ in range(2))
-    told, ends = _results(whole)
+    told, ends = row_of([whole.numel_out(i) for i in range(1, whole.n_out())])
     scheduled = [np.empty(len(theta))] if theta else []
     step = Call(whole, [memory, signals[0], plant.results[1], *scheduled], [moved, *ends])
     law = _feedback(scenario, truth.plant, plant, names) if scenario.feedback else None
 
-    x, y = np.empty((N + 1, len(state))), np.empty((N + 1, made.size - len(state)))
+    x, y = (np.empty((N + 1, part.size)) for part in made)
     log = np.empty((N + 1, told.size))
     state[:] = vector(scenario.x0, model.names("x"), "x0")
     for k in range(N + 1):
@@ -161,7 +159,7 @@ def _loop(
         step.evaluate()
         log[k] = told
         memory[:] = moved
-        state[:] = following
+        state[:] = made[0]
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
     fields["w"] = truth.remainders(fields, x)
@@ -175,17 +173,5 @@ def _loop(
         outside=(*truth.outside, *broken_assumptions(observer, scenario, truths)),
         t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
         truths=truths,
-        claims=dict(zip(function.name_out()[1:], _parts(log, ends), strict=True)),
+        claims=claims_of(function, log),
     )
-
-
-def _results(function: ca.Function) -> tuple[FloatArray, list[FloatArray]]:
-    """Return one row for all results of a step but the memory, and the parts of it."""
-    sizes = [function.numel_out(i) for i in range(1, function.n_out())]
-    row = np.empty(sum(sizes))
-    return row, np.split(row, np.cumsum(sizes)[:-1])
-
-
-def _parts(log: FloatArray, like: list[FloatArray]) -> list[FloatArray]:
-    """Take a log apart as its rows are."""
-    return np.split(log, np.cumsum([part.size for part in like])[:-1], axis=1)

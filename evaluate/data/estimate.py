@@ -6,10 +6,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.kernel import Call, dense
+from obsynth.codegen.kernel import Call, dense, row_of
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.evaluate.checked import scheduling_columns, step_function
+from obsynth.evaluate.checked import claims_of, scheduling_columns, step_function
 from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
@@ -91,8 +91,7 @@ def estimate(
     names = [model.names("rho")[k] for k in scheduling_columns(step, model, "step")]
     rows = np.column_stack([record.u, record.y, *(record[name] for name in names)])
     log, blamed = _march(step, np.array(memory, dtype=float), rows, model.output_names)
-    ends = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
-    told = as_told(dict(zip(step.name_out()[1:], np.split(log, ends, axis=1), strict=True)))
+    told = as_told(claims_of(step, log))
     for array in told.values():
         array.flags.writeable = False
     own = observer.observer if isinstance(observer, FaultDetector) else observer
@@ -129,12 +128,10 @@ def _march(
     Shapes: rows (N, n_u + n_y + n_theta), result (N, numbers of the outputs but the memory).
     """
     step = compiled(dense(function), len(rows))
-    sizes = [step.numel_in(i) for i in range(1, step.n_in())]
-    given, moved = np.zeros(sum(sizes)), np.zeros(memory.size)
-    told = np.zeros(sum(step.numel_out(i) for i in range(1, step.n_out())))
-    args = [memory, *np.split(given, np.cumsum(sizes)[:-1])]
-    places = np.cumsum([step.numel_out(i) for i in range(1, step.n_out() - 1)])
-    call = Call(step, args, [moved, *np.split(told, places)])
+    given, args = row_of([step.numel_in(i) for i in range(1, step.n_in())])
+    told, ends = row_of([step.numel_out(i) for i in range(1, step.n_out())])
+    moved, status = np.zeros(memory.size), ends[STEP_OUTPUTS.index("status") - 1]
+    call = Call(step, [memory, *args], [moved, *ends])
     evaluate = call.evaluate
 
     def run(rows: FloatArray, log: FloatArray) -> None:
@@ -145,7 +142,7 @@ def _march(
             memory[:] = moved
 
     log, blamed = np.empty((len(rows), told.size)), None
-    column, void = int(places[STEP_OUTPUTS.index("status") - 2]), STATUS["void"]
+    column, void = sum(map(len, ends[: STEP_OUTPUTS.index("status") - 1])), STATUS["void"]
     for k in range(0, len(rows), BLOCK):
         kept, part = memory.copy(), log[k : k + BLOCK]
         run(rows[k : k + BLOCK], part)
@@ -158,8 +155,8 @@ def _march(
             alone = []
             for i, name in enumerate(outputs):
                 given[:] = rows[k]
-                args[2][i] = np.nan
+                args[1][i] = np.nan
                 evaluate()
-                alone += [] if int(told[column]) & void else [name]
+                alone += [] if int(status[0]) & void else [name]
             blamed, memory[:] = tuple(alone), after
     return log, blamed or ()
