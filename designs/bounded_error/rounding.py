@@ -1,14 +1,9 @@
 """What rounding adds to the error of one step, proved for the stored gains.
 
-Let z, fhat, u, y be doubles. The step as it runs differs from equations (10)-(12) over real numbers
-with the plant's own constants by what `rounding_bound` says of `equations`; what else is rounded,
-the matrices of the error system, moves the error as an unknown reading and an unknown input would:
-with y = C x + W2 w + delta,
-
-    e = zeta + E W2 w + E delta ,    e+ gets  (T (A + M) - K C) E delta - K delta ,
-    e_f+ gets  -F (C E delta + delta) ,    zeta+ gets  T (D_0 - D) d  and so on.
-
-All of it is at most `UioDesign.rounding`, which bounds and recursions count as a disturbance.
+The step as it runs differs from equations (10)-(12) over real numbers with the plant's own
+constants by what `rounding_bound` says of `equations`; what else is rounded moves the error as an
+unknown reading and an unknown input would (docs/methods/bounded_error_uio.md, Rounding). All of it
+is at most `UioDesign.rounding`, which bounds and recursions count as a disturbance.
 """
 
 import functools

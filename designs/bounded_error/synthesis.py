@@ -137,18 +137,7 @@ def analyse_gain(
 ) -> EllipsoidSolution:
     """Find the best ellipsoid and gamma for a given gain: the least weighted trace of P^-1.
 
-    With the gain fixed, the LMI at gamma says of X = P^-1, at every vertex i,
-
-        X >= A_i X A_i' / (1 - gamma) + W_i Q_v^-1 W_i' / gamma .
-
-    Take X1, X2 that satisfy it at gamma1, gamma2 with weights Q1, Q2, and X = X1 # X2, their
-    weighted geometric mean with exponents 1 - t and t. The mean is monotone, superadditive and
-    not decreased by ``A . A'``, so X satisfies the inequality at (1 - t) gamma1 + t gamma2 with
-    Q = Q1 # Q2, whose trace is no larger than both allow, because arithmetic means of gamma and
-    1 - gamma exceed geometric ones. As trace(S X) <= trace(S X1)^(1-t) trace(S X2)^t, the
-    optimum is log-convex in gamma: one minimum, found with a bound of what is left. With the
-    gain free the argument fails (what a measurement takes off is not superadditive the right
-    way), which is why `search_gamma` needs its grid.
+    It is log-convex in gamma (the method's page, Given gains), so that its one minimum is found.
     """
     radius = _decay_limit(system, gain)
     if radius >= 1.0:

@@ -117,14 +117,8 @@ def guarantee(design: BankDesign) -> Guarantee:
 def steady_half_widths(design: BankDesign) -> tuple[FloatArray, FloatArray] | None:
     """Return bounds of the half widths of states, (n,), and of faults by filters, (n_f, n_l).
 
-    Of sets that are N calls old or more, N the horizon. None where a slope has no bound over the
-    region, as at a flow sqrt(z) through zero, or the unmeasured states may drive each other apart.
-
-    With slopes |df_i/dx_j| <= s_ij, own slopes of the unmeasured states <= -d_i and speeds at most
-    R_i, the envelope of a step is wider than the sets by 2 Ts R_i. The widths w of the unmeasured
-    states are at most S^-1 of what the other widths feed in, S = diag(d) - s, plus (I - Ts S)^k
-    times what they exceed it by k calls before, at most a multiple of S^-1 1, which falls with k. A
-    fault's interval has the width (w_y + v) / N, v' = s e + l (e_y - v), e those of envelopes.
+    Of sets that are as old as the horizon: docs/methods/filter_bank.md. None where a slope has no
+    bound over the region, or the unmeasured states may drive each other apart.
     """
     found = _slopes(design)
     if found is None:

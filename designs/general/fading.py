@@ -1,22 +1,7 @@
 """How the first error fades from the peak bounds: a nonnegative recursion, and its proof.
 
-For the Jacobians that occur the error system is linear, so responses to disturbances and to the
-first error add up. The latter has e_q = T e_p, e_c = M e_p - Z b delta' ..., e_p+ = L T e_p +
-b delta ... - B b delta' ..., with B = A0 Z + K and L = A0 - B C0. Let Y be regular, eta = Y e_p,
-and mu_a = |eta_a|_2 over blocks of one or two coordinates (two for a complex pair). Then
-
-    mu+ <= G mu,    |e_q| <= R_q mu,  |e_c| <= R_c mu,    mu_0 <= S |e_p| at the start,
-    R_q = |T Y^-1|,   R_c = |M Y^-1| + |Z b| r R_q,   S = |Y|,
-    G = |Y L T Y^-1| + |Y B b| r R_q + |Y b| r R_c ,
-
-where |.| of a block is its spectral norm. All are nonnegative, so the recursion started at
-``S |e_p|`` stays above whatever the first error does, for every k >= 0 and every sequence of
-Jacobians. Y is the stored inverse of a stored basis V, and its own inverse is enclosed: with
-``|I - Y V| <= D``, ``Y^-1 = V (Y V)^-1`` lies within ``|V| D (I - D)^-1`` of V.
-
-Where no basis makes G contract, an exponential serves: divided by lambda^k, what the first error
-adds is at most ``(I - G_lambda)^-1`` times its largest response without feedback, G_lambda the sums
-of responses of the system divided by lambda. Then G = lambda I, R = I, and S has these by columns.
+docs/methods/general_class.md, The first error, in the letters used here: ``mu+ <= G mu`` in a basis
+V with the inverse Y, by blocks of one or two coordinates, or an exponential where none contracts.
 """
 
 from collections.abc import Iterator

@@ -1,22 +1,6 @@
 """One storage function ``V = e_c'P e_c`` for the error system of the general class, stated once.
 
-With ``s = [e_c; v_k; v_{k+1}; q]``, v in units of its bound and q one entry per channel, the next
-errors are linear in s (see `ErrorSystem`),
-
-    e_q+ = E s ,   e_c+ = (E - Z Y) s ,    Y s = C0 e_q+ + V0 v_{k+1} + b' q' ,
-
-and a channel allows ``q_j = delta z_j s`` with ``|delta| <= 1``, z_j a component of e_c or v_k for
-F, of e_q+ or v_{k+1} for h, times the radius. So for any multipliers ``tau_j >= 0``
-
-    V+ <= keep V + v'N v - |C e_c|^2     follows from
-
-    [ keep P (+) N (+) tau - sum_j tau_j z_j'z_j - C'C        *  ]
-    [ P (E - Z Y)                                             P  ]  > 0 ,
-
-at once for all Jacobians: ``tau_j (|z_j s|^2 - q_j^2)`` is not negative where q is what a channel
-allows. With ``keep = 1 - gamma``, C = 0 and a trace of N of at most gamma, V <= 1 is invariant;
-with keep = 1 and ``N = mu^2 I`` the energy of ``C e_c`` is at most mu^2 times that of v. What the
-family varies beside its channels is the radius of the enclosures.
+docs/methods/general_class.md, Ellipsoid and energy gain, has the block, in the letters used here.
 """
 
 from dataclasses import dataclass
@@ -33,10 +17,8 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """The maps above. Shapes: N errors, n_w entries of v_k and v_{k+1}, n_q channels, K in all.
+    """The maps E, Y and rows z of the channels. Shapes: N errors, n_q channels, K entries of s.
 
-    E, Y: shapes (N, K), (m, K)
-    z: rows of the channels, (n_q, K)
     before, after: which components of v stand for v_k and v_{k+1}, n_w in all
     """
 
@@ -100,7 +82,7 @@ def closed_rows(loop: Loop, Z: FloatArray) -> Enclosure:
 def storage_block(
     P: Any, X: Any, keep: Any, noise: Any, tau: Any, z: Any, output: Any = None
 ) -> Any:
-    """Return the block above, in any arithmetic; noise, tau, output C'C None where there are none.
+    """Return the block, in any arithmetic; noise, tau and output C'C None where there are none.
 
     Shapes: X = P (E - Z Y) (N, K), keep (1, 1), noise (n_w, n_w), tau (n_q, n_q), z (n_q, K).
     """

@@ -1,18 +1,8 @@
 """Sums of absolute impulse responses, and the peak (l1) bounds of every error that they give.
 
-Let A be known up to an entrywise radius, X_0 = I, X_{k+1} = fl(A X_k) and X_k = 0 for k >= N. With
-the local errors D_k = X_{k+1} - A X_k one has A^k = X_k - sum_{j<k} A^{k-1-j} D_j, hence with
-R >= sum_k |D_k|
-
-    sum_k |A^k| <= S + (sum_k |A^k|) R,      S = sum_k |X_k| ,
-
-for the partial sums first, which stay bounded by S (I - R)^-1 as soon as the norm of R is below
-one: the sums converge, and A is Schur. Every single power has |A^k - X_k| <= S (I - R)^-1 R.
-
-With p_k the largest ``[|e_q|; |e_c|]`` of `ErrorSystem` up to the instant k, these sums give
-``n + G p_k`` as a bound at k: n from disturbances, rounding and the channels that disturbances
-drive, G from those that errors drive. If ``n + G b <= b``, b bounds all errors at every k. Bounds
-are rounded up; `absolute_sums`, which a search uses with its derivative, is fast and no guarantee.
+docs/methods/general_class.md, Peak bounds, in the letters used here: X_k, S and R of the sums, and
+``n + G b <= b``, n from disturbances, rounding and the channels that disturbances drive, G from
+those that errors drive. All is rounded up, but for `absolute_sums`, which a search uses.
 """
 
 from dataclasses import dataclass

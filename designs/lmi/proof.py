@@ -1,10 +1,7 @@
 """Why yes and why no: proofs at every vertex; blocks that bind, and a bound on the margin.
 
-Maximise t subject to F_i(x) - t I >= 0. For any matrices Z_i >= 0 the sum of <Z_i, F_i(x) - t I>
-is not negative at a feasible point, and it is affine in x and t: c0 + r'x - t sum tr Z_i >= 0.
-So t <= (c0 + r'x) / sum tr Z_i whatever the solver did; its dual solution only makes the bound
-sharp, with r of the size of its accuracy (C. Jansson, D. Chaykin, C. Keil, SIAM J. Numer.
-Anal. 46, 2007, use the same argument with intervals).
+Any matrices Z_i >= 0 bound the margin by t <= (c0 + r'x) / sum tr Z_i (docs/proofs.md, Matrix
+inequalities); a solver's dual solution makes it sharp, with r of the size of its accuracy.
 """
 
 from __future__ import annotations
