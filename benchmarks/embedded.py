@@ -28,7 +28,7 @@ from obsynth.designs.core.core import Seen
 from obsynth.designs.core.observer import STEP_OUTPUTS
 from obsynth.designs.core.outwards import Rounding
 from obsynth.designs.core.running import ROUND_UP, ULPS
-from obsynth.designs.general.step import Limits, build_core, memory_sizes, running
+from obsynth.designs.general.step import build_core, memory_sizes, running
 from obsynth.symbolic import Table
 
 HERE = Path(__file__).parent
@@ -97,7 +97,7 @@ def numbers(observer: ob.Observer) -> str:
     # what the third reading corrects is nothing, and K is zero
     assert not design.Z[:, 2].any()
     assert not design.K.any()
-    limits, (bound,) = Limits.of(design.extended.plant, precision), running(design)
+    limits, (bound,) = design.limits, running(design)
     value = {sp.Symbol(s.name): s.value for s in design.plant.constants}
     a, A = sp.symbols("a1:5"), sp.symbols("A1:5")
     outflow = [sp.sqrt(2 * sp.Symbol("g")) * a[i] / A[i] for i in range(4)]

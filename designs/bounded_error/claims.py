@@ -11,7 +11,7 @@ from obsynth.derive.rigour import is_positive_definite, prove_positive_definite
 from obsynth.derive.structure.conditions import decouple
 from obsynth.designs.bounded_error import lmis
 from obsynth.designs.bounded_error.lmis import ModelData
-from obsynth.designs.bounded_error.model import MATRICES, Derived, Limits, noise_box
+from obsynth.designs.bounded_error.model import MATRICES, Derived, noise_box
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import of_matrices, prove_rounding, step_error
 from obsynth.designs.bounded_error.step import running_bound
@@ -209,8 +209,8 @@ def _on_rounding(design: UioDesign) -> Iterator[str]:
     if not step_error(design)[1]:
         yield f"{said}, which is not proved for this plant"
         return
-    plant, limits = design.plant, Limits.of(design.plant, design.precision)
-    listed = signals.beyond((*plant.x, *plant.f, *plant.u), np.concatenate(limits))
+    plant = design.plant
+    listed = signals.beyond((*plant.x, *plant.f, *plant.u), np.concatenate(design.limits))
     where = f"{listed}, estimates too: there " if listed else ""
     yield (
         f"{where}{said}, which is proved for {signals.IEEE[design.precision]} rounded to nearest"

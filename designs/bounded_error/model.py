@@ -1,7 +1,7 @@
 """From a model to the numeric data of the method, structural conditions first."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +10,8 @@ from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import middle_and_radius
 from obsynth.derive.structure.conditions import detectability, unknown_input_condition
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
-from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.given import PlantClass
-from obsynth.designs.core.signals import finite_box, wider
+from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -88,25 +87,6 @@ MATRICES = ("A", "B", "B_f", "C", "D", "W1", "W2")
 """Of a split, by which a design stores them."""
 # Relative to the largest magnitude of each state: a few thousand roundings of one step.
 ROUNDING = 2.0**-40
-
-
-class Limits(NamedTuple):
-    """Where a bound goes on: boxes of states and their estimates, of faults, of inputs, (., 2).
-
-    States on which a derivative depends keep to their ranges, as do inputs that do not enter with
-    constant factors; others may leave theirs by its width, `LARGEST_SIGNAL` where there is none.
-    """
-
-    x: FloatArray
-    f: FloatArray
-    u: FloatArray
-
-    @classmethod
-    def of(cls, plant: Plant, precision: str = "double") -> "Limits":
-        """Read the limits of a plant."""
-        x, f, u = (finite_box(plant, kind, precision).reshape(-1, 2) for kind in "xfu")
-        curved, held = curved_states(plant)[:, None], covered_inputs(plant)[:, None]
-        return cls(np.where(curved, x, wider(x)), wider(f), np.where(held, u, wider(u)))
 
 
 @dataclass(frozen=True, eq=False)

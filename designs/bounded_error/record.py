@@ -13,6 +13,7 @@ from obsynth.derive.split import LinearForm
 from obsynth.designs.bounded_error.lmis import ErrorKind, ModelData, kept_coordinates
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design, Record
+from obsynth.designs.core.signals import Limits
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -92,6 +93,11 @@ class UioDesign(Design):
         names = {one.name for one in fields(ModelData)} & vars(self).keys()
         own = {name: getattr(self, name) for name in names}
         return ModelData(**own, vertices=vertices.mid, vertex_radius=vertices.rad)
+
+    @property
+    def limits(self) -> Limits:
+        """Where the bound goes on."""
+        return Limits.of(self.plant, self.precision)
 
     def kept(self, error: ErrorKind) -> list[int]:
         """Return which coordinates of x an error of a kind has."""

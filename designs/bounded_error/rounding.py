@@ -15,7 +15,7 @@ import numpy as np
 
 from obsynth.derive.rigour import ExactMatrix
 from obsynth.derive.structure.conditions import decouple
-from obsynth.designs.bounded_error.model import Limits, rounding_allowance
+from obsynth.designs.bounded_error.model import rounding_allowance
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.boxes import cut_box
@@ -57,8 +57,7 @@ def _moved(design: UioDesign) -> FloatArray:
 def of_matrices(design: UioDesign, off: Mapping[str, FloatArray]) -> FloatArray:
     """Bound what rounding the matrices of the split, by `off`, adds in one step, (n + n_f,)."""
     plant = design.plant
-    limits = Limits.of(plant, design.precision)
-    x, f = (np.abs(box).max(axis=1, initial=0.0) for box in (limits.x, limits.f))
+    x, f, _ = (np.abs(box).max(axis=1, initial=0.0) for box in design.limits)
     d, w = (np.abs(finite_box(plant, kind)).max(axis=1, initial=0.0) for kind in "dw")
     found, before = _through(design, off["C"] @ x + off["W2"] @ w)
     moved = off["D"] @ d + off["B_f"] @ (2.0 * f) + off["W1"] @ design.w_radius
@@ -70,7 +69,7 @@ def of_matrices(design: UioDesign, off: Mapping[str, FloatArray]) -> FloatArray:
 def of_step(design: UioDesign) -> FloatArray:
     """Bound what one step as it runs adds to xi and to the returned estimates, (n + n_f,)."""
     plant, C, E = design.plant, design.C, design.E
-    limits, n = Limits.of(plant, design.precision), len(design.A)
+    limits, n = design.limits, len(design.A)
     shift = design.W2 @ design.w_centre
     X = limits.x
     w_radius = np.abs(design.W2) @ design.w_radius

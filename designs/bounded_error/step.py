@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.bounded_error.model import Limits
 from obsynth.designs.bounded_error.record import UioDesign
 from obsynth.designs.core.boxes import Ends, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
@@ -165,11 +164,7 @@ def build_core(design: UioDesign) -> Core:
     bound, move = running_bound(design), equations(design)
     n, C, W2 = len(design.A), ca.DM(design.C), design.W2
     offset, noise = ca.DM(W2 @ design.w_centre), ca.DM(np.abs(W2) @ design.w_radius)
-    limits, curved, precision = (
-        Limits.of(design.plant, design.precision),
-        curved_states(design.plant),
-        design.precision,
-    )
+    limits, curved, precision = design.limits, curved_states(design.plant), design.precision
 
     def pick(one: ca.SX, other: ca.SX) -> ca.SX:
         return ca.vertcat(*(one[i] if curved[i] else other[i] for i in range(n)))

@@ -1,6 +1,7 @@
 """What methods read and say of ranges: sizes where there is none, nominal w, remainders."""
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -9,6 +10,7 @@ from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.derive.remainder.enclosure import carries_remainder
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.designs.core.limits import LIMITS
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
@@ -80,6 +82,25 @@ def wider(box: FloatArray) -> FloatArray:
     """Return a finite box that reaches beyond another by its width, up to `LARGEST_SIGNAL`."""
     wide = np.clip(box + np.diff(box, axis=1) * [-1.0, 1.0], -LARGEST_SIGNAL, LARGEST_SIGNAL)
     return np.column_stack([np.minimum(box, wide)[:, 0], np.maximum(box, wide)[:, 1]])
+
+
+class Limits(NamedTuple):
+    """Where a bound goes on: boxes of states and their estimates, of faults, of inputs, (., 2).
+
+    Inputs that do not enter with constant factors keep to their ranges, all else may leave its by
+    its width; `LARGEST_SIGNAL` stands where there is none.
+    """
+
+    x: FloatArray
+    f: FloatArray
+    u: FloatArray
+
+    @classmethod
+    def of(cls, plant: Plant, precision: str = "double", held: bool = True) -> "Limits":
+        """Read them; held: states on which a derivative depends keep to their ranges too."""
+        x, f, u = (finite_box(plant, kind, precision).reshape(-1, 2) for kind in "xfu")
+        kept = curved_states(plant)[:, None] & held, covered_inputs(plant)[:, None]
+        return cls(np.where(kept[0], x, wider(x)), wider(f), np.where(kept[1], u, wider(u)))
 
 
 def within(signals: Iterable[Signal], units: bool = False) -> str:

@@ -17,7 +17,7 @@ from obsynth.designs.general.model import GeneralModel, boxes
 from obsynth.designs.general.peak import error_sums, prove_peak
 from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import prove_rounding
-from obsynth.designs.general.step import Limits, steady
+from obsynth.designs.general.step import steady
 from obsynth.designs.general.storage import prove_storage
 from obsynth.designs.general.system import error_system, extra_inputs
 
@@ -186,8 +186,8 @@ def _on_rounding(design: GeneralDesign) -> str:
     """Say where the rounding of a step is bounded."""
     rounding = design.rounding
     largest = max(float(part.max(initial=0.0)) for part in (rounding.q, rounding.c, rounding.p))
-    plant, limits = design.extended.plant, Limits.of(design.extended.plant, design.precision)
-    listed = signals.beyond((*plant.x, *plant.u), np.vstack([limits.x, limits.u]))
+    plant = design.extended.plant
+    listed = signals.beyond((*plant.x, *plant.u), np.concatenate(design.limits))
     where = f"estimates and inputs with {listed}: there " if listed else ""
     return (
         f"{where}the rounding errors of one step stay below {largest:.1e} in every component, "

@@ -23,7 +23,6 @@ from obsynth.designs.general.model import CLASS, GeneralModel, of
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.rounding import settle
-from obsynth.designs.general.step import Limits
 from obsynth.designs.general.storage import attained_gain, with_ellipsoid, with_energy
 from obsynth.designs.general.synthesis import Units, solve_ellipsoid, solve_energy, units
 from obsynth.designs.general.system import error_system, extra_inputs
@@ -215,5 +214,5 @@ def peak_bounds(design: GeneralDesign) -> PeakBound:
             rho=rho,
         )
     b = small_gain_solution(sums.G, sums.n)
-    widest = np.diff(Limits.of(design.extended.plant, design.precision).x, axis=1)[:, 0]
+    widest = np.diff(design.limits.x, axis=1)[:, 0]
     return PeakBound(b, fade(system, b, widest))

@@ -11,6 +11,7 @@ from obsynth.derive.forms.extended import Extended, extend
 from obsynth.derive.jacobian.family import AffineFamily
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.record import Design, Record
+from obsynth.designs.core.signals import Limits
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
@@ -160,6 +161,11 @@ class GeneralDesign(Design):
     def extended(self) -> Extended:
         """The plant with its faults as states, derived from the stored equations."""
         return _extended(self.plant, self.unfollowed, self.divided)
+
+    @property
+    def limits(self) -> Limits:
+        """Where estimates and inputs are followed."""
+        return Limits.of(self.extended.plant, self.precision, held=False)
 
     @property
     def places(self) -> list[int]:

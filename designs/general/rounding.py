@@ -13,7 +13,7 @@ from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.rounding import Bound, rounding_bound
 from obsynth.designs.general.record import GeneralDesign, Rounding
-from obsynth.designs.general.step import Limits, stages
+from obsynth.designs.general.step import stages
 from obsynth.symbolic.arrays import FloatArray
 
 CELLS = 256
@@ -23,9 +23,9 @@ UP = 1.0 + 2.0**-40
 ROOM = 1.0 + 2.0**-10
 
 
-def shown(design: GeneralDesign, limits: Limits) -> FloatArray:
+def shown(design: GeneralDesign) -> FloatArray:
     """Bound the readings of states within the limits, (m,)."""
-    plant = design.extended.plant
+    plant, limits = design.extended.plant, design.limits
     sx = plant.sx()
     output = ca.Function("shown", [sx.x, sx.u, sx.w], [ca.densify(sx.y)], ["x", "u", "w"], ["y"])
     found = _over(design, output, {"x": limits.x, "u": limits.u, "w": plant.box("w")})["y"]
@@ -48,9 +48,7 @@ def _over(
 
 def needed(design: GeneralDesign) -> Rounding:
     """Bound what one step adds, rounded up."""
-    plant = design.extended.plant
-    limits = Limits.of(plant, design.precision)
-    most = shown(design, limits)
+    limits, most = design.limits, shown(design)
     boxes = {"x": limits.x, "u": limits.u, "y": np.column_stack([-most, most])}
     first, second, third = stages(design)
     leak = design.extended.leak(design.L0, most)

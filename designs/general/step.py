@@ -1,7 +1,5 @@
 """What runs: a prediction, corrected with the readings, and half widths around it."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,7 +7,7 @@ from numpy.typing import ArrayLike
 from obsynth.derive.rigour import add_up
 from obsynth.designs.core.boxes import Ends, column, every
 from obsynth.designs.core.core import Core, Known, Parts, Seen
-from obsynth.designs.core.equations import covered_inputs, curved_states
+from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.running import (
@@ -23,30 +21,11 @@ from obsynth.designs.core.running import (
     settle,
     shaken,
 )
-from obsynth.designs.core.signals import finite_box, wider
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.lmis import rounding_in
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
 from obsynth.designs.general.system import error_system, magnitude
-from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Where estimates and inputs are followed: boxes (N, 2), (n_u, 2).
-
-    Inputs that enter in no constant way keep to their ranges, all else may leave its by its width.
-    """
-
-    x: FloatArray
-    u: FloatArray
-
-    @classmethod
-    def of(cls, plant: Plant, precision: str = "double") -> "Limits":
-        """Read the limits of an extended plant."""
-        x, u = (finite_box(plant, kind, precision).reshape(-1, 2) for kind in "xu")
-        return cls(wider(x), np.where(covered_inputs(plant)[:, None], u, wider(u)))
 
 
 def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function]:
@@ -214,7 +193,7 @@ def build_core(design: GeneralDesign) -> Core:
     """Build what the observer knows of its own; half widths begin anew after a missing reading."""
     first, second, third = stages(design)
     plant, n = design.extended.plant, len(design.plant.x)
-    limits, precision = Limits.of(plant, design.precision), design.precision
+    limits, precision = design.limits, design.precision
     far = LIMITS[precision].far
     bounds = running(design)
     names, followed = design.plant.names("f"), design.extended.followed

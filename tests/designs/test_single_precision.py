@@ -24,7 +24,7 @@ from obsynth.designs.core.running import Running, all_around
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.rounding import settle, shown
-from obsynth.designs.general.step import Limits, build_core, memory_sizes, stages
+from obsynth.designs.general.step import build_core, memory_sizes, stages
 from obsynth.designs.set_membership.synthesis import frame
 from obsynth.designs.set_membership.zonotope import (
     Frame,
@@ -101,8 +101,8 @@ def test_the_allowances_are_those_of_the_precision():
     single = settle(design.changed(options={**design.options, "precision": "single"}))
     _, second, _ = stages(single)
     rng, count = np.random.default_rng(3), 4000
-    limits = Limits.of(design.extended.plant, "single")
-    most = shown(design, limits)
+    limits = single.limits
+    most = shown(single)
     x = rng.uniform(*limits.x.T[:, :, None], (len(limits.x), count)).astype(np.float32)
     u = rng.uniform(*limits.u.T[:, :, None], (len(limits.u), count)).astype(np.float32)
     y = rng.uniform(-1.0, 1.0, (len(most), count)) * most[:, None]

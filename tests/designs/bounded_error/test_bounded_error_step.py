@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.bounded_error.model import Limits
 from obsynth.designs.bounded_error.step import equations, first_bound
 from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.signals import Limits
 from obsynth.designs.core.step import Step
 
 

@@ -11,11 +11,12 @@ from tapes import NUMPY, tape
 import obsynth as ob
 from methods import PEAK_GAINS
 from obsynth.designs.bounded_error.claims import claims, covers, guarantee
-from obsynth.designs.bounded_error.model import Limits, rounding_allowance
+from obsynth.designs.bounded_error.model import rounding_allowance
 from obsynth.designs.bounded_error.rounding import of_matrices, of_step, settle
 from obsynth.designs.bounded_error.step import equations
 from obsynth.designs.core.boxes import cut_box
 from obsynth.designs.core.rounding import rounding_bound
+from obsynth.designs.core.signals import Limits
 
 
 def designed(plant, **options):
