@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -9,13 +10,9 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
 from obsynth.derive.errors import DerivationError, StructureError, UnboundedError
-from obsynth.designs.bounded_error import claims, model, step, synthesis
+from obsynth.designs.bounded_error import claims, model, printed, step, synthesis
 from obsynth.designs.bounded_error.claims import inverse_diagonal_bounds, prove_ellipsoid
-from obsynth.designs.bounded_error.lmis import (
-    ErrorKind,
-    ErrorSystem,
-    build_error_system,
-)
+from obsynth.designs.bounded_error.lmis import ErrorKind, ErrorSystem, ModelData, build_error_system
 from obsynth.designs.bounded_error.model import CLASS, NoiseBox, UioModel, read
 from obsynth.designs.bounded_error.record import EllipsoidBound, UioDesign
 from obsynth.designs.bounded_error.rounding import settle
@@ -247,11 +244,8 @@ class BoundedErrorUIO(Method):
             raise ObsynthError("the LMI is linear only for a fixed gamma: give gamma=")
         model: UioModel = self._checked(given, bounds)
         if self.form in ("printed", "repaired"):
-            from obsynth.designs.bounded_error.printed import box_vertices, multiplier_problem
-
-            data = model.design.data.at(box_vertices(model.bounds))
-            noise, weights = self._noise(model, 3), self._weights(model)
-            return multiplier_problem(data, self.gamma, noise, self.objective, weights, self.form)
+            data = model.design.data.at(printed.box_vertices(model.bounds))
+            return self._by_multipliers(model, data, self.gamma)
         system, free_or_fixed, weights = self._setting(model)
         return synthesis.design_problem(system, self.gamma, free_or_fixed, self.objective, weights)
 
@@ -282,7 +276,7 @@ class BoundedErrorUIO(Method):
                 return synthesis.largest_gamma(system)
 
         else:
-            solve, top = self._multiplier_form(model, weights)
+            solve, top = self._multiplier_form(model)
         n, m = model.design.K.shape
         kept = model.design.kept(self.error)
 
@@ -309,28 +303,24 @@ class BoundedErrorUIO(Method):
             )
         return complete(synthesis.search_gamma(solve, weights, largest))[0]
 
-    def _multiplier_form(self, model: UioModel, weights: FloatArray) -> tuple[Any, Any]:
-        from obsynth.designs.bounded_error.printed import (
-            box_vertices,
-            largest_multiplier_gamma,
-            refuse_printed,
-            synthesise_multipliers,
-        )
-
-        vertices = box_vertices(model.bounds)
-        data = model.design.data.at(vertices)
-        noise = self._noise(model, 3)
+    def _by_multipliers(self, model: UioModel, data: ModelData, gamma: float) -> Problem:
         form: Any = self.form
-        if form == "printed":
-            refuse_printed(data, vertices, self.gamma or 0.0)
+        noise, weights = self._noise(model, 3), self._weights(model)
+        return printed.multiplier_problem(data, gamma, noise, self.objective, weights, form)
+
+    def _multiplier_form(self, model: UioModel) -> tuple[Any, Any]:
+        data, noise = (
+            model.design.data.at(printed.box_vertices(model.bounds)),
+            self._noise(model, 3),
+        )
+        if self.form == "printed":
+            printed.refuse_printed(data, self.gamma or 0.0)
 
         def solve(gamma: float) -> EllipsoidSolution:
-            return synthesise_multipliers(data, gamma, noise, self.objective, weights, form)
+            problem = self._by_multipliers(model, data, gamma)
+            return printed.solve_multipliers(problem, gamma, noise)
 
-        def top() -> float:
-            return largest_multiplier_gamma(data)
-
-        return solve, top
+        return solve, partial(printed.largest_multiplier_gamma, data)
 
     def _complete(
         self,

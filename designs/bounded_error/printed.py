@@ -99,25 +99,17 @@ def largest_multiplier_gamma(data: ModelData) -> float:
     return synthesis.largest_feasible(state)
 
 
-def synthesise_multipliers(
-    data: ModelData,
-    gamma: float,
-    noise: FloatArray,
-    objective: Objective,
-    weights: FloatArray,
-    form: Literal["printed", "repaired"],
-) -> EllipsoidSolution:
-    """Solve (51) at a fixed gamma."""
-    problem = multiplier_problem(data, gamma, noise, objective, weights, form)
+def solve_multipliers(problem: Problem, gamma: float, noise: FloatArray) -> EllipsoidSolution:
+    """Solve (51) as it is stated at a gamma."""
     solution = solve_reliably(problem, floor=synthesis.FLOOR, gap=synthesis.GAP)
     gain = np.asarray(np.linalg.solve(solution["P"], solution["H"]), dtype=float)
     P = gamma * solution["P"]
     return EllipsoidSolution(gain, 0.5 * (P + P.T), gamma, noise)
 
 
-def refuse_printed(data: ModelData, vertices: FloatArray, gamma: float) -> None:
+def refuse_printed(data: ModelData, gamma: float) -> None:
     """Refuse the printed form where an error exists that no gain removes."""
-    point = find_fixed_point(data.A, data.B_f, data.C, data.T, vertices)
+    point = find_fixed_point(data.A, data.B_f, data.C, data.T, data.vertices)
     if point is None:
         return
     raise InfeasibleDesign(
