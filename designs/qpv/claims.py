@@ -16,6 +16,7 @@ from obsynth.designs.core.guard import MOST_CALLS, Watch
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.running import above
 from obsynth.designs.core.signals import IEEE, about_centre, at_centre, noise_centre, within
+from obsynth.designs.lmi.problem import Arithmetic, lift
 from obsynth.designs.lmi.proof import RUMP, FamilyProof, prove_family, prove_inverse
 from obsynth.designs.qpv import lmis
 from obsynth.designs.qpv.equations import measured_schedule
@@ -212,45 +213,29 @@ def undisturbed(design: QPVDesign) -> str:
 def _prove_term(
     design: QPVDesign, term: PolyaTerm, families: list[Enclosure], formula: Any
 ) -> FamilyProof:
-    data = design.data
-    P = Enclosure.of(design.P)
-    gains = [P @ Enclosure.of(gain) for gain in design.L]
-    enclosed = _lifted(data)
-    count = len(families[0].mid)
+    parts: dict[str, Any] = {}
+    kinds: tuple[Arithmetic, ...] = ("enclosure", "exact")
+    for kind in kinds:
+        P = lift(design.P, kind)
+        parts[kind] = P, [P @ lift(gain, kind) for gain in design.L], _lifted(design.data, kind)
 
-    def at(k: Any) -> Enclosure:
-        psi = [family.member(k) for family in families]
-        block: Enclosure = formula(P, lmis.close(P, gains, term, psi=psi, **enclosed))
-        return block
+    def block(kind: str, psi: list[Any]) -> Any:
+        P, gains, lifted = parts[kind]
+        return formula(P, lmis.close(P, gains, term, psi=psi, **lifted))
 
-    exact_P = ExactMatrix.of(design.P)
-    exact_gains = [exact_P @ ExactMatrix.of(gain) for gain in design.L]
-    exact_data = _exact(data)
-
-    def exactly(k: int) -> ExactMatrix:
-        psi = [ExactMatrix.of(family.mid[k]) for family in families]
-        closed = lmis.close(exact_P, exact_gains, term, psi=psi, **exact_data)
-        block: ExactMatrix = formula(exact_P, closed)
-        return block
-
-    return prove_family(count, at, exactly, exact_count=2)
+    return prove_family(
+        len(families[0].mid),
+        lambda k: block("enclosure", [family.member(k) for family in families]),
+        lambda k: block("exact", [ExactMatrix.of(family.mid[k]) for family in families]),
+        exact_count=2,
+    )
 
 
-def _lifted(data: VertexData) -> dict[str, list[Enclosure]]:
-    lifted = {
-        name: [
-            Enclosure.of(block, getattr(data, f"{name}_radius")) for block in getattr(data, name)
-        ]
-        for name in ("A", "C", "G", "H")
-    }
-    lifted["Cz"] = [Enclosure.of(block) for block in data.Cz]
-    return lifted
-
-
-def _exact(data: VertexData) -> dict[str, list[ExactMatrix]]:
+def _lifted(data: VertexData, kind: Arithmetic) -> dict[str, list[Any]]:
     return {
-        name: [ExactMatrix.of(block) for block in getattr(data, name)]
-        for name in ("A", "C", "G", "H", "Cz")
+        name: [lift(block, kind, getattr(data, f"{name}_radius", 0.0)) for block in blocks]
+        for name, blocks in vars(data).items()
+        if name in ("A", "C", "G", "H", "Cz")
     }
 
 
