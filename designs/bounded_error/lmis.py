@@ -24,8 +24,7 @@ ErrorKind = Literal["plain", "shifted"]
 class ModelData:
     """Everything numeric that the error system is formed from; E, T, Pi: of `Decoupling`.
 
-    vertices, vertex_radius (N, n, n): every Jacobian is a convex combination of matrices within the
-        radius of the vertices
+    vertices, vertex_radius (N, n, n): every Jacobian is a combination of matrices within these
     """
 
     A: FloatArray
@@ -132,10 +131,7 @@ def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSyste
 
 
 def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
-    """Error system in zeta = T x - z, which the noise w_{k+1} does not enter: e = zeta + E W2 w_k.
-
-    Written in coordinates of the range of T, in which zeta stays; see the method's page.
-    """
+    """Error system in zeta = T x - z (the method's page), in coordinates of the range of T."""
     n, n_f, m, n_w = data.sizes
     keep = kept_coordinates(data.T)
     part = _parts(data, arithmetic)

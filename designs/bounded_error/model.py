@@ -18,20 +18,14 @@ from obsynth.symbolic.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class NoiseBox:
-    """Boxes of the disturbances and of the fault increments per step.
-
-    w_centre, w_radius (n_w,), rate (n_f,)
-    """
+    """Boxes w_centre, w_radius (n_w,) of the disturbances, and fault increments rate (n_f,)."""
 
     w_centre: FloatArray
     w_radius: FloatArray
     rate: FloatArray
 
     def equal_weights(self, blocks: int = 3) -> FloatArray:
-        """Weights of the components of v in units of its boxes, summing to 1 (see the errata).
-
-        Q_v = 1/3 diag(Q_w, Q_eps, Q_w) of circumscribed ellipsoids; no w_{k+1} where ``blocks=2``.
-        """
+        """Weights Q_v of v in units of its boxes (see the errata); 2 blocks are without w_{k+1}."""
         n_w, n_f = self.w_radius.size, self.rate.size
         parts = [np.full(n_w, 1.0 / max(n_w, 1)), np.full(n_f, 1.0 / max(n_f, 1))]
         if blocks == 3:

@@ -59,10 +59,7 @@ def multiplier_problem(
     weights: FloatArray,
     form: Literal["printed", "repaired"],
 ) -> Problem:
-    """State (51) with variables P, H, alpha, beta, U (printed) or P, H, a >= 0, b (repaired).
-
-    As in `design_problem`, P and H stand for gamma times those of the paper.
-    """
+    """State (51), printed or repaired; P and H are gamma times those of the paper."""
     problem = Problem(f"(51), {form}, at gamma = {gamma:.6g}")
     P = _state(problem, data, gamma, noise, form, synthesis.MARGIN)
     synthesis.set_objective(problem, P, objective, weights, np.ones(len(weights)))
@@ -197,10 +194,7 @@ def find_fixed_point(
     seed: int = 0,
     starts: int = 12,
 ) -> FixedPoint | None:
-    """Search every vertex (N, n, n) for a fixed point that makes (51) infeasible.
-
-    ``min(q1, q2)`` is maximised over the exact space of solutions, rounded and checked exactly.
-    """
+    """Search every vertex (N, n, n) for a fixed point that makes (51) infeasible, exactly."""
     from scipy.optimize import minimize
 
     space = _solution_space(A, B_f, C, T)

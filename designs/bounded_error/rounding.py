@@ -132,10 +132,7 @@ def _outward(box: FloatArray, share: float) -> FloatArray:
 
 @functools.lru_cache(maxsize=8)
 def step_error(design: UioDesign) -> tuple[FloatArray, bool]:
-    """Return what the allowance has to hold of one step, (n + n_f,), and whether it is proved.
-
-    Where branches of several states meet, the bound may be of no use, and the allowance is assumed.
-    """
+    """Return what the allowance has to hold of one step, and whether that is proved or assumed."""
     step = of_step(design)
     size = max(1.0, float(np.abs(finite_box(design.plant, "x")).max()))
     if np.all(step <= USEFUL * size) or design.precision == "single":

@@ -80,8 +80,7 @@ def settling(
 def equations(design: UioDesign) -> ca.Function:
     """(z, fhat, u, y) -> (xhat, innovation, next_state, z_next, fhat_next), y less W2 w_centre.
 
-    Equations (10)-(12) by the innovation and the plant's own rows without d: nothing is lost by
-    rounding the split, N, G or L (the method's page, Observer).
+    (10)-(12) without N, G, L and the split, which would be rounded (the method's page, Observer).
     """
     model, C = design.plant, ca.DM(design.C)
     sizes = {"z": len(model.x), "fhat": len(model.f), "u": len(model.u), "y": C.shape[0]}
@@ -157,10 +156,7 @@ def first_bound(design: UioDesign, x: Ends, f: Ends, kept: Parts) -> ca.SX:
 
 
 def build_core(design: UioDesign) -> Core:
-    """Build what the observer knows of its own: `equations`, with half widths around them.
-
-    A missing reading moves the estimates like its prediction, and the half widths begin anew.
-    """
+    """Build the core: `equations` and half widths, which begin anew after a missing reading."""
     bound, move = running_bound(design), equations(design)
     n, C, W2 = len(design.A), ca.DM(design.C), design.W2
     offset, noise = ca.DM(W2 @ design.w_centre), ca.DM(np.abs(W2) @ design.w_radius)

@@ -135,10 +135,7 @@ def synthesise(
 def analyse_gain(
     system: ErrorSystem, gain: FloatArray, noise: FloatArray | None, weights: FloatArray
 ) -> EllipsoidSolution:
-    """Find the best ellipsoid and gamma for a given gain: the least weighted trace of P^-1.
-
-    It is log-convex in gamma (the method's page, Given gains), so that its one minimum is found.
-    """
+    """Find ellipsoid and gamma of a gain: one minimum (the method's page, Given gains)."""
     radius = _decay_limit(system, gain)
     if radius >= 1.0:
         raise InfeasibleDesign(

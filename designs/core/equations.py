@@ -23,10 +23,7 @@ MOST_NODES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """What is known of an instant: sets of states and faults, inputs and scheduling.
-
-    rest: sets of what else is unknown, see `Equations`; by default their ranges
-    """
+    """What is known of an instant: sets of states, faults and the rest, inputs, scheduling."""
 
     states: Ends
     faults: Ends

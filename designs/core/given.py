@@ -44,10 +44,7 @@ MATRIX = "matrix"
 
 
 def check_options(method: Any) -> None:
-    """Hold every field of a frozen dataclass against its annotation; sequences become tuples.
-
-    What `read_option` does not know a method checks by itself.
-    """
+    """Hold every option against its annotation, see `read_option`; sequences become tuples."""
     hints = get_type_hints(type(method), include_extras=True)
     for option in fields(method):
         value = read_option(option.name, hints[option.name], getattr(method, option.name))

@@ -41,10 +41,7 @@ YOUNG = "_2"
 
 @dataclass(frozen=True)
 class Watch:
-    """Options of the guard, the same for every method, see `Method`.
-
-    horizon: None: as many calls as the core's bounds take to settle
-    """
+    """Options of the guard, see `Method`; horizon None: what the core takes to settle."""
 
     horizon: int | None
     recovery: int
@@ -157,10 +154,7 @@ class Guard:
 
     @cached_property
     def settled(self) -> tuple[int, FloatArray | None, int]:
-        """N, the half widths of a core that has settled, and the calls that the contractor has.
-
-        The older copy began N calls ago; its core takes some of them to settle.
-        """
+        """N, half widths of a core that settled since N calls, and the contractor's calls."""
         horizon = self.watch.horizon
         late = _LATE if horizon is None else min(_LATE, horizon - 1)
         passes = MOST_PASSES if horizon is None else min(MOST_PASSES, (horizon - late) // 2)

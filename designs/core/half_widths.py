@@ -87,10 +87,7 @@ class HalfWidths:
 
     @property
     def begun(self) -> FloatArray:
-        """What a core begins from: what one instant says.
-
-        A fault without a declared range is known by the inversion one call late.
-        """
+        """What a core begins from: what one instant says, faults by ranges or one call late."""
         n = len(self.contractor.domain)
         waits = not np.isfinite(self.declared[n:]).all()
         found = (self.envelope if waits else self.declared).copy()

@@ -55,10 +55,7 @@ def _pushes(plant: Plant, kind: str) -> FloatArray:
 
 
 def held_in_single(plant: Plant) -> Plant:
-    """Return a plant whose ranges single precision holds, or refuse it by name.
-
-    Ends of what is measured, which a step compares with, become numbers of it outside of them.
-    """
+    """Return a plant with ranges in single precision, measured ones outwards, or refuse it."""
     limit = LIMITS["single"].huge
     ends: dict[str, tuple[float, float]] = {}
     for kind in ("x", "u", "d", "f", "w", "p", "rho"):

@@ -161,8 +161,7 @@ def finite_or(vector: ca.SX, other: ca.SX | ca.DM | Sequence[float], finite: flo
 def could_be_written(parts: Mapping[str, ca.SX], nonnegative: Sequence[str], real: str) -> ca.SX:
     """Return 1 where a step can have written parts of a memory, else 0.
 
-    Some are not negative, ends of boxes are in order, and the sum of all others is a finite number
-    of the precision `real`.
+    Some are not negative, ends of boxes are in order, the sum of all others is finite.
     """
     total, held = ca.SX(0), ca.SX(1)
     for name, part in parts.items():
@@ -186,10 +185,7 @@ def counter(count: ca.SX, limit: float) -> ca.SX:
 def extended(
     ode: ca.Function, sizes: Mapping[str, int], layout: Mapping[str, slice], mark: str
 ) -> ca.Function:
-    """Return a right-hand side for the guarded memory from one for the core's own.
-
-    What is the guard's stands still, as does a memory that was not initialised.
-    """
+    """Return an ode of the guarded memory from a core's; what is not the core's stands still."""
     names = ode.name_in()
     ports = [ca.SX.sym(name, ode.numel_in(i)) for i, name in enumerate(names)]
     ports[0] = memory = ca.SX.sym("memory", layout["initialised"].stop)

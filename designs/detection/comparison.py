@@ -17,10 +17,7 @@ VOID, RECOVERING = STATUS["void"], STATUS["recovering"]
 
 @dataclass(frozen=True)
 class Void:
-    """Instants from a void until the step has recovered.
-
-    first, last: the first and the last void; count: how many; until: the last recovering instant
-    """
+    """Voids from first to last, how many, and the last instant that recovers from them."""
 
     first: int
     last: int

@@ -35,10 +35,7 @@ def core_of(observer: Any) -> Core | None:
 
 
 def bounded_faults(observer: Observer) -> NDArray[np.bool_]:
-    """Return which faults have an interval that anything measured can make narrower.
-
-    Not those that are infinite, or handed on from call to call as they were declared.
-    """
+    """Return which faults have an interval that anything measured can make narrower."""
     step, n_f = observer.step, len(observer.model.f)
     ports = [ca.SX.sym(name, step.numel_in(i)) for i, name in enumerate(step.name_in())]
     try:

@@ -1,12 +1,8 @@
 """The mean of every fault over the last m instants, for any course of the fault.
 
-It lies in (P(X_k) - P(X_{k-m}) - sum_j D(X_j, u_j, F_j, W)) / m for every relation between states
-and the fault, and in the mean of the F_j: docs/step.md, Means of faults over a window. Operations
-are rounded outwards, and sums are formed anew at every call from what is remembered of m-1
-instants. A mean that is empty contradicts the assumptions: it is void, and the window begins anew.
-
-D is simplified as text before it is enclosed: what x, f and ``c'F`` have in common is gone. Weights
-c are rows alone, and pairs of rows in which a term that both have cancels.
+docs/step.md, Means of faults over a window. D of a relation is simplified as text before it is
+enclosed: what x, f and ``c'F`` have in common is gone. Every operation is rounded outwards, and
+sums are formed anew at every call from what is remembered of m-1 instants.
 """
 
 from functools import cached_property, reduce

@@ -116,10 +116,7 @@ class Corners:
 
 
 def build_core(design: BankDesign) -> Core:
-    """Build the bank: docs/methods/filter_bank.md, Equations of the step.
-
-    What the envelope leaves of a measured state stands in for a reading that is missing.
-    """
+    """Build the bank: docs/methods/filter_bank.md, Equations of the step."""
     outputs = design.outputs.tolist()
     box = outward(design.region, design.precision)
     region, precision = ca.DM(box), design.precision
@@ -242,11 +239,7 @@ def fault_intervals(design: BankDesign, parts: Parts, shown: tuple[ca.SX, ...]) 
 
 
 def telling(found: Sequence[Ends]) -> Ends:
-    """Return the first filter's intervals, for a fault that another one shows before it that one's.
-
-    A fault that was zero throughout has means of zero, so one interval without it is a proof of the
-    fault, whatever the others say. The one farthest from zero is taken.
-    """
+    """Return the first filter's intervals, or that farthest from zero, which proves a fault."""
     low, high = ca.SX(found[0].lower), ca.SX(found[0].upper)
     for j in range(low.numel()):
         away, silent = ca.SX(0), ca.logic_and(low[j] <= 0.0, high[j] >= 0.0)

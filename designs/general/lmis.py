@@ -17,10 +17,7 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """The maps E, Y and rows z of the channels. Shapes: N errors, n_q channels, K entries of s.
-
-    before, after: which components of v stand for v_k and v_{k+1}, n_w in all
-    """
+    """E, Y, rows z (n_q, K) of the channels, components of v that stand for v_k and v_{k+1}."""
 
     E: Enclosure
     Y: Enclosure

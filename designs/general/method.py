@@ -70,10 +70,7 @@ class GeneralUIO(Method):
         return cls(**options, **other.watched)
 
     def _design(self, model: Any, bounds: JacobianBounds | None) -> Observer:
-        """Design, prove and return the observer.
-
-        Where no gain follows the faults, or none has a rate, `WAYS` are tried.
-        """
+        """Design, prove and return the observer; by `WAYS` where faults are not followed."""
         followed = self.faults == "followed" and bool(model.f)
         loose = not any(s.rate is not None or s.constant for s in model.f)
         if followed and loose and self.bounds != "l2":
@@ -114,11 +111,7 @@ class GeneralUIO(Method):
         return self._stored(given, weights, units(given, weights))
 
     def fix(self, model: GeneralModel, gains: Mapping[str, ArrayLike]) -> GeneralDesign:
-        """Bound the errors of given gains.
-
-        ``L`` (n + n_f, m) corrects states and followed faults; ``K`` (n, m) and ``F`` (n_f, m) move
-        their next prediction by what is left of the innovation.
-        """
+        """Bound the errors of ``L`` (n + n_f, m); ``K``, ``F`` (., m) move the next prediction."""
         blank, n = model.design, len(model.design.plant.x)
         N, m = blank.L0.shape
         shapes = {"L": (N, m), "K": (n, m), "F": (N - n, m)}

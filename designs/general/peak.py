@@ -26,11 +26,7 @@ SLACK = 2.0**-40
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteSums:
-    """``sum_k |Q A^k B|`` over a number of steps, with what its derivative needs.
-
-    squares: A, A^2, A^4, ...; left, right: the factors after every doubling
-    responses: every ``Q A^k B``, as (left steps, n_o, right steps, n_i)
-    """
+    """``sum_k |Q A^k B|``, every response (left, n_o, right, n_i), and factors of doublings."""
 
     total: FloatArray
     squares: list[FloatArray]
@@ -110,10 +106,7 @@ class PowerSum:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Absolute impulse responses ``|Q A^k B|`` of every output to every input, total their sum.
-
-    terms, spread: ``|Q A^k B| <= terms[k] + spread``, terms zero beyond the last
-    """
+    """Bounds ``|Q A^k B| <= terms[k] + spread``, terms zero beyond the last, and their total."""
 
     terms: FloatArray
     spread: FloatArray

@@ -150,10 +150,7 @@ def steady(design: GeneralDesign) -> FloatArray:
 def settling(
     design: GeneralDesign, box: FloatArray, calls: int | None = None
 ) -> tuple[int, FloatArray] | None:
-    """Return how many calls bounds from boxes (n + n_f,) take to settle, and the largest then.
-
-    Around estimates that are as near as the limits say; None of an energy gain.
-    """
+    """Return how many calls bounds from boxes take to settle, and the largest then, or None."""
     bounds = running(design)
     if not bounds:
         return None

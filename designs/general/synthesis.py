@@ -38,10 +38,7 @@ LEAST_LEVEL = 1e-24
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Numbers that a solver found, in the units of the plant.
-
-    Z (N, m), P (N, N), gamma; noise (n_w,) and tau (n_q,): diagonals; level: mu
-    """
+    """Numbers found, in units of the plant; noise, tau: diagonals; level: mu."""
 
     Z: FloatArray
     P: FloatArray
@@ -53,10 +50,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Units:
-    """A start, and what the unknowns are measured in: errors x (N,), readings y (m,).
-
-    bounded: whether a small-gain matrix below one was found, so that a design exists
-    """
+    """A start, units of errors x (N,), readings y (m,), and whether a bound was found."""
 
     Z: FloatArray
     x: FloatArray

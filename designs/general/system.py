@@ -1,12 +1,8 @@
 """The error system of the general class, enclosed: docs/methods/general_class.md, The observer.
 
-    e_q  = T e_p - L0 V v ,    e_c  = e_q - Z nu ,
-    nu   = C0 e_q + V0 v + sum_j b_j delta'_j [e_q; v]_(c_j) ,
-    e_p+ = A0 e_c - K nu + W0 v + sum_j b_j delta_j [e_c; v]_(c_j) ,
-
-v less its middle, with ``|delta_j|, |delta'_j| <= r_j``, where delta of F and delta' of h are
-independent, but delta' is the same for both gains: an innovation moves ``back = A0 Z + K`` in all,
-e_p+ is ``A0 e_q - back nu`` and so on. There is one channel for every column of every direction.
+With e_p, e_q, e_c the errors of the three stages, v less its middle, T = I - L0 C, and a channel
+``b delta z``, |delta| <= r, for every column of every direction; an innovation moves
+``back = A0 Z + K`` in all.
 """
 
 from dataclasses import dataclass
@@ -21,11 +17,7 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Uncertain columns: ``b delta z`` with z one component of [e; v] and ``|delta| <= radius``.
-
-    columns: the b, shape (rows, count)
-    radii, sources: of each, shape (count,)
-    """
+    """Columns ``b delta z`` (rows, count), z an entry of [e; v], ``|delta| <= radius``."""
 
     columns: FloatArray
     radii: FloatArray

@@ -18,10 +18,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """The error system with P multiplied in, so that it is affine in the unknowns.
-
-    PG, PKC (n, n): P (I - F C) and P K C; HC, DC (n_f, n); A (n, n) or a family
-    """
+    """The error system with P multiplied in: P (I - F C), P K C, H C, D C, A or a family, W."""
 
     P: Any
     PG: Any
@@ -69,14 +66,8 @@ def dissipation_block(
 ) -> Any:
     """V+ - V + |f - fhat|^2 < mu^2 |w|^2 for every value of the nonlinearity, mu2 (1, 1).
 
-        [ P - sum tau_i R_i   *       *      *   *
-          0                   T       *      *   *
-          0                   0       mu^2   *   *
-          X                   P G E   P G W  P   *
-          H C A + D C         H C E   H C W  0   I ]  > 0
-
-    with G = I - F C: (26) put right, one multiplier per group of the sector; at every vertex,
-    without multipliers, where there is no sector.
+    (26) put right, with one multiplier per group of the sector: the method's page, Conditions; at
+    every vertex, without multipliers, where there is no sector.
     """
     n_f, n_w = loop.HC.shape[0], loop.W.shape[1]
     c = loop.HC @ loop.A + loop.DC

@@ -173,10 +173,7 @@ def _normalised(matrix: FloatArray) -> FloatArray:
 
 
 def check_detectability(parts: Split, G: FloatArray, vertices: FloatArray) -> None:
-    """Test the pair (G (A + M), C) at every vertex: the zeros of (A + M, L, C) have to be stable.
-
-    Observability of (A, C), which the paper asks for, is not enough: a fault hides a zero's motion.
-    """
+    """Test (G (A + M), C) at every vertex: the zeros of (A + M, L, C) have to be stable."""
     n = len(parts.A)
     names = parts.model.names("x")
     for index, M in enumerate(vertices):

@@ -26,10 +26,7 @@ def first_memory(design: HinfDesign, start: Start) -> dict[str, ArrayLike]:
 
 
 def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
-    """Return A xhat + B u + g(c, u) with c the nearest point of the box of the states.
-
-    The plant at c, w at its middle, is A c + B u + g(c, u) and what that w adds.
-    """
+    """Return A xhat + B u + g(c, u), c the nearest point of the box, by the plant's own rows."""
     nearest = clip(xhat, model.box("x"))
     kinds = ("d", "f", "w", "p", "rho")
     quiet = [ca.DM.zeros(len(model.names(kind))) for kind in kinds]
@@ -41,8 +38,7 @@ def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
 def build_core(design: HinfDesign) -> Core:
     """Build the filter (18)-(19) (the method's page, Filter), which gives estimates and no sets.
 
-    The first sample has no prediction behind it: xhat_0 is the guess. One missing entry of y
-    leaves no innovation in any: the gains mix them.
+    One missing entry of y leaves no innovation in any: the gains mix them.
     """
     model, C, gains = design.plant, ca.DM(design.C), design.gains
 

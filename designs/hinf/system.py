@@ -29,10 +29,7 @@ HORIZON = 60
 
 @dataclass(frozen=True, eq=False)
 class SectorForm:
-    """How a nonlinearity is bounded by a sector, see the options of `HinfUIO`.
-
-    given: diagonal of M'M where it is given and only proved
-    """
+    """How a sector is made, see `HinfUIO`; given: the diagonal of M'M, which is only proved."""
 
     multipliers: Multipliers
     drop_zero_rows: bool = True
@@ -41,10 +38,7 @@ class SectorForm:
 
 @dataclass(frozen=True, eq=False)
 class Sector:
-    """What the nonlinearity may do: s = E phi, |phi of group g|^2 <= e' diag(R_g) e.
-
-    group: of every phi; one multiplier per group
-    """
+    """s = E phi, |phi of group g|^2 <= e' diag(R_g) e, with one multiplier per group."""
 
     E: Annotated[FloatArray, "n k"]
     group: tuple[int, ...]

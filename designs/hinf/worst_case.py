@@ -34,10 +34,7 @@ CLOSE = 1.0 - 1e-6
 
 @dataclass(frozen=True, eq=False)
 class OperatingPoints:
-    """Points (x, u, v) with x = f(x, u, v): v are the faults and unknown inputs that hold them.
-
-    jacobian (N, n, n): of the right-hand side by x
-    """
+    """Points x = f(x, u, v), v faults and d, with Jacobians (N, n, n) by x."""
 
     x: FloatArray
     u: FloatArray
@@ -77,10 +74,7 @@ def _batch(function: ca.Function, *arguments: FloatArray) -> FloatArray:
 def hold_points(
     model: Plant, x: FloatArray, u: FloatArray, functions: Functions | None = None
 ) -> OperatingPoints:
-    """Move points x (N, n), u (N, n_u) to the nearest at which faults and d can hold the plant.
-
-    Gauss-Newton on x = f(x, u, v); what does not converge or leaves the ranges is left out.
-    """
+    """Move points x (N, n), u (N, n_u) to the nearest that faults and d can hold, if any."""
     rhs, slopes = functions or _functions(model)
     n, n_u = x.shape[1], u.shape[1]
     z = np.hstack([x, u, np.zeros((len(x), rhs.size_in(2)[0]))])

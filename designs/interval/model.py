@@ -42,8 +42,7 @@ Prefer = Sequence[str] | Mapping[str, str] | None
 class IntervalModel(Record):
     """x+ = A(rho) x + B(rho) u + o(rho) + F (f, d) + W1 w and y = C x + W2 w, in discrete time.
 
-    family: the stacked matrix [A B o], affine in independent scalars
-    scheduled: states and inputs on whose declared range the family rests
+    family: of [A B o], affine in scalars; scheduled: on whose declared ranges it rests
     """
 
     plant: Plant

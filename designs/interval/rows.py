@@ -25,10 +25,7 @@ SMALLEST: Mapping[Precision, float] = {"double": 2.0**-1000, "single": 2.0**-120
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """upper = max_i U_i s and lower = min_i L_i s; sizes: the parts of s in their order.
-
-    radius: what the matrices may be off, as a coefficient of |s|
-    """
+    """upper = max_i U_i s, lower = min_i L_i s; sizes: of the parts of s; radius: off by |s|."""
 
     sizes: Mapping[str, int]
     upper: tuple[Exact, ...]

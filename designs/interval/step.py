@@ -116,10 +116,7 @@ def _contract(design: IntervalDesign, r: Ends, y: ca.SX, u: ca.SX) -> Ends:
 
 
 def build_core(design: IntervalDesign) -> Core:
-    """Build the observer: contraction, sets of x_k and f_{k-1}, prediction.
-
-    A reading that is missing leaves nothing to predict from: the decoupling needs them all.
-    """
+    """Build the observer: contraction, sets of x_k and f_{k-1}, prediction from all readings."""
     plant, n_f = design.plant, design.n_f
     first = _Evaluated.of(design.first_rows, design)
     rows = ("state_rows", "estimate_rows", "prediction_rows", "share_rows")

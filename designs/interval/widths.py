@@ -189,10 +189,7 @@ def contraction_width(rows: Rows, slack: FloatArray, part: Part, component: int)
 
 
 def steady(step: WidthMap) -> tuple[FloatArray, FloatArray] | None:
-    """Return (e*, w*) in doubles, or None if the errors grow without bound.
-
-    From the solution without contraction, which the step maps below itself, or else from zero.
-    """
+    """Return (e*, w*) in doubles, or None if the errors grow without bound."""
     n2 = len(step.part.e_rest)
     if n2 == 0:
         return np.zeros(0), np.zeros(0)

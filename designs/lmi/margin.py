@@ -97,10 +97,7 @@ class MarginSolution:
 def largest_margin(
     problem: Problem, *, caps: Mapping[str, Inequality] | None = None, explain: bool = True
 ) -> Margin:
-    """Phase 1: the largest t with every strict block >= t I, measured at the point found.
-
-    That there is none is believed of a solved problem only.
-    """
+    """Phase 1: the largest t with every strict block >= t I, measured at the point found."""
     t = scalar(_MARGIN)
     first = problem.tightened(t)
     first.add("margin.limit", t <= 1.0)

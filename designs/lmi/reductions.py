@@ -19,20 +19,14 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class Extremes:
-    """The extreme points among given points, by row, and how the others follow from them.
-
-    weights: for every other row, weights of rows kept or dropped later that give it exactly
-    """
+    """Extreme points by row, and weights of kept or dropped rows that give the others exactly."""
 
     kept: IntArray
     weights: Mapping[int, Mapping[int, Fraction]]
 
 
 def extreme_points(points: ArrayLike) -> Extremes:
-    """Drop points that are convex combinations of others, and what stands twice.
-
-    An inequality that is affine in a parameter holds at all points if it holds at the extreme ones.
-    """
+    """Drop points that are convex combinations of others, and what stands twice, exactly."""
     # Adding zero makes one zero of the two, so that equal rows have equal bytes.
     array = np.asarray(points, dtype=float) + 0.0
     if array.ndim != 2 or not np.isfinite(array).all():
@@ -55,11 +49,7 @@ def extreme_points(points: ArrayLike) -> Extremes:
 
 @dataclass(frozen=True, eq=False)
 class SplitFamily:
-    """A family written as one common inequality and a small one per vertex.
-
-    common, members: inequalities >= 0, the former None if nothing is common
-    rows, shared: of the family that ``members`` has, and those that both have, with the slack
-    """
+    """One common inequality, or None, one per vertex, its rows, and those that both share."""
 
     common: Affine | None
     members: Affine

@@ -19,10 +19,7 @@ _GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 @dataclass(frozen=True)
 class Bisection:
-    """The limit of feasibility along a line, and how many problems were solved.
-
-    feasible, infeasible: last values found so; the latter None if the whole line is feasible
-    """
+    """The limit of feasibility along a line; infeasible None if all of it is feasible."""
 
     feasible: float
     infeasible: float | None
@@ -142,10 +139,7 @@ def search_log_convex(
     rtol: float = 1e-3,
     most: int = 40,
 ) -> Search[Result]:
-    """Minimise an objective whose logarithm is known to be convex along a line.
-
-    Chords through the points tried bound it from below, so that the search knows when to stop.
-    """
+    """Minimise a log-convex objective along a line; chords say when to stop."""
     record = _Record(design, objective)
 
     def left_over() -> float:

@@ -101,10 +101,7 @@ def _attempts(problem: Problem, second_solvers: Sequence[str]) -> Iterator[Solut
 
 @dataclass(frozen=True, eq=False)
 class LazySolution:
-    """A solution found with some vertices and checked at all.
-
-    problem, chosen: as it was stated in the last round, vertices by family, the others whole
-    """
+    """A solution found with some vertices by family, as stated last, and checked at all."""
 
     solution: Solution
     problem: Problem
@@ -119,10 +116,7 @@ def solve_lazily(
     floor: float | Callable[[Problem, Solution], float] = 0.0,
     solve: Callable[[Problem], Solution] = solve_with_retries,
 ) -> LazySolution:
-    """Solve a problem whose families may have many vertices, none left below the floor.
-
-    start: vertices that mattered to a like problem before, by family.
-    """
+    """Solve a problem with many vertices, from some of a start, none left below the floor."""
     families = {
         item.name: item.expression
         for item in problem.blocks.values()

@@ -106,10 +106,7 @@ def psi_family(
 
 
 def psi_kept(N: FloatArray, sets: ErrorSets) -> FloatArray:
-    """Return the distinct extreme values of Psi among all pairs, for N (V, n, n, n).
-
-    An inequality that is affine in Psi holds at all pairs if it holds at these.
-    """
+    """Return the distinct extreme values of Psi among all pairs, for N (V, n, n, n)."""
     families = np.stack([psi_family(block, sets).mid for block in N], axis=1)
     count = len(families)
     flat = families.reshape(count, -1)

@@ -23,10 +23,7 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class PolyaTerm:
-    """Integer weights of one term: `single` of what depends on one index, `double` of products.
-
-    total: s (s - 1), the sum of either kind; 1 for collapsed terms
-    """
+    """Weights of one term: `single`, and of products `double`; total s (s - 1), or 1."""
 
     total: int
     single: NDArray[np.int64]
@@ -56,10 +53,7 @@ def polya_terms(vertices: int, order: int) -> tuple[PolyaTerm, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """One Polya term of the closed loop, `total` times what belongs to it.
-
-    drift, side: he{P (A + Psi) - Gamma C}, P G - Gamma H, the latter None without disturbances
-    """
+    """One term, times total: he{P (A + Psi) - Gamma C}, P G - Gamma H or None, Cz."""
 
     total: Any
     drift: Any

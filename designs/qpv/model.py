@@ -271,10 +271,7 @@ def read_noise(rate: float | None, model: Plant) -> NoiseBound | None:
 
 
 def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> None:
-    """Refuse states and faults that no output shows somewhere in the sets (Section 3).
-
-    A column of (A + Psi, C) that vanishes there belongs to an integrator that no gain reaches.
-    """
+    """Refuse states and faults that no output shows somewhere in the sets (Section 3)."""
     from scipy.optimize import linprog
 
     n = data.A.shape[1]
@@ -304,10 +301,7 @@ def check_faults(data: VertexData, sets: ErrorSets, names: tuple[str, ...]) -> N
 
 
 def default_sets(form: QPV) -> Mapping[str, Any]:
-    """Return region, E_x and initial_error by name: docs/methods/qpv_observer.md, Plant class.
-
-    Without a fault at the start, as `Observer.memory0` takes it.
-    """
+    """Return region, E_x and initial_error by name: docs/methods/qpv_observer.md, Plant class."""
     plant = form.model
     boxes = np.vstack([plant.box("x"), plant.box("f").reshape(-1, 2)])
     loose = [s.name for s in (*plant.x, *plant.f) if not s.bounded]

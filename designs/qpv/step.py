@@ -107,10 +107,7 @@ class _Sizes:
 
 
 def build_core(design: QPVDesign) -> Core:
-    """Build the Runge-Kutta step of order four with u, y and theta held, and the bound of V.
-
-    A missing reading is replaced by what is expected, and the bound begins anew.
-    """
+    """Build the Runge-Kutta step, readings held, and the bound of V, begun anew after gaps."""
     n, m = len(design.plant.x), len(design.plant.output)
     equations, sizes, follow = Equations(design), _Sizes.of(design), build_update(design)
     precision, lost = design.precision, of_outputs(design)

@@ -67,11 +67,7 @@ def columns(parts: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What drives one of the two bounding systems.
-
-    M (n, n), c (n, 1): A_o - L C, and inputs, offset, disturbances and outputs
-    size (n, 1): sum of the magnitudes of what c is made of
-    """
+    """M = A_o - L C (n, n), what drives it, c (n, 1), and the magnitudes of its terms."""
 
     M: ca.SX
     c: ca.SX
@@ -186,10 +182,7 @@ class Pull:
 def pulls(
     design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX], sizes: ca.SX
 ) -> tuple[list[list[Pull]], list[list[Pull]]]:
-    """Return what bounds every fault from above and below, the others anywhere in their bounds.
-
-    By N_m theta <= r_m and r_M <= N_M theta and the signs of N; sizes (m, 1): of the readings.
-    """
+    """Return what bounds every fault from above and below, others in their bounds, by N's signs."""
     N, size = responses(design, memory), sizes + shown_size(design, memory)
     bounds = memory["theta_m"], memory["theta_M"]
     found: tuple[list[list[Pull]], list[list[Pull]]] = ([], [])
@@ -219,10 +212,7 @@ def shown_size(design: SetDesign, memory: Memory) -> ca.SX:
 
 
 def theta_rates(design: SetDesign, memory: Memory, r: tuple[ca.SX, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return the derivatives of theta_m and theta_M by the law of the method's page.
-
-    The cooperative one moves every component towards what its own output leaves.
-    """
+    """Return the derivatives of theta_m and theta_M by the law of the method's page."""
     own = memory["theta_m"], memory["theta_M"]
     if design.law == "printed":
         pairs = zip(responses(design, memory), r, own, strict=True)

@@ -50,10 +50,7 @@ def design_gain(
     names: tuple[str, ...] = (),
     judge: Callable[[FloatArray], Gain] | None = None,
 ) -> Gain:
-    """Return the gain of the fastest decay with entries of size at most `cap`.
-
-    judge: what a gain is worth; without, what it certifies, lowered to what is Metzler
-    """
+    """Return the gain of the fastest decay with entries up to `cap`, as `judge` values it."""
     alpha, best = -np.inf, None
     if judge is None:
         _require_metzler(A_lower, C, cap, names)
@@ -76,10 +73,7 @@ def design_gain(
 
 
 def analyse_gain(A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, L: FloatArray) -> Gain:
-    """Return p and the largest decay of a given gain; a negative one shows that it is unstable.
-
-    The left Perron vector of A_upper - L C is the best p; a small coupling keeps it positive.
-    """
+    """Return p, a Perron vector, and the largest decay of a gain; negative if it is unstable."""
     lacking = off_diagonal(A_lower - L @ C)
     if lacking.min(initial=0.0) < 0.0:
         i, j = np.unravel_index(np.argmin(lacking), lacking.shape)

@@ -24,10 +24,7 @@ from obsynth.symbolic.errors import ObsynthError
 
 @dataclass(frozen=True, eq=False)
 class Coordinates(Record):
-    """What is stored of coordinates: S and D of the equation above.
-
-    rate, input_rate: ranges of the derivatives of all states, as those of the outputs in `System`
-    """
+    """S and D of the equation above, and ranges of the derivatives of states as in `System`."""
 
     S: Annotated[FloatArray, "n n"]
     D: Annotated[FloatArray, "n n"]

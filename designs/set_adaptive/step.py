@@ -63,11 +63,7 @@ def begun(x: Sequence[Any], f: Sequence[Any]) -> dict[str, Any]:
 
 
 def build_core(design: SetDesign) -> Core:
-    """Build the observer: fault bounds from y_k, xi of x_k, then the prediction with u_k.
-
-    Where a reading is missing the output is anywhere in its range, and no fault bound moves. The
-    printed law keeps no order, so no bound of it is given.
-    """
+    """Build the observer: fault bounds from y_k, where it is whole, xi of x_k, the prediction."""
     plant, sizes = design.plant, memory_sizes(design)
     m = len(plant.output)
     x_box, f_box = (outward(plant.box(kind), design.precision) for kind in ("x", "f"))
@@ -124,10 +120,7 @@ def build_core(design: SetDesign) -> Core:
 
 
 def build_ode(design: SetDesign) -> ca.Function:
-    """Build (memory, u, y[, theta]) -> dmemory of equations (6)-(8), (13), (14).
-
-    With noise for states anywhere in y - v to y + v; without, the printed functions of y.
-    """
+    """Build (memory, u, y[, theta]) -> dmemory of equations (6)-(8), (13), (14)."""
     plant = design.plant
     vector = ca.SX.sym("memory", sum(memory_sizes(design).values()))
     u, y = ca.SX.sym("u", len(plant.u)), ca.SX.sym("y", len(plant.output))
@@ -218,11 +211,7 @@ def _declared(design: SetDesign, rate: FloatArray, input_rate: FloatArray, u: ca
 def _frozen(
     design: SetDesign, low: ca.SX, high: ca.SX, x: Ends, u: ca.SX, exact: ca.SX
 ) -> tuple[Drive, Drive]:
-    """Return the bounding systems for everything that C x may show until the next sample.
-
-    In coordinates of their own, for all that the states may be: their reach by the speeds in the
-    declared ranges first, then by those within that reach.
-    """
+    """Return bounding systems for all that C x may show, or states reach, in a sample."""
     given, states = design.coordinates, (x.lower, x.upper)
     if given is None:
         speed = _declared(design, design.rate, design.input_rate, u)

@@ -1,8 +1,7 @@
 """The equations over boxes, enclosed by affine functions of what a zonotope carries.
 
-A zonotope carries z = (x, faults that are followed). Everything else that is bounded stands beside:
-what enters several rows is a generator of its own, as is every fault that is not followed, what
-enters one row only widens it.
+docs/methods/set_membership_observer.md, Step, 2: beside z, what enters several rows and every free
+fault is a generator of its own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,10 +45,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Enclosures:
-    """Affine enclosures of the rows and outputs of a plant.
-
-    followed: places of the faults that are followed
-    """
+    """Affine enclosures of a plant's rows and outputs; followed: places of faults in z."""
 
     sweeps: Sweeps
     followed: IntArray

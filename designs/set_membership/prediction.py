@@ -45,10 +45,7 @@ def predict(
     share: float = 1.0,
     calls: int = LONGEST,
 ) -> Predicted:
-    """Follow the half widths from a share of the declared ranges until they stand still.
-
-    held: half widths that are guaranteed in any case, states then faults, infinite where none is
-    """
+    """Follow half widths from a share of the declared ranges, held or less, to rest."""
     n, n_f = len(model.plant.x), len(model.plant.f)
     free = model.enclosures.free
     declared = 0.5 * np.diff(model.box[: n + n_f], axis=1)[:, 0]

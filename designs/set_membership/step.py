@@ -288,10 +288,7 @@ class Bank:
         X: Ends,
         used: ca.SX,
     ) -> tuple[Ends, Ends, ca.SX]:
-        """Return the sets of states and faults, and the estimates of the faults.
-
-        Faults that are not followed are told one call late, by generators of their own.
-        """
+        """Return sets of states and faults, and estimates; faults not followed one call late."""
         assert seen.around is not None
         sweeps, enclosures = self.enclosures.sweeps, self.enclosures
         n, n_f = sweeps.n, sweeps.n_f

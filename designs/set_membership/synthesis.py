@@ -220,10 +220,7 @@ class Wishes:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A gain with a bank, what it predicts, and the weighted mean of that.
-
-    size: of the step, relative to others; share: of the ranges that the prediction begins from
-    """
+    """A gain with a bank, what it predicts from a share of the ranges, the mean, the size."""
 
     gain: Gain
     bank: Bank

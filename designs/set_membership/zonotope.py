@@ -1,9 +1,7 @@
 """Zonotopes of code: ``c + G xi`` with |xi| <= 1, and what rounding adds, a box beside.
 
-Every operation returns numbers c, G and a slack s such that the set that real arithmetic gives lies
-in ``{c + G xi + eta, |eta| <= s}``. A sum of k products is off by at most ``k step`` times the sum
-of their absolute values, `Real.step` four units of rounding, which covers the rounding of that
-bound as well; `Real.tiny` is above what underflow takes of such a sum.
+Every operation returns c, G and a slack such that the set of real arithmetic lies within
+(docs/methods/set_membership_observer.md, What floating point adds).
 """
 
 from collections.abc import Sequence
