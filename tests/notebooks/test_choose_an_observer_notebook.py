@@ -16,6 +16,7 @@ QUESTION = """{
     "median": float(np.median(found.half_width)),
     "inside": float(inside),
     "filter": crane.kalman.missed,
+    "compiled": equal == len(rows) > 100 if project.build else None,
 }"""
 
 
@@ -40,6 +41,7 @@ def test_a_budget_is_kept(notebook):
     small = notebook.answers["small"]
     assert small is None or small <= 1500
     assert (small is None) == (notebook.answers["least"] > 1500)
+    assert notebook.answers["compiled"] in (None, True)
 
 
 def test_the_meter_is_inside_and_the_leak_certain_after_a_second(notebook):

@@ -17,6 +17,7 @@ QUESTION = """
     "void": [void.tolist(), second[(status_2 & 8) > 0].tolist()],
     "valid": certificate.valid,
     "vectors": project.comparison.vectors if project.comparison else None,
+    "compiled": equal == len(rows) == 181 if project.build else None,
 }
 """
 
@@ -64,4 +65,5 @@ def test_the_leak_and_what_contradicts_the_bounds(found):
 def test_the_design_is_proved_again_and_the_c_code_compared(found, executed):
     assert found["valid"] is True
     assert found["vectors"] in (None, 500)
+    assert found["compiled"] in (None, True)
     assert sum(executed.pictures) == 6

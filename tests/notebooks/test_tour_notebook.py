@@ -10,6 +10,7 @@ QUESTION = """{
     "promised": float(detector.smallest_detectable[0]),
     "valid": certificate.valid,
     "vectors": project.comparison.vectors if project.comparison else None,
+    "compiled": equal == len(rows) == 1001 if project.build else None,
 }"""
 
 
@@ -43,4 +44,5 @@ def test_the_refusal_names_what_is_missing(tour):
 def test_the_file_is_proved_and_the_code_compared(tour):
     assert tour.answers["valid"] is True
     assert tour.answers["vectors"] in (None, 3000)
+    assert tour.answers["compiled"] in (None, True)
     assert tour.pictures == [1, 1]
