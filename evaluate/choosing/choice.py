@@ -13,7 +13,7 @@ from obsynth.evaluate.choosing.tries import Try
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.plotting.layout import BARS, INK, SOFT, name_lines, new_figure, style
 from obsynth.symbolic import Plant
-from obsynth.symbolic.arrays import FloatArray, IntArray
+from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 from obsynth.symbolic.shown import card, folded
 from obsynth.symbolic.table import Table, text
 
@@ -64,13 +64,26 @@ class Choice:
         return np.array([self.names.index(name) for name in self.criterion], dtype=np.int64)
 
     @cached_property
-    def _units(self) -> FloatArray:
-        """Half of the declared ranges; the narrowest that was found where there is none."""
+    def _declared(self) -> FloatArray:
+        """Half of the declared ranges, infinite (or 0, of a point) where there is none."""
         boxes = np.vstack([self.model.box("x"), self.model.box("f").reshape(-1, 2)])
         half: FloatArray = 0.5 * np.diff(boxes, axis=1)[:, 0]
+        return half
+
+    @cached_property
+    def _units(self) -> FloatArray:
+        """Half of the declared ranges; the narrowest that was found where there is none."""
         least = np.min([_settled(one) for one in (*self.made, self.kalman)], axis=0)
-        half = np.where(np.isfinite(half) & (half > 0), half, least)
-        return np.where(np.isfinite(half) & (half > 0), half, 1.0)
+        half = np.where(_usable(self._declared), self._declared, least)
+        return np.where(_usable(half), half, 1.0)
+
+    @property
+    def _unit(self) -> str:
+        """What the widths of the criterion are shares of, in words."""
+        ranged = _usable(self._declared[self._counted])
+        if ranged.all():
+            return "half range"
+        return "half range or narrowest found" if ranged.any() else "narrowest found"
 
     def online(self, one: Try) -> FloatArray:
         """Return the mean half widths of the second half of the run, as shares, (n + n_f,)."""
@@ -80,6 +93,18 @@ class Choice:
         """Return the guaranteed steady half widths as shares, infinite where there are none."""
         told = one.observer.half_widths
         return np.full(len(self.names), np.inf) if told is None else told / self._units
+
+    @property
+    def shares(self) -> dict[str, dict[str, dict[str, float]]]:
+        """By observer, ``run`` and ``guaranteed``, and signal: the shares as numbers."""
+        told = {"run": self.online, "guaranteed": self.guaranteed}
+        return {
+            one.name: {
+                kind: dict(zip(self.names, share(one).tolist(), strict=True))
+                for kind, share in told.items()
+            }
+            for one in self.made
+        }
 
     def score(self, one: Try) -> float:
         """Return the criterion: the smaller, the better."""
@@ -139,7 +164,7 @@ class Choice:
             why = f"within 5 % of {first.name} ({narrow}, {first.operations} operations)"
         said = (
             f"{best.name} is recommended: half widths of {spoken} are "
-            f"{text(self.score(best), 3)} of the half range in the mean, {why}, at "
+            f"{text(self.score(best), 3)} of the {self._unit} in the mean, {why}, at "
             f"{best.operations} operations a step."
         )
         said += " Its intervals of faults hold means over time." if best.means else ""
@@ -174,22 +199,29 @@ class Choice:
         columns = ["observer", "certified", "in the run", "guaranteed", "settled at call"]
         columns += ["operations", "design [s]", "remark"]
         run: Any = self.kalman.run
-        title = f"Half width / half range of {', '.join(self.criterion)}, {run.scenario}, "
+        title = f"Half width / {self._unit} of {', '.join(self.criterion)}, {run.scenario}, "
         title += f"{len(run.t)} instants"
         marked = [i for i, one in enumerate(self.tries) if one is self.best]
         return Table(title, columns, rows, self.reason, marked)
 
     @property
     def widths(self) -> Table:
-        """The shares of every state and fault: in the run, and guaranteed in brackets."""
+        """The shares of every state and fault: in the run, and guaranteed in brackets.
+
+        Observers are the rows, or the columns where there are fewer observers than signals.
+        """
 
         def cell(now: float, ever: float) -> str:
             return text(now, 3) + (f" ({text(ever, 3)})" if np.isfinite(ever) else "")
 
         shown = (*self.made, self.kalman)
+        observers = [*(one.name for one in self.made), "Kalman, no guarantee"]
         cells = [map(cell, self.online(one), self.guaranteed(one)) for one in shown]
-        rows = [[*row] for row in zip(self.names, *cells, strict=True)]
-        columns = ["signal", *(one.name for one in self.made), "Kalman, no guarantee"]
+        rows = [[name, *row] for name, row in zip(observers, cells, strict=True)]
+        columns = ["observer", *self.names]
+        if len(observers) < len(self.names):
+            columns, *rows = map(list, zip(columns, *rows, strict=True))
+            columns[0] = "signal"
         note = "Mean of the second half of the run (guaranteed); without a range, / the narrowest."
         return Table("Half width / half range of every state and fault", columns, rows, note)
 
@@ -235,6 +267,12 @@ class Choice:
     def _repr_html_(self) -> str:
         assumed = folded("Assumptions", self.assumptions)
         return card(f"Observers for {self.model.name}", self.table, self.widths, assumed)
+
+
+def _usable(half: FloatArray) -> BoolArray:
+    """Return which half ranges can be divided by."""
+    usable: BoolArray = np.isfinite(half) & (half > 0)
+    return usable
 
 
 def _settled(one: Try) -> FloatArray:

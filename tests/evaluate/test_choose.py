@@ -109,6 +109,8 @@ def test_signals_without_a_range_are_measured_by_the_narrowest():
     found = Choice(plant, ("f",), None, tuple(tries), tries[1])
     assert [found.score(one) for one in tries] == [1.0, 2.0]
     assert found.best.name == "a" and "hardly" not in found.reason
+    assert "are 1 of the narrowest found in the mean" in found.reason
+    assert found.table.title.startswith("Half width / narrowest found of f, ")
     assert found.online(tries[1]).tolist() == [1.0, 2.0]
 
 
@@ -124,7 +126,12 @@ def test_everything_is_shown():
     assert table.marked == [0]
     assert "hold means over time" in found.reason and "means" not in choice(entry("o", 1, 1)).reason
     assert repr(found) == f"<Choice for 'leaking tanks': {found.reason}>"
+    assert found.widths.columns == ["signal", "one", "<two>", "Kalman, no guarantee"]
     assert found.widths.rows[3][:2] == ["leak", "0.4 (0.8)"]
+    many = choice(*(entry(name, 0.02, 900) for name in "abcd")).widths
+    assert many.columns == ["observer", "e1", "h2", "e3", "leak"]
+    assert [row[0] for row in many.rows] == [*"abcd", "Kalman, no guarantee"]
+    assert many.rows[0][4] == "0.4 (0.8)"
     assert found.assumptions.rows[0] == ["bounded", "one, <two>"]
     page = found._repr_html_()
     assert "&lt;two&gt;" in page and "<two>" not in page and "<b>rank" not in page

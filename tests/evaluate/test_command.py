@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import os
 import subprocess
 import sys
@@ -183,8 +184,13 @@ def chosen(monkeypatch):
     def choose(plant, **options):
         given.append((plant, options))
         table = Table("Observers", ["observer"], [["interval"]])
+        shares = {"interval": {"run": {"x": 0.5}, "guaranteed": {"x": math.inf}}}
         return SimpleNamespace(
-            table=table, widths=table, recommended=choose.best, reason="none fits"
+            table=table,
+            widths=table,
+            shares=shares,
+            recommended=choose.best,
+            reason="none fits",
         )
 
     choose.best = object()
@@ -209,6 +215,9 @@ def test_choose_without_a_recommendation_is_a_failure_that_shows_the_table(chose
     result = runner.invoke(app, ["choose", "battery"])
     assert result.exit_code == 1
     assert "interval" in result.output and "obsynth: none fits" in said(result)
+    result = runner.invoke(app, ["choose", "battery", "--json"])
+    shares = json.loads(result.stdout)["half_widths"]
+    assert shares == {"interval": {"run": {"x": 0.5}, "guaranteed": {"x": None}}}
 
 
 @pytest.mark.parametrize(

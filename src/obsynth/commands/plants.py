@@ -121,6 +121,6 @@ def choose(
 
     given = plant_of(plant)
     choice = obsynth.choose(given, budget=budget, criterion=criterion, Ts=ts, limit=limit)
-    facts = {"observers": choice.table, "half_widths": choice.widths, "reason": choice.reason}
+    facts = {"observers": choice.table, "half_widths": choice.shares, "reason": choice.reason}
     failed = choice.reason if choice.recommended is None else ""
     return Told(facts, (choice.table, choice.widths), failed=failed)
