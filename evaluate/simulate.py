@@ -1,14 +1,15 @@
 """Run a plant and an observer side by side through ``Observer.step``."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
+import casadi as ca
 import numpy as np
 
-from obsynth.codegen.kernel import Call, dense, row_of
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
+    WORDS,
     broken_assumptions,
     claims_of,
     finite,
@@ -19,9 +20,10 @@ from obsynth.evaluate.checked import (
     step_function,
     vector,
 )
-from obsynth.evaluate.compiled import compiled
+from obsynth.evaluate.compiled import PAYS, compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.joint import joint
+from obsynth.evaluate.march import Before, in_rows, march
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Truth
 from obsynth.symbolic import Plant, Scenario
@@ -103,18 +105,43 @@ def simulate(
     return _loop(truth, observer, scenario, fields, seed)
 
 
-def _feedback(
-    scenario: Scenario, plant: Plant, truth: Call, names: tuple[str, ...]
-) -> Callable[[int], FloatArray]:
-    """Return a function of k that reads y_k and returns u_k; refuses an algebraic loop."""
+def _feedback(scenario: Scenario, plant: Plant, output: Call, names: tuple[str, ...]) -> Before:
+    """Return a function of (k, state, row) that sets u_k by y_k; refuses an algebraic loop."""
     refuse_algebraic_loop(scenario, plant)
     law: Any = scenario.inputs
+    (x, given), y = output.args, output.results[1]
 
-    def at(k: int) -> FloatArray:
-        truth.evaluate()
-        return vector(law(k, truth.results[1].copy()), names, f"inputs at k = {k}")
+    def at(k: int, state: FloatArray, row: FloatArray) -> None:
+        x[:], given[:] = state[: x.size], row
+        output.evaluate()
+        row[: len(names)] = vector(law(k, y.copy()), names, f"inputs at k = {k}")
 
     return at
+
+
+def instants(truth: Truth, observer: Observer | FaultDetector, calls: int) -> ca.Function:
+    """Return (x and memory, u d f w rho) -> (both at the next instant, y and what is told).
+
+    Where it is called often, as compiled code: both together, or what is compiled already.
+    """
+    step, model = dense(step_function(observer, truth.model)), truth.model
+    theta = scheduling_columns(step, model, "step")
+    together = _instant(truth.function, step, theta)
+    found = compiled(together, calls) if calls >= PAYS else together
+    if found is together:
+        found = _instant(compiled(truth.function, calls), compiled(step, calls), theta)
+    return found
+
+
+def _instant(moving: ca.Function, step: ca.Function, theta: list[int]) -> ca.Function:
+    n, n_memory = moving.numel_in(0), step.numel_in(0)
+    state = ca.MX.sym("state", n + n_memory)
+    signals = [ca.MX.sym(f"v{i}", moving.numel_in(i)) for i in range(1, moving.n_in())]
+    move, call = cast(Any, moving), cast(Any, step)
+    moved, y = move(state[:n], *signals)
+    memory, *told = call(state[n:], signals[0], y, *([signals[-1][theta]] if theta else []))
+    following = ca.vertcat(moved, memory)
+    return in_rows(ca.Function("instant", [state, *signals], [following, y, *told]))
 
 
 def _loop(
@@ -127,39 +154,20 @@ def _loop(
     """March plant and observer through the samples."""
     model, N = truth.model, scenario.steps
     function = step_function(observer, model)
-    theta = scheduling_columns(function, model, "step")
     names = model.names("u")
-    u = fields.setdefault("u", np.zeros((N + 1, len(names))))
-    kinds = ("u", "d", "f", "w", "rho")
-    given, sizes = np.hstack([fields[kind] for kind in kinds]), [fields[k].shape[1] for k in kinds]
-    # both functions read one row of signals and write one row of results
-    row, signals = row_of(sizes)
-    whole, moving = compiled(dense(function), N + 1), compiled(truth.function, N + 1)
-    state, (_, made) = np.empty(len(model.x)), row_of([moving.numel_out(i) for i in range(2)])
-    plant = Call(moving, [state, *signals], made)
-    memory, moved = (np.empty(whole.numel_in(0)) for _ in range(2))
-    told, ends = row_of([whole.numel_out(i) for i in range(1, whole.n_out())])
-    scheduled = [np.empty(len(theta))] if theta else []
-    step = Call(whole, [memory, signals[0], plant.results[1], *scheduled], [moved, *ends])
-    law = _feedback(scenario, truth.plant, plant, names) if scenario.feedback else None
-
-    x, y = (np.empty((N + 1, part.size)) for part in made)
-    log = np.empty((N + 1, told.size))
-    state[:] = vector(scenario.x0, model.names("x"), "x0")
-    for k in range(N + 1):
-        row[:] = given[k]
-        if law is not None:
-            signals[0][:] = u[k] = law(k)
-        plant.evaluate()
-        x[k], y[k] = state, plant.results[1]
-        if k == 0:
-            memory[:] = first_memory(observer, scenario, y[0], memory.size)
-        if theta:
-            scheduled[0][:] = signals[-1][theta]
-        step.evaluate()
-        log[k] = told
-        memory[:] = moved
-        state[:] = made[0]
+    fields.setdefault("u", np.zeros((N + 1, len(names))))
+    rows = np.hstack([fields[kind] for kind in WORDS])
+    output, instant = Call(in_rows(truth.function)), instants(truth, observer, N + 1)
+    law = _feedback(scenario, truth.plant, output, names) if scenario.feedback else None
+    output.args[0][:] = x0 = vector(scenario.x0, model.names("x"), "x0")
+    output.args[1][:] = rows[0]
+    output.evaluate()
+    memory = first_memory(observer, scenario, output.results[1], function.numel_in(0))
+    blocks = march(instant, np.hstack([x0, memory]), rows, law)
+    parts = ((states[:, : x0.size].copy(), told) for states, told in blocks)
+    x, said = map(np.concatenate, zip(*parts, strict=True))
+    fields["u"] = rows[:, : len(names)]
+    y, log = np.split(said, [output.results[1].size], axis=1)
     finite(x, model.names("x"))
     finite(y, tuple(model.output_names))
     fields["w"] = truth.remainders(fields, x)

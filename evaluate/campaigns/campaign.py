@@ -2,22 +2,23 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from obsynth.codegen.kernel import dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.campaigns.facts import Job, Row
 from obsynth.evaluate.campaigns.parts import Parts, fingerprint
-from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.progress import bar
 from obsynth.evaluate.run import percent
-from obsynth.symbolic import Plant, Scenario
+from obsynth.evaluate.simulate import instants
+from obsynth.evaluate.truth import Truth
+from obsynth.symbolic import ObsynthError, Plant, Scenario
 from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
@@ -182,10 +183,12 @@ def campaign(
     parts = Parts(None if folder is None else Path(folder), fingerprint(jobs))
     todo = [piece for job in jobs for piece in _pieces(replace(job, seeds=parts.left(job)))]
     wanted = [key for job in jobs for key in job.keys]
-    for job in {job.design: job for job in todo}.values():
+    for job in {(job.design, job.truth): job for job in todo}.values():
         # so that processes find it compiled instead of all compiling it
-        calls = sum((j.given.steps + 1) * len(j.seeds) for j in todo if j.design == job.design)
-        compiled(dense(job.observer.step), calls)
+        same = [j for j in todo if (j.design, j.truth) == (job.design, job.truth)]
+        with suppress(ObsynthError):  # a run that is refused says so itself
+            pair = Truth(job.plant, job.observer, job.substeps)
+            instants(pair, job.observer, sum((j.given.steps + 1) * len(j.seeds) for j in same))
     with bar() as say:
         for rows in _here(todo, workers) if client is None else _there(todo, client):
             parts.add(rows)

@@ -1,18 +1,19 @@
 """`estimate`: an observer on a record, and which readings contradict it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from obsynth.codegen.kernel import Call, dense, row_of
+from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import claims_of, scheduling_columns, step_function
 from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.march import in_rows, march
 from obsynth.evaluate.trace import as_told
 from obsynth.evaluate.truth import sample_time
 from obsynth.symbolic import Plant, Record, read_record
@@ -22,8 +23,6 @@ from obsynth.symbolic.taking import takes
 
 JITTER = 0.05
 """Share of the sample time by which two instants of a record may be too far from each other."""
-BLOCK = 4096
-"""Instants from one memory that is kept to the next."""
 
 
 @takes(observer="Observer FaultDetector ExtendedKalman")
@@ -127,36 +126,36 @@ def _march(
 
     Shapes: rows (N, n_u + n_y + n_theta), result (N, numbers of the outputs but the memory).
     """
-    step = compiled(dense(function), len(rows))
-    given, args = row_of([step.numel_in(i) for i in range(1, step.n_in())])
-    told, ends = row_of([step.numel_out(i) for i in range(1, step.n_out())])
-    moved, status = np.zeros(memory.size), ends[STEP_OUTPUTS.index("status") - 1]
-    call = Call(step, [memory, *args], [moved, *ends])
-    evaluate = call.evaluate
+    step = in_rows(compiled(dense(function), len(rows)))
+    before = STEP_OUTPUTS[1 : STEP_OUTPUTS.index("status")]
+    column = sum(int(function.numel_out(name)) for name in before)
+    readings = dict(zip(outputs, range(function.numel_in(1), len(rows[0])), strict=False))
+    log: list[FloatArray] = []
+    blamed: tuple[str, ...] | None = None
+    begin = 0
+    for states, told in march(step, memory, rows):
+        void = told[:, column].astype(np.int64) & STATUS["void"] > 0
+        if void.any() and blamed is None:
+            k = int(void.argmax())
+            blamed = _blamed(step, states[k], rows[begin + k], column, readings)
+        log.append(told)
+        begin += len(told)
+    return np.concatenate(log), blamed or ()
 
-    def run(rows: FloatArray, log: FloatArray) -> None:
-        for row, out in zip(rows, log, strict=True):
-            given[:] = row
-            evaluate()
-            out[:] = told
-            memory[:] = moved
 
-    log, blamed = np.empty((len(rows), told.size)), None
-    column, void = sum(map(len, ends[: STEP_OUTPUTS.index("status") - 1])), STATUS["void"]
-    for k in range(0, len(rows), BLOCK):
-        kept, part = memory.copy(), log[k : k + BLOCK]
-        run(rows[k : k + BLOCK], part)
-        at = np.flatnonzero(part[:, column].astype(np.int64) & void)
-        if at.size and blamed is None:
-            # once more up to the void, then without each of its readings
-            after, memory[:] = memory.copy(), kept
-            k += int(at[0])
-            run(rows[k - int(at[0]) : k], log[k - int(at[0]) : k])
-            alone = []
-            for i, name in enumerate(outputs):
-                given[:] = rows[k]
-                args[1][i] = np.nan
-                evaluate()
-                alone += [] if int(status[0]) & void else [name]
-            blamed, memory[:] = tuple(alone), after
-    return log, blamed or ()
+def _blamed(
+    step: ca.Function,
+    memory: FloatArray,
+    row: FloatArray,
+    column: int,
+    readings: Mapping[str, int],
+) -> tuple[str, ...]:
+    """Return the readings, by their columns in the row, without which a step is not void."""
+    call, found = Call(step), []
+    for name, i in readings.items():
+        call.args[0][:], call.args[1][:] = memory, row
+        call.args[1][i] = np.nan
+        call.evaluate()
+        if not int(call.results[1][column]) & STATUS["void"]:
+            found.append(name)
+    return tuple(found)
