@@ -1,7 +1,7 @@
 """The quadruple tank of Buciakowski et al., all the way, against the printed numbers."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,24 +10,17 @@ import numpy as np
 
 from obsynth.codegen import CProject, generate_c
 from obsynth.codegen.folder import complete_folder
-from obsynth.derive import JacobianBounds, Split, jacobian_bounds, split
+from obsynth.derive import JacobianBounds, jacobian_bounds, split
 from obsynth.designs import BoundedErrorUIO, Observer
 from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.papers.buciakowski import Refusals, ask, claims_of, tank
-from obsynth.evaluate.papers.claim import claims_table
+from obsynth.evaluate.papers.buciakowski import ask, claims_of, tank
+from obsynth.evaluate.papers.claim import Claim, claims_table
 from obsynth.evaluate.report import report
 from obsynth.evaluate.run import Run, percent
 from obsynth.evaluate.simulate import simulate
-from obsynth.evaluate.studies.printed import (
-    bounds_table,
-    code_table,
-    half_widths,
-    refusal_table,
-    vertices_table,
-    width_table,
-)
-from obsynth.symbolic import Plant, Scenario, scenarios
+from obsynth.symbolic import Scenario, scenarios
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.table import Table
 
 # The largest round value that leaves room below the largest feasible gamma of all forms.
@@ -58,10 +51,8 @@ Progress = Callable[[str, float], None]
 class QuadrupleTank:
     """What the study found on the euler model, Ts = 1 s; the last of the designs ships."""
 
-    model: "Plant"
-    split: "Split"
-    bounds: "JacobianBounds"
-    refusals: Refusals
+    bounds: JacobianBounds
+    claims: tuple[Claim, ...]
     designs: dict[str, Observer]
     runs: dict[str, tuple[Run, ...]]
     project: CProject
@@ -92,9 +83,7 @@ class QuadrupleTank:
     def tables(self) -> list[Table]:
         """Return the short account that the command prints."""
         return [
-            bounds_table(self.bounds),
-            vertices_table(self.bounds),
-            refusal_table(self.refusals),
+            claims_table("What the paper prints, and what holds", self.claims),
             width_table(self.designs),
             coverage_summary(self.runs),
             code_table(self.project),
@@ -119,11 +108,10 @@ def quadruple_tank(
     say = _stages(progress)
     with complete_folder(folder, RUN) as place:
         say(0)
-        model = tank()
-        parts = split(model)
+        parts = split(tank())
         bounds = jacobian_bounds(parts)
         say(1)
-        refusals = ask(parts, bounds)
+        claims = tuple(claims_of(parts, bounds, ask(parts, bounds)))
         designs = {}
         methods = {
             BEFORE: BoundedErrorUIO(form="repaired", gamma=GAMMA, objective="trace", **OWN),
@@ -140,10 +128,8 @@ def quadruple_tank(
         designs[PEAK].save(place / "design.json")
         designs[ELLIPSOID].save(place / "design_ellipsoid.json")
         study = QuadrupleTank(
-            model=model,
-            split=parts,
             bounds=bounds,
-            refusals=refusals,
+            claims=claims,
             designs=designs,
             runs=runs,
             project=replace(project, folder=Path(folder).resolve() / "c"),
@@ -190,16 +176,14 @@ def shortened(name: str, steps: int) -> Scenario:
 
 
 def _write(study: QuadrupleTank, path: Path) -> None:
-    claims = list(claims_of(study.split, study.bounds, study.refusals))
-    errata = claims_table("What the paper prints, and what holds", claims)
+    printed, _, _, code = study.tables()
     report(
         path,
         {label: study.designs[label] for label in (ELLIPSOID, PEAK)},
         runs=study.runs,
         tables={
-            "Derived bounds": [bounds_table(study.bounds), vertices_table(study.bounds)],
-            "What the paper prints": [refusal_table(study.refusals), errata],
-            "C code": code_table(study.project),
+            "What the paper prints": printed,
+            "C code": code,
         },
         title="Quadruple tank: states and pump faults with guaranteed bounds",
         lead="After Buciakowski, Witczak, Puig, Rotondo, Nejjari and Korbicz, A bounded-error "
@@ -209,3 +193,43 @@ def _write(study: QuadrupleTank, path: Path) -> None:
         highlights=study.highlights(),
         half_widths={label: half_widths(o) for label, o in study.designs.items()},
     )
+
+
+def width_table(designs: Mapping[str, Observer]) -> Table:
+    """Compare the guaranteed steady half widths of the designs."""
+    model = next(iter(designs.values())).model
+    names = (*model.names("x"), *model.names("f"))
+    base = None
+    rows: list[list[Any]] = []
+    for label, observer in designs.items():
+        widths = half_widths(observer)
+        base = widths.sum() if base is None else base
+        numbers = [*widths, widths.sum(), widths.sum() / base]
+        rows.append([label, *(f"{number:.3f}" for number in numbers)])
+    return Table(
+        "Guaranteed half widths in steady state",
+        ["design", *names, "sum", "ratio"],
+        rows,
+        marked=[len(rows) - 1],
+    )
+
+
+def code_table(project: CProject) -> Table:
+    """Say what the C project is and how it was compared."""
+    rows: list[list[Any]] = [["operations of one step", str(project.operations)]]
+    if project.build is not None and project.comparison is not None:
+        rows += [
+            ["compiler", project.build.compiler],
+            ["flags", " ".join(project.build.flags)],
+            ["steps compared with CasADi", f"{project.comparison.vectors:,}"],
+            ["values equal to the last bit", f"{project.comparison.values:,} of them, all"],
+        ]
+    else:
+        rows.append(["comparison", "not done: no C compiler found"])
+    return Table("C project", ["", ""], rows)
+
+
+def half_widths(observer: Observer) -> FloatArray:
+    """Return the method's own half widths of states, then faults; infinite without a guarantee."""
+    model, widths = observer.model, observer.performance.get("core_half_widths")
+    return np.full(len(model.x) + len(model.f), np.inf) if widths is None else widths
