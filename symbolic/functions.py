@@ -136,28 +136,12 @@ class NamedFunction:
     most: int | None = 1
 
 
+_NAMED = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh sign floor erf"
 _TABLE = (
-    NamedFunction("sqrt", sp.sqrt, ca.sqrt),
-    NamedFunction("exp", sp.exp, ca.exp),
-    NamedFunction("log", sp.log, ca.log),
-    NamedFunction("sin", sp.sin, ca.sin),
-    NamedFunction("cos", sp.cos, ca.cos),
-    NamedFunction("tan", sp.tan, ca.tan),
-    NamedFunction("asin", sp.asin, ca.asin),
-    NamedFunction("acos", sp.acos, ca.acos),
-    NamedFunction("atan", sp.atan, ca.atan),
+    *(NamedFunction(name, getattr(sp, name), getattr(ca, name)) for name in _NAMED.split()),
     NamedFunction("atan2", sp.atan2, ca.atan2, 2, 2),
-    NamedFunction("sinh", sp.sinh, ca.sinh),
-    NamedFunction("cosh", sp.cosh, ca.cosh),
-    NamedFunction("tanh", sp.tanh, ca.tanh),
-    NamedFunction("asinh", sp.asinh, ca.asinh),
-    NamedFunction("acosh", sp.acosh, ca.acosh),
-    NamedFunction("atanh", sp.atanh, ca.atanh),
     NamedFunction("Abs", sp.Abs, ca.fabs),
-    NamedFunction("sign", sp.sign, ca.sign),
-    NamedFunction("floor", sp.floor, ca.floor),
     NamedFunction("ceiling", sp.ceiling, ca.ceil),
-    NamedFunction("erf", sp.erf, ca.erf),
     NamedFunction("Max", sp.Max, _fold(ca.fmax), 1, None),
     NamedFunction("Min", sp.Min, _fold(ca.fmin), 1, None),
     NamedFunction("Heaviside", sp.Heaviside, _heaviside, 1, 2),

@@ -46,39 +46,24 @@ def _guarded(value: sp.Expr) -> tuple[sp.Expr, sp.Basic] | None:
     return None
 
 
+_NAMED = (
+    "exp log sqrt sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh sign floor erf"
+)
 _OPERATIONS: dict[int, Callable[..., Any]] = {
+    **{getattr(ca, f"OP_{n.upper()}"): _lift(getattr(sp, n)) for n in _NAMED.split()},
     ca.OP_ASSIGN: lambda a: a,
     ca.OP_ADD: _add,
     ca.OP_SUB: _lift(lambda a, b: a - b),
     ca.OP_MUL: _lift(lambda a, b: a * b),
     ca.OP_DIV: _lift(lambda a, b: a / b),
     ca.OP_NEG: _lift(lambda a: -a),
-    ca.OP_EXP: _lift(sp.exp),
-    ca.OP_LOG: _lift(sp.log),
     ca.OP_POW: _lift(lambda a, b: a**b),
     ca.OP_CONSTPOW: _lift(lambda a, b: a**b),
-    ca.OP_SQRT: _lift(sp.sqrt),
     ca.OP_SQ: _lift(lambda a: a**2),
     ca.OP_TWICE: _lift(lambda a: 2 * a),
     ca.OP_INV: _lift(lambda a: 1 / a),
-    ca.OP_SIN: _lift(sp.sin),
-    ca.OP_COS: _lift(sp.cos),
-    ca.OP_TAN: _lift(sp.tan),
-    ca.OP_ASIN: _lift(sp.asin),
-    ca.OP_ACOS: _lift(sp.acos),
-    ca.OP_ATAN: _lift(sp.atan),
-    ca.OP_ATAN2: _lift(sp.atan2),
-    ca.OP_SINH: _lift(sp.sinh),
-    ca.OP_COSH: _lift(sp.cosh),
-    ca.OP_TANH: _lift(sp.tanh),
-    ca.OP_ASINH: _lift(sp.asinh),
-    ca.OP_ACOSH: _lift(sp.acosh),
-    ca.OP_ATANH: _lift(sp.atanh),
     ca.OP_FABS: _lift(sp.Abs),
-    ca.OP_SIGN: _lift(sp.sign),
-    ca.OP_FLOOR: _lift(sp.floor),
     ca.OP_CEIL: _lift(sp.ceiling),
-    ca.OP_ERF: _lift(sp.erf),
     ca.OP_FMIN: _lift(sp.Min),
     ca.OP_FMAX: _lift(sp.Max),
     ca.OP_LOG1P: _lift(lambda a: sp.log(1 + a)),

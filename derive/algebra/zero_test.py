@@ -8,13 +8,11 @@ from typing import Any
 
 import sympy as sp
 
-from obsynth.derive.algebra.connected import connected
 from obsynth.derive.algebra.secants import quotients
 from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, simplified, size
 
 Box = Mapping[sp.Symbol, tuple[float, float]]
 NUMERIC = "numerically zero at 60 digits"
-_ORDER = ("syntactic", "expand", "cancel", "simplify", NUMERIC)
 _DIGITS = 60
 _WORKING = 100
 _POINTS = 6
@@ -88,7 +86,7 @@ def prove_zero(expression: sp.Expr, box: Box) -> str:
     values = _values(parts, {known.get(s, s): bounds for s, bounds in box.items()})
     if values is None or not _vanish(values):
         return ""
-    return max((_prove(sp.Add(*group)) for group in _groups(parts, values)), key=_ORDER.index)
+    return _prove(expression)
 
 
 def _prove(expression: sp.Expr, exponentials: bool = True) -> str:
@@ -139,25 +137,6 @@ def _size_over_one(expression: sp.Expr) -> int:
     for base, power in powers.items():
         size *= min(len(base.args), _LARGEST_NUMERATOR) ** min(power, _LARGEST_POWER)
     return size
-
-
-def _groups(terms: list[sp.Expr], values: list[list[Any]]) -> list[list[sp.Expr]]:
-    """Parts of a sum that vanish by themselves: terms that are connected by common functions.
-
-    What does not vanish by itself stays in one part.
-    """
-    # terms without a function belong together
-    parts = connected(_functions(term) or {1} for term in terms)
-    alone = [part for part in parts if _vanish([values[k] for k in part])]
-    settled = {k for part in alone for k in part}
-    left = [k for k in range(len(terms)) if k not in settled]
-    return [[terms[k] for k in part] for part in ([*alone, left] if left else alone)]
-
-
-def _functions(term: sp.Expr) -> set[sp.Expr]:
-    """Factors of a term that are no powers of symbols, without their exponents."""
-    bases = (factor.as_base_exp()[0] for factor in sp.Mul.make_args(term))
-    return {base for base in bases if not base.is_Symbol and not base.is_number}
 
 
 def _positive(expression: sp.Expr, box: Box) -> dict[sp.Symbol, sp.Symbol]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.derive.constants.interval_matrix import sign_patterns
+from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
 from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.intervals.search.batch import Rows
@@ -28,7 +28,6 @@ from obsynth.derive.rigour import (
     down,
     finite,
     largest_eigenvalue,
-    perron_bound,
     rotate,
     up,
 )
@@ -74,23 +73,6 @@ class Maximum:
     def __str__(self) -> str:
         text = f"{self.upper:.8g} ({self.status.word}, gap {self.gap:.1e}; {self.method})"
         return f"{text} at {self.where}" if self.at else text
-
-
-def interval_bound(field: SymmetricField, centre: FloatArray, radius: FloatArray) -> FloatArray:
-    """Bound the largest eigenvalue over a batch of interval matrices."""
-    coupled = np.zeros((field.size, field.size), dtype=bool)
-    coupled[field.rows, field.columns] = True
-    patterns = sign_patterns(coupled | coupled.T, _FEW_SIGNS)
-    if patterns is None:
-        return up(largest_eigenvalue(centre)[1] + perron_bound(radius))
-    known = np.where(np.isfinite(radius), radius, 0.0)
-    bound = np.full(len(centre), -np.inf)
-    for signs in patterns:
-        corner = centre + signs[:, None] * known * signs
-        bound = np.maximum(
-            bound, largest_eigenvalue(corner, 2.0 * UNIT_ROUNDOFF * np.abs(corner))[1]
-        )
-    return np.where(finite(radius), bound, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,9 +260,8 @@ def _search(
             best = max(best, attained)
         bound = np.minimum(now.bound, grown.bound)
         hard = bound > best + tolerance
-        bound[hard] = np.minimum(
-            bound[hard], interval_bound(field, found.centre[hard], found.radius[hard])
-        )
+        plain, _ = eigenvalue_over_interval(found.centre[hard], found.radius[hard], _FEW_SIGNS)
+        bound[hard] = np.minimum(bound[hard], plain)
         width = now.upper - now.lower
         done = (bound <= best + tolerance) | (width <= 0.0).all(axis=0)
         closed = max(closed, float(bound[done].max(initial=-np.inf)))

@@ -7,29 +7,15 @@ with one sign per row and one per column (Rohn). A sign matters only where R cou
 others: one sign per connected part of R is free.
 """
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from obsynth.derive.algebra.connected import connected
-from obsynth.derive.rigour import UNIT_ROUNDOFF, largest_eigenvalue, perron_bound, up
+from obsynth.derive.rigour import UNIT_ROUNDOFF, finite, largest_eigenvalue, perron_bound, up
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 MOST_SIGNS = 16
-
-
-@dataclass(frozen=True, eq=False)
-class IntervalExtreme:
-    """Largest eigenvalue or norm over an interval matrix: bounded, and attained at a member.
-
-    Exact up to rounding when all sign matrices were looked at.
-    """
-
-    upper: float
-    attained: float
-    matrix: FloatArray
-    exact: bool
 
 
 def augment(matrix: FloatArray) -> FloatArray:
@@ -54,20 +40,22 @@ def sign_patterns(coupled: BoolArray, most: int = MOST_SIGNS) -> FloatArray | No
     return patterns
 
 
-def eigenvalue_over_interval(centre: FloatArray, radius: FloatArray) -> IntervalExtreme:
-    """Bound the largest eigenvalue of all symmetric matrices of an interval (Hertz 1992)."""
-    patterns = sign_patterns(radius > 0.0)
+def eigenvalue_over_interval(
+    centre: FloatArray, radius: FloatArray, most: int = MOST_SIGNS
+) -> tuple[FloatArray, bool]:
+    """Bound the largest eigenvalue over each interval of a batch, (N, k, k), and say how.
+
+    Exact up to rounding when all sign matrices were looked at, up to 2^most of them (Hertz 1992).
+    """
+    coupled: BoolArray = np.asarray((radius > 0.0).any(axis=0), dtype=np.bool_)
+    patterns = sign_patterns(coupled, most)
     if patterns is None:
-        lower, upper = largest_eigenvalue(centre[None])
-        wide = float(up(upper[0] + perron_bound(radius[None])[0]))
-        return IntervalExtreme(wide, float(lower[0]), centre, False)
-    best, attained, matrix = -np.inf, -np.inf, centre
-    for block in np.array_split(patterns, max(1, len(patterns) // 4096)):
-        corners = centre + block[:, :, None] * radius * block[:, None, :]
-        rounding = UNIT_ROUNDOFF * np.abs(corners) * 1.01
-        lower, upper = largest_eigenvalue(corners, rounding)
-        best = max(best, float(upper.max()))
-        k = int(np.argmax(lower))
-        if float(lower[k]) > attained:
-            attained, matrix = float(lower[k]), corners[k]
-    return IntervalExtreme(best, attained, matrix, True)
+        return up(largest_eigenvalue(centre)[1] + perron_bound(radius)), False
+    known = np.where(np.isfinite(radius), radius, 0.0)
+    bound = np.full(len(centre), -np.inf)
+    for signs in np.array_split(patterns, max(1, len(patterns) * len(centre) // 4096)):
+        corners = centre[:, None] + signs[:, :, None] * known[:, None] * signs[:, None, :]
+        flat = corners.reshape(-1, *centre.shape[1:])
+        upper = largest_eigenvalue(flat, 2.0 * UNIT_ROUNDOFF * np.abs(flat))[1]
+        bound = np.maximum(bound, upper.reshape(corners.shape[:2]).max(axis=1))
+    return np.where(finite(radius), bound, np.inf), True

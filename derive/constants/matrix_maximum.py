@@ -141,8 +141,8 @@ def _block(
         np.asarray(ranges.lower)[inside],
         np.asarray(ranges.upper)[inside],
     )
-    hertz = eigenvalue_over_interval(*field.matrix_of_ranges())
-    known, method = hertz.upper, "sign matrices of Hertz" if hertz.exact else "centre plus radius"
+    (bound,), exact = eigenvalue_over_interval(*field.matrix_of_ranges())
+    known, method = float(bound), "sign matrices of Hertz" if exact else "centre plus radius"
     if hull is not None and len(hull.vertices):
         kept = hull.part(block)
         radius = np.broadcast_to(kept.radius, kept.vertices.shape)

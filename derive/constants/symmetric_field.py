@@ -65,9 +65,8 @@ class SymmetricField:
         return self._matrices(found.lower, found.upper)
 
     def matrix_of_ranges(self) -> tuple[FloatArray, FloatArray]:
-        """Return centre and radius, shape (k, k), of the entrywise ranges over the whole box."""
-        centre, radius = self._matrices(self.lower[:, None], self.upper[:, None])
-        return centre[0], radius[0]
+        """Return centre and radius, (1, k, k), of the entrywise ranges over the whole box."""
+        return self._matrices(self.lower[:, None], self.upper[:, None])
 
     def _matrices(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
         low = np.maximum(low, self.lower[:, None])
@@ -82,14 +81,11 @@ class SymmetricField:
         used = sorted({k for k in problem.gradient.ravel().tolist() if k >= 0})
         found = enclose(problem.program, lower, upper, [*range(m), *used], m)
         centre, radius = self._matrices(found.lower[:m], found.upper[:m])
-        position = {k: m + row for row, k in enumerate(used)}
-        v, n = lower.shape
-        slope_lower, slope_upper = np.zeros((m, v, n)), np.zeros((m, v, n))
-        for e in range(m):
-            for j, k in enumerate(problem.gradient[e].tolist()):
-                if k >= 0:
-                    slope_lower[e, j] = found.lower[position[k]]
-                    slope_upper[e, j] = found.upper[position[k]]
+        row = np.zeros(len(problem.program.outputs), dtype=np.int64)
+        row[used] = m + np.arange(len(used))
+        place, present = row[problem.gradient], problem.gradient[:, :, None] >= 0
+        slope_lower = np.where(present, found.lower[place], 0.0)
+        slope_upper = np.where(present, found.upper[place], 0.0)
         finite = np.isfinite(slope_lower) & np.isfinite(slope_upper)
         smooth = np.asarray(finite.all(axis=(0, 1)) & ~found.rough[:m].any(axis=0), dtype=np.bool_)
         slope_lower, slope_upper = slope_lower * smooth, slope_upper * smooth

@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.errors import StructureError
+from obsynth.derive.jacobian.family import find_dependences
+from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Role, Signal
-
-_POINTS = 24
-_RANK = 1e-7
-_LARGEST_DENOMINATOR = 10**6
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +102,7 @@ def extend(model: Plant, unfollowed: Sequence[str] = (), divided: Sequence[str] 
     states = [*model.x, *followed]
     size = len(states)
     _refuse_shown(outputs, free, model)
-    D0, base = _span(rows, free, states, model)
+    D0, base = _span(rows, free, model)
     L0, picked = _left_inverse(D0, outputs, states, free, model)
     T0 = sp.eye(size) - L0 * _slopes(outputs, states, picked)
     if free:
@@ -175,9 +172,7 @@ def _refuse_shown(outputs: list[sp.Expr], free: list[Signal], model: Plant) -> N
             )
 
 
-def _span(
-    rows: list[sp.Expr], free: list[Signal], states: list[Signal], model: Plant
-) -> tuple[sp.Matrix, list[sp.Expr]]:
+def _span(rows: list[sp.Expr], free: list[Signal], model: Plant) -> tuple[sp.Matrix, list[sp.Expr]]:
     """Return D0 and the rows without unknown inputs; rows less these lie in its span, proved."""
     size = len(rows)
     zero = {s.symbol: sp.Integer(0) for s in free}
@@ -201,63 +196,16 @@ def _span(
             "with range=, as a bounded disturbance",
             symbols=tuple(s.name for s in free),
         )
-    touched = [i for i, row in enumerate(left) if row != 0]
-    samples = _sampled([left[i] for i in touched], model)
-    scale = np.array([_half(states[i]) for i in touched])
-    scaled = samples / scale[:, None]
-    norms = np.linalg.norm(scaled, axis=0)
-    scaled = scaled[:, norms > 0.0] / norms[norms > 0.0]
-    rank = int(np.linalg.matrix_rank(scaled, tol=_RANK)) if scaled.size else 0
-    if rank == len(touched):
-        D0 = sp.zeros(size, rank)
-        for column, i in enumerate(touched):
-            D0[i, column] = 1
-        return D0, base
-    pivots = _pivots(scaled, rank)
-    D0 = sp.zeros(size, rank)
-    known = scaled[pivots]
-    for k, i in enumerate(touched):
-        if k in pivots:
-            D0[i, pivots.index(k)] = 1
-            continue
-        weights = np.linalg.lstsq(known.T, scaled[k], rcond=None)[0]
-        weights = weights * scale[k] / scale[pivots]
-        for column, weight in enumerate(weights.tolist()):
-            if abs(weight) > 1e-9 * float(np.abs(weights).max(initial=0.0)):
-                D0[i, column] = _simple(left[i], left[touched[pivots[column]]], weight, rank)
-        told = sum((D0[i, c] * left[touched[p]] for c, p in enumerate(pivots)), sp.Integer(0))
-        if not is_zero(left[i] - told):
-            raise StructureError(
-                f"{free[0].role} {names}: what it does to {states[i].name} is no constant multiple "
-                f"of what it does to {', '.join(states[touched[p]].name for p in pivots)}, so no "
-                "constant direction holds it; declare it with range=, as a bounded disturbance",
-                symbols=tuple(s.name for s in free),
-                condition="constant directions of unknown inputs",
-            )
+    entries = matrix_entries({(i, 0): row for i, row in enumerate(left)}, model)
+    sampled = entries.sample(corners=False)
+    basis, dependences = find_dependences(entries.exact, sampled, entries.symbols)
+    D0 = sp.zeros(size, len(basis))
+    for column, (i, _) in enumerate(basis):
+        D0[i, column] = 1
+    for dependence in dependences:
+        for other, weight in dependence.coefficients.items():
+            D0[dependence.entry[0], basis.index(other)] = weight
     return D0, base
-
-
-def _half(signal: Signal) -> float:
-    """Return half the range of a signal, 1 where it has none."""
-    half = 0.5 * (signal.upper - signal.lower)
-    return half if np.isfinite(half) and half > 0.0 else 1.0
-
-
-def _sampled(rows: list[sp.Expr], model: Plant) -> FloatArray:
-    """Evaluate rows at random points of the box, shape (rows, points)."""
-    signals = [s for s in model.signals if s.role is not Role.PARAM or s.lower < s.upper]
-    rng = np.random.default_rng(0)
-    function = sp.lambdify([s.symbol for s in signals], rows, modules="numpy", cse=True)
-    columns = []
-    for _ in range(_POINTS):
-        point = [
-            rng.uniform(s.lower, s.upper) if s.bounded else rng.uniform(-1.0, 1.0) for s in signals
-        ]
-        with np.errstate(all="ignore"):
-            value = np.array(function(*point), dtype=float)
-        if np.isfinite(value).all():
-            columns.append(value)
-    return np.array(columns).reshape(-1, len(rows)).T
 
 
 def _pivots(scaled: FloatArray, rank: int) -> list[int]:
@@ -266,15 +214,6 @@ def _pivots(scaled: FloatArray, rank: int) -> list[int]:
 
     order = qr(scaled.T, pivoting=True, mode="r")[1]
     return sorted(int(k) for k in order[:rank])
-
-
-def _simple(row: sp.Expr, pivot: sp.Expr, weight: float, rank: int) -> sp.Expr:
-    """Return the exact factor that a number stands for."""
-    if rank == 1:
-        ratio = sp.cancel(sp.together(row / pivot))
-        if not ratio.free_symbols:
-            return ratio
-    return sp.Rational(weight).limit_denominator(_LARGEST_DENOMINATOR)
 
 
 def _slopes(outputs: list[sp.Expr], states: Sequence[Signal], picked: Sequence[int]) -> sp.Matrix:

@@ -14,14 +14,7 @@ import numpy as np
 
 from obsynth.derive.intervals.rules import COMMUTATIVE, PARTIAL, RULES, uncertain
 from obsynth.derive.rigour import Interval
-from obsynth.derive.rigour.interval import point
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
-
-_RATIONAL: dict[str, Callable[..., Fraction]] = {
-    "add": lambda a, b: a + b,
-    "subtract": lambda a, b: a - b,
-    "multiply": lambda a, b: a * b,
-}
 
 
 @dataclass(frozen=True)
@@ -55,32 +48,17 @@ class Graph:
             extra = (node.number,) if node.op == "power_int" else ()
             with np.errstate(all="ignore"):
                 lo, hi = RULES[node.op](*(self.constants[a] for a in node.args), *extra)
-            if lo[0] != hi[0]:
-                lo, hi = self._without_rounding(node, lo, hi)
+            if node.op == "multiply":
+                # an exponent 3 n has to stay an integer, or a power loses its negative bases
+                a, b = (self.exact(k) for k in node.args)
+                if a and b and np.isfinite(a * b) and Fraction(a) * Fraction(b) == a * b:
+                    return self.number(a * b, a * b)
             if lo[0] == hi[0]:
                 return self.number(float(lo[0]), float(hi[0]))
             self.constants[index] = (lo, hi)
         self.nodes.append(node)
         self._known[node] = index
         return index
-
-    def _without_rounding(self, node: Node, lo: FloatArray, hi: FloatArray) -> Interval:
-        """Replace the enclosure of an operation on numbers by its result where that is a double.
-
-        An exponent n - 1 has to stay an integer, or a power loses its negative bases.
-        """
-        known = [self.exact(a) for a in node.args]
-        values = [v for v in known if v is not None and np.isfinite(v)]
-        if node.op not in _RATIONAL or len(values) < len(known):
-            return lo, hi
-        result = _RATIONAL[node.op](*map(Fraction, values))
-        try:
-            nearest = float(result)
-        except OverflowError:
-            return lo, hi
-        if Fraction(nearest) != result:
-            return lo, hi
-        return point(nearest)
 
     def number(self, lo: float, hi: float) -> int:
         """Return the node of a constant interval."""

@@ -85,8 +85,6 @@ def make_problem(
 
 # What a few sweeps over a few boxes settle needs no further thought.
 _QUICK = Budget(boxes=4_000, sweeps=7)
-# A gap that falls to this share in two sweeps over few boxes is soon closed.
-_FEW, _FAST = 400, 0.25
 # Ranges of quantities that become variables are to add next to nothing to the gap.
 _INNER = 1e-3
 
@@ -95,36 +93,20 @@ def staged(problem: Problem, rtol: float, budget: Budget) -> Outcome:
     """Bound every expression of a problem, in fewer variables where it does not see all of them."""
     quick = Budget(min(_QUICK.boxes, budget.boxes), min(_QUICK.sweeps, budget.sweeps))
     search = Search(problem, rtol)
-    outcome = _while_quick(search, quick, budget)
+    outcome = search.run(quick)
     left = [
         e for e in range(len(problem.gradient)) if not outcome.finished[2 * e : 2 * e + 2].all()
     ]
-    if left and problem.source is not None and np.isfinite(problem.upper - problem.lower).all():
-        source = problem.source
+    source, found, reduced = problem.source, None, None
+    if left and source is not None and np.isfinite(problem.upper - problem.lower).all():
         found = reduce_variables(source.column, source.variables, source.extra, left)
-        reduced = None if found is None else _reduced(problem, source, found, rtol, budget)
-        if found is not None and reduced is not None:
-            outcome = _merged(outcome, reduced, found.which)
-            left = [e for e in left if e not in found.which]
-    if not left or quick == budget:
-        return outcome
-    spent = search.boxes, search.sweeps
-    last = search.run(budget, left)
-    # what was spent before is counted already
-    last = replace(last, boxes=last.boxes - spent[0], sweeps=last.sweeps - spent[1])
-    return _merged(outcome, last, left)
-
-
-def _while_quick(search: Search, quick: Budget, budget: Budget) -> Outcome:
-    """Search for a while, and on as long as few boxes are left and the gap falls fast."""
-    outcome = search.run(quick)
-    while 0 < search.open.count <= _FEW and search.sweeps < budget.sweeps:
-        before = search.excess()
-        outcome = search.run(replace(budget, sweeps=search.sweeps + 2))
-        after = search.excess()
-        if not np.isfinite(after) or after > _FAST * before:
-            break
-    return outcome
+        if found is not None:
+            reduced = _reduced(problem, source, found, rtol, budget)
+    which = [] if found is None or reduced is None else found.which
+    left = [e for e in left if e not in which]
+    if left and quick != budget:
+        outcome = search.run(budget, left)
+    return outcome if reduced is None else _merged(outcome, reduced, which)
 
 
 def _merged(first: Outcome, second: Outcome, expressions: list[int]) -> Outcome:

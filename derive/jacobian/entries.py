@@ -14,9 +14,8 @@ from obsynth.derive.jacobian.matrix_entries import KINDS, Entry, MatrixEntries
 from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray
-from obsynth.symbolic.convert import nearest_double, to_sx
+from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.plant import Plant
-from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
 
 # Expanding a longer entry costs more than the zeros it may show.
 _LONG = 1000
@@ -25,7 +24,6 @@ COLUMNS = {"states": ("x",), "inputs": ("u",), "joint": ("x", "w")}
 # Two forms of a row are compared on boxes of this share of the ranges.
 _SHARE, _BOXES = 0.25, 24
 _GAIN = 0.9
-_POINTS = 16
 
 
 def jacobian_entries(split_or_model: Split | Plant, wrt: str) -> MatrixEntries:
@@ -137,49 +135,25 @@ def _preferred_rows(
     def may_vanish(part: sp.Expr) -> bool:
         (value,) = to_sx([part], symbols, ["a denominator"])
         function = ca.Function("part", [variables, sx.c], [value])
-        lower, upper = evaluate(Program.from_casadi(function, {1: constants}), *_ends(box))
+        program = Program.from_casadi(function, {1: constants})
+        lower, upper = evaluate(program, box[:, :1], box[:, 1:])
         return bool(lower[0, 0] <= 0.0 <= upper[0, 0])
 
     for i, typed in enumerate(rows):
         if size(typed) > LARGEST_ROW:
             continue
-        row = typed
         shorter = cancel_common_factors(substitute(typed, {}), may_vanish)
         if shorter is not None:
-            (written,) = to_sx([shorter], symbols, [f"dynamics row {i + 1}"])
-            if _agree(typed.xreplace(model.constant_values), written, symbols, model):
-                rows[i], rhs[i], row = shorter, written, shorter
-        other = products_to_sums(substitute(row, {}))
+            rows[i], (rhs[i],) = shorter, to_sx([shorter], symbols, [f"dynamics row {i + 1}"])
+        other = products_to_sums(substitute(rows[i], {}))
         if other is None:
             continue
         (written,) = to_sx([other], symbols, [f"dynamics row {i + 1}"])
-        if not _agree(row.xreplace(model.constant_values), written, symbols, model):
-            continue
         forms = [ca.jacobian(form, columns) for form in (rhs[i], written)]
         widths = _mean_widths(forms, variables, sx.c, box, constants)
         if _is_narrower(widths[1], widths[0]):
             rows[i], rhs[i] = other, written
     return rows, ca.vertcat(*rhs)
-
-
-def _ends(box: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return box[:, :1], box[:, 1:]
-
-
-def _agree(row: sp.Expr, written: ca.SX, symbols: dict[sp.Symbol, ca.SX], model: Plant) -> bool:
-    """Compare a row as the user wrote it with its other form, at random points."""
-    variables, box = all_variables(model)
-    values = [(symbols[s], nearest_double(v)) for s, v in model.constant_values.items()]
-    numbers = [ca.DM(value) for _, value in values]
-    plain = ca.substitute([written], [symbol for symbol, _ in values], numbers)[0]
-    function = ca.Function("form", [variables], [plain])
-    names = [s.symbol for k in KINDS for s in getattr(model, k)]
-    try:
-        points = sample_box(box, _POINTS)
-        check_parity([row], names, lambda p: np.array(function(p)), points, ["a row"])
-    except ParityError:
-        return False
-    return True
 
 
 def _mean_widths(

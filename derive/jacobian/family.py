@@ -259,20 +259,16 @@ def find_dependences(
         centred = samples[entry] / unit
         centred -= centred.mean()
         size = float(np.linalg.norm(centred))
-        proved: AffineDependence | None
-        if size <= _RANK_TOLERANCE * np.sqrt(len(centred)):
-            proved = prover.constant(entry)
-        else:
+        guess: dict[Entry, float] | None = {}
+        if size > _RANK_TOLERANCE * np.sqrt(len(centred)):
             matrix = np.array(columns).T if columns else np.zeros((len(centred), 0))
             scale = np.linalg.norm(matrix, axis=0)
             weights = np.linalg.lstsq(matrix / scale, centred / size, rcond=None)[0]
-            proved = None
-            if np.linalg.norm(centred / size - matrix / scale @ weights) <= _RANK_TOLERANCE:
-                used = np.flatnonzero(np.abs(weights) > _RANK_TOLERANCE)
-                guess = {
-                    basis[k]: float(weights[k] * size / scale[k]) * (unit / units[k]) for k in used
-                }
-                proved = prover.combination(entry, guess)
+            near = np.linalg.norm(centred / size - matrix / scale @ weights) <= _RANK_TOLERANCE
+            used = np.flatnonzero(np.abs(weights) > _RANK_TOLERANCE)
+            share = weights * size / scale
+            guess = {basis[k]: float(share[k]) * (unit / units[k]) for k in used} if near else None
+        proved = None if guess is None else prover.prove(entry, guess)
         if proved is None:
             basis.append(entry)
             columns.append(centred if size > 0.0 else np.ones_like(centred))
@@ -289,11 +285,8 @@ class _Prover:
         self.entries, self.variables = entries, variables
         self.parts = {e: monomials(expression, variables) for e, expression in entries.items()}
 
-    def constant(self, entry: Entry) -> AffineDependence | None:
-        return self._accept(entry, {})
-
-    def combination(self, entry: Entry, guess: Mapping[Entry, float]) -> AffineDependence | None:
-        exact = _solve(self.parts[entry], [self.parts[other] for other in guess])
+    def prove(self, entry: Entry, guess: Mapping[Entry, float]) -> AffineDependence | None:
+        exact = _solve(self.parts[entry], [self.parts[other] for other in guess]) if guess else []
         if exact is not None:
             return self._accept(entry, dict(zip(guess, exact, strict=True)))
         # equal functions in different words: short rational coefficients are worth a try

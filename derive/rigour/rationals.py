@@ -179,22 +179,11 @@ def is_positive_definite(matrix: Any) -> bool:
     exact = ExactMatrix.of(matrix)
     if exact.shape[0] != exact.shape[1] or exact.entries != exact.entries.transpose():
         raise ObsynthError(f"the exact {exact.shape} matrix is not symmetric")
-    scaled, _ = exact.entries.numer_denom()
-    rows = scaled.tolist()
-    n = len(rows)
-    previous: Any = 1
-    # Bareiss: after step k every entry is a minor, the pivots are the leading ones, and every
-    # division is exact. L D L' follows with D the quotients of successive pivots.
-    for k in range(n):
-        pivot = rows[k][k]
-        if pivot <= 0:
-            return False
-        for i in range(k + 1, n):
-            head = rows[k][i]
-            for j in range(i, n):
-                rows[i][j] = (rows[i][j] * pivot - head * rows[k][j]) // previous
-        previous = pivot
-    return True
+    from flint import fmpz_mat
+
+    rows = exact.entries.numer_denom()[0].tolist()
+    minors = ([row[:k] for row in rows[:k]] for k in range(1, len(rows) + 1))
+    return all(fmpz_mat(minor).det() > 0 for minor in minors)
 
 
 def _is_zero(value: Any) -> bool:

@@ -8,7 +8,6 @@ of 0/0.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 
 import casadi as ca
 import sympy as sp
@@ -27,6 +26,7 @@ from obsynth.symbolic.tape import from_tape
 _PATCH = 1.0 / 8.0
 _HIGHEST_ORDER = 4
 _LARGEST = 200
+_DEEP = 100
 _PATCHED = {"sinc": ca.sin, "phi1": ca.expm1, "tanhc": ca.tanh}
 _KINKS = (sp.Abs, sp.sign, sp.Piecewise, sp.Max, sp.Min, sp.floor, sp.ceiling, sp.Heaviside)
 
@@ -315,49 +315,15 @@ def _order(function: sp.Expr, symbol: sp.Symbol) -> int | None:
 
 
 def _patch(graph: SxGraph, k: int) -> tuple[str, int] | None:
-    """Name and argument of a node that is one of the patched functions."""
+    """Name and argument of a node that is one of the patched functions, letter by letter."""
     code, args, _ = graph.nodes[k]
-    if code == ca.OP_ADD and all(graph.nodes[a][0] == ca.OP_IF_ELSE_ZERO for a in args):
+    if code != ca.OP_ADD or any(graph.nodes[a][0] != ca.OP_IF_ELSE_ZERO for a in args):
+        return None
+    tests = [graph.nodes[graph.nodes[a][1][0]] for a in args]
+    sizes = [graph.nodes[operands[0]] for code, operands, _ in tests if code == ca.OP_LT]
+    for z in [operands[0] for code, operands, _ in sizes if code == ca.OP_FABS]:
+        whole, argument = graph.expression(k), graph.expression(z)
         for name in _PATCHED:
-            found = _match(_template(name), graph, k)
-            if found is not None:
-                return name, found
+            if ca.is_equal(whole, BY_NAME[name].casadi(argument), _DEEP):
+                return name, z
     return None
-
-
-@cache
-def _template(name: str) -> SxGraph:
-    s = ca.SX.sym("s")
-    return SxGraph(BY_NAME[name].casadi(s), s, ca.SX(0, 1))
-
-
-def _match(template: SxGraph, graph: SxGraph, root: int) -> int | None:
-    """Argument z for which a node is the function of the template at z, letter by letter."""
-    bound: dict[int, int] = {}
-
-    def agree(t: int, k: int) -> bool:
-        if t in bound:
-            return bound[t] == k
-        code, args, value = template.nodes[t]
-        if code == ca.OP_INPUT:
-            bound[t] = k
-            return True
-        if graph.nodes[k][0] != code:
-            return False
-        if code == ca.OP_CONST:
-            return graph.nodes[k][2] == value
-        others = graph.nodes[k][1]
-        for order in (others, others[::-1]) if code in _EITHER_WAY else (others,):
-            before = dict(bound)
-            if all(agree(a, b) for a, b in zip(args, order, strict=True)):
-                bound[t] = k
-                return True
-            bound.clear()
-            bound.update(before)
-        return False
-
-    (leaf,) = [t for t, node in enumerate(template.nodes) if node[0] == ca.OP_INPUT]
-    return bound[leaf] if agree(template.roots[0], root) else None
-
-
-_EITHER_WAY = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMAX})

@@ -25,8 +25,6 @@ from obsynth.derive.intervals.search.batch import (
 )
 from obsynth.derive.intervals.search.curvature import (
     Curvatures,
-    concave_bounds,
-    is_concave,
     sharpened_slopes,
     taylor_spread,
 )
@@ -254,32 +252,12 @@ class Search:
         terms = mean_value_terms(lower, upper, centre, *slopes)
         bound = np.fmin(rows.bound, _mean_value_bound(at.upper, terms))
         bound = np.fmin(bound, up(at.upper + taylor_spread(lower, upper, centre, ends, hessians)))
-        rows = Rows(rows.goal, lower, upper, bound)
-        free = upper > lower
-        bends_down = (~free | (np.einsum("nii->in", hessians.upper) < 0.0)).all(axis=0)
-        index = np.flatnonzero(self.is_open(rows) & bends_down & free.any(axis=0))
-        index = index[is_concave(hessians.take(index), free[:, index])]
-        if len(index):
-            bound[index] = concave_bounds(
-                rows.take(index),
-                hessians.take(index),
-                centre[:, index],
-                0.5 * (ends[0][:, index] + ends[1][:, index]),
-                lambda some: self.record(some, slopes=True),
-                self.is_open,
-            )
         convex = (np.einsum("nii->in", hessians.lower) >= 0.0) & hessians.usable
-        return rows, terms, convex
+        return Rows(rows.goal, lower, upper, bound), terms, convex
 
     def is_open(self, rows: Rows) -> BoolArray:
         """Where a row may still hold more than the best value of its goal."""
         return np.asarray(rows.bound > self.best[rows.goal] + self.tolerance()[rows.goal])
-
-    def excess(self) -> float:
-        """Return the largest gap that is open, in units of what is good enough."""
-        rows = self.open
-        gap = (rows.bound - self.best[rows.goal]) / self.tolerance()[rows.goal]
-        return float(gap.max(initial=0.0))
 
     def close(self, rows: Rows, settled: BoolArray | None = None) -> BoolArray:
         """Close rows that cannot improve their goal; tell which ones stay open."""

@@ -1,13 +1,11 @@
 """Second derivatives over batches of boxes, and what they say about a largest value.
 
 Where an expression is twice differentiable all over a box, an enclosure H of its second derivatives
-gives three things that values and gradients do not: a gradient enclosure that is better by one
-order (the mean-value form of every partial derivative), a bound of second order,
-f(x) <= f(c) + f'(c) (x - c) + sup (x - c)' H (x - c) / 2, and, where H is negative definite, the
-knowledge that the goal is concave, so that its tangent at any point bounds it.
+gives two things that values and gradients do not: a gradient enclosure that is better by one order
+(the mean-value form of every partial derivative), and a bound of second order,
+f(x) <= f(c) + f'(c) (x - c) + sup (x - c)' H (x - c) / 2.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -15,9 +13,8 @@ import numpy as np
 
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import JUMPS
-from obsynth.derive.intervals.search.batch import Entries, RowRanges, Rows, Source, radius_about
+from obsynth.derive.intervals.search.batch import Entries, Source, radius_about
 from obsynth.derive.rigour import Interval, down, up
-from obsynth.derive.rigour.interval import divide, multiply, subtract
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 # Kinks, jumps and choices: CasADi's second derivative leaves out what happens at the switch. Of
@@ -28,8 +25,6 @@ _NOT_SMOOTH = (JUMPS - {"arctangent2"}) | {
 }
 _ULP = 2.3e-16
 _TINY = 1e-300
-# Steps of the climb to the top of a concave goal.
-_CLIMB = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +42,6 @@ class Hessians:
     def size(self) -> FloatArray:
         """Largest magnitudes, shape (N, v, v)."""
         return np.maximum(np.abs(self.lower), np.abs(self.upper))
-
-    def take(self, which: IntArray) -> "Hessians":
-        """Return some of the rows."""
-        return Hessians(self.lower[which], self.upper[which], self.usable[which])
 
 
 class Curvatures:
@@ -164,89 +155,3 @@ def taylor_spread(
     across = 0.5 * np.einsum("nij,in,jn->n", size, radius, radius)
     total = (along.sum(axis=0) + across) * (1.0 + (len(lower) ** 2 + 64) * _ULP) + _TINY
     return np.where(hessians.usable, total, np.inf)
-
-
-def is_concave(hessians: Hessians, free: BoolArray) -> BoolArray:
-    """Prove goals strictly concave in their free variables, by elimination in intervals."""
-    count = int(free.sum(axis=0).max(initial=0))
-    order = np.argsort(~free.T, axis=1, kind="stable")[:, :count]
-    inside = np.take_along_axis(free.T, order, axis=1)
-    pick = np.arange(len(order))[:, None, None], order[:, :, None], order[:, None, :]
-    low, high = -hessians.upper[pick], -hessians.lower[pick]
-    outside = ~(inside[:, :, None] & inside[:, None, :])
-    one = np.broadcast_to(np.eye(count), low.shape)
-    low, high = np.where(outside, one, low), np.where(outside, one, high)
-    proved = hessians.usable.copy()
-    with np.errstate(all="ignore"):
-        for k in range(count):
-            proved &= low[:, k, k] > 0.0
-            if not proved.any():
-                break
-            pivot = np.where(proved, low[:, k, k], 1.0), np.where(proved, high[:, k, k], 1.0)
-            for i in range(k + 1, count):
-                factor = divide((low[:, i, k], high[:, i, k]), pivot)
-                for j in range(i, count):
-                    product = multiply(factor, (low[:, j, k], high[:, j, k]))
-                    entry = low[:, j, i], high[:, j, i]
-                    low[:, j, i], high[:, j, i] = subtract(entry, product)
-    return proved
-
-
-def tangent_rise(
-    lower: FloatArray,
-    upper: FloatArray,
-    centre: FloatArray,
-    at_centre: Interval,
-) -> FloatArray:
-    """Bound the rise of tangents above their point of contact, over boxes.
-
-    Shapes: at_centre (ndarray, ndarray), shape (v, N).
-    """
-    with np.errstate(invalid="ignore", over="ignore"):
-        forwards = np.where(upper > centre, up(at_centre[1] * up(upper - centre)), 0.0)
-        backwards = np.where(lower < centre, up(at_centre[0] * down(lower - centre)), 0.0)
-    along = np.maximum(np.maximum(forwards, backwards), 0.0)
-    return np.asarray(up(along.sum(axis=0) * (1.0 + (len(lower) + 2) * _ULP)))
-
-
-def _newton(rows: Rows, hessians: Hessians, at: FloatArray, slope: FloatArray) -> FloatArray:
-    """One step of Newton's method inside the boxes, along the variables that may still move."""
-    pressed = ((at <= rows.lower) & (slope < 0.0)) | ((at >= rows.upper) & (slope > 0.0))
-    still: BoolArray = (pressed | (rows.upper <= rows.lower)).T
-    matrix = 0.5 * (hessians.lower + hessians.upper)
-    matrix[still[:, :, None] | still[:, None, :]] = 0.0
-    diagonal = np.einsum("nii->ni", matrix)
-    diagonal[still] = -1.0
-    diagonal[...] = np.where(diagonal < 0.0, diagonal, -1.0)
-    try:
-        step = np.linalg.solve(matrix, -np.where(still, 0.0, slope.T)[:, :, None])[:, :, 0].T
-    except np.linalg.LinAlgError:
-        return at
-    moved = at + np.where(np.isfinite(step), step, 0.0)
-    return np.clip(moved, rows.lower, rows.upper)
-
-
-def concave_bounds(
-    rows: Rows,
-    hessians: Hessians,
-    start: FloatArray,
-    slope: FloatArray,
-    evaluate: Callable[[Rows], RowRanges],
-    is_open: Callable[[Rows], BoolArray],
-) -> FloatArray:
-    """Bound goals that are concave over their boxes: they lie below every tangent."""
-    bound, index = rows.bound.copy(), np.arange(rows.count)
-    at = start
-    for _ in range(_CLIMB):
-        at = _newton(rows, hessians, at, slope)
-        found = evaluate(Rows(rows.goal, at, at, rows.bound))
-        ends = found.slope_lower, found.slope_upper
-        top = up(found.upper + tangent_rise(rows.lower, rows.upper, at, ends))
-        bound[index] = np.fmin(bound[index], top)
-        rows = Rows(rows.goal, rows.lower, rows.upper, bound[index])
-        left = np.flatnonzero(is_open(rows))
-        if not len(left):
-            break
-        slope = 0.5 * (ends[0] + ends[1])[:, left]
-        rows, hessians, at, index = rows.take(left), hessians.take(left), at[:, left], index[left]
-    return bound

@@ -201,23 +201,15 @@ def preimage(
     function: ca.Function, number: int, value: float, low_at: FloatArray, high_at: FloatArray
 ) -> FloatArray:
     """Find where a quantity takes a value, on the way between its smallest and largest value."""
+    from scipy.optimize import brentq
 
-    def at(share: float) -> FloatArray:
-        return low_at + share * (high_at - low_at)
+    def off(share: float) -> float:
+        there = low_at + share * (high_at - low_at)
+        return float(function(there).nonzeros()[number]) - value
 
-    def value_at(share: float) -> float:
-        return float(function(at(share)).nonzeros()[number])
-
-    low, high = 0.0, 1.0
-    if value_at(low) >= value:
+    if off(0.0) >= 0.0:
         return low_at
-    if value_at(high) <= value:
+    if off(1.0) <= 0.0:
         return high_at
-    while True:
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            return at(high)
-        found = value_at(middle)
-        if found == value:
-            return at(middle)
-        low, high = (middle, high) if found < value else (low, middle)
+    share = float(brentq(off, 0.0, 1.0, xtol=1e-16, rtol=1e-15))
+    return low_at + share * (high_at - low_at)
