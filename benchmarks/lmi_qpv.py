@@ -18,7 +18,8 @@ from obsynth.designs.lmi.expression import full, scalar, symmetric
 from obsynth.designs.lmi.margin import solve_with_margin
 from obsynth.designs.lmi.problem import Problem, he, symmetric_block
 from obsynth.designs.lmi.proof import prove_family
-from obsynth.designs.lmi.reductions import extreme_points, split_common
+from obsynth.designs.lmi.reductions import split_common
+from obsynth.designs.qpv.error_matrix import extreme_points
 
 __all__ = ["ROWS"]
 
@@ -72,7 +73,7 @@ def reduced(kappa: float) -> dict[str, Any]:
     """Extreme pairs, common part split off, few vertices, back-off, proof at all pairs kept."""
     start = time.perf_counter()
     offsets, half = _box(kappa)
-    kept = extreme_points(_pairs(offsets)).kept
+    kept = extreme_points(_pairs(offsets))
     psi = _psi(_pairs(offsets)[kept])
     # The error is measured in half widths of the box.
     D, back = np.diag(half), np.diag(1.0 / half)

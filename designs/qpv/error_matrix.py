@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.rigour import Enclosure
-from obsynth.designs.lmi.reductions import extreme_points
 from obsynth.designs.qpv.sets import Shape
 from obsynth.symbolic.arrays import FloatArray
 
@@ -112,21 +111,22 @@ def psi_kept(N: FloatArray, sets: ErrorSets) -> FloatArray:
     flat = families.reshape(count, -1)
     varying = np.flatnonzero(np.ptp(flat, axis=0) > 0)
     independent = _independent(flat[:, varying])
-    kept = _extreme(_tidy(independent)) if independent.size else np.zeros(1, dtype=np.intp)
+    kept = extreme_points(_tidy(independent)) if independent.size else np.zeros(1, dtype=np.intp)
     return np.swapaxes(families[kept], 0, 1)
 
 
-def _extreme(points: FloatArray) -> NDArray[np.intp]:
-    """Rows that are extreme, up to rounding; the hull grows by what lies outside it."""
+def extreme_points(points: FloatArray) -> NDArray[np.intp]:
+    """Rows that are extreme, up to rounding; in many coordinates all that differ."""
     dimension = points.shape[1]
     if dimension == 1:
         return np.unique([points[:, 0].argmin(), points[:, 0].argmax()])
     if dimension > _HULL_DIMENSION:
-        return extreme_points(points).kept
+        return np.sort(np.unique(points, axis=0, return_index=True)[1])
     from scipy.spatial import ConvexHull
 
     directions = np.random.default_rng(0).normal(size=(dimension, 64 * dimension))
     chosen = np.unique((points @ directions).argmax(axis=0))
+    # the hull grows by what lies outside it
     while True:
         hull = ConvexHull(points[chosen])
         heights = points @ hull.equations[:, :-1].T + hull.equations[:, -1]
@@ -149,7 +149,7 @@ def _independent(columns: FloatArray) -> FloatArray:
 
 
 def _tidy(points: FloatArray) -> FloatArray:
-    """Round to 30 bits of half ranges, so that exact tests see patterns; the proof takes all."""
+    """Round to 30 bits of half ranges, so that equal rows are equal; the proof takes all."""
     low, high = points.min(axis=0), points.max(axis=0)
     centred = (points - 0.5 * (low + high)) / np.where(high > low, 0.5 * (high - low), 1.0)
     return np.asarray(np.round(centred * 2.0**30) / 2.0**30)

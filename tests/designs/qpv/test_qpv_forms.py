@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import obsynth as ob
-from obsynth.designs.qpv.error_matrix import ErrorSets, entering, psi_family, psi_kept
+from obsynth.designs.qpv.error_matrix import (
+    ErrorSets,
+    entering,
+    extreme_points,
+    psi_family,
+    psi_kept,
+)
 from obsynth.designs.qpv.model import read_form
 from obsynth.designs.qpv.sets import box, cross, hull
 
@@ -98,6 +104,16 @@ def test_dropped_pairs_are_convex_combinations_of_kept_ones(kind):
     # mutant: without one of the kept pairs some pair is no combination any more
     fewer = columns[:, 1:]
     assert not linprog(np.zeros(len(kept) - 1), A_eq=fewer, b_eq=columns[:, 0]).success
+
+
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_no_corner_is_lost_in_any_number_of_coordinates(count):
+    """In many coordinates nothing goes but what is twice. Mutant: the first row left out."""
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count)))
+    points = np.vstack([0.5 * corners[:3], corners, corners])
+    kept = points[extreme_points(points)]
+    assert {tuple(row) for row in kept.tolist()} >= {tuple(row) for row in corners.tolist()}
+    assert len(kept) == len(corners) + (3 if count > 7 else 0)
 
 
 def test_outputs_that_vary_are_relaxed_and_hold_between_the_vertices():
