@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.designs.core.frequency import ComplexArray, peak_gain
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.hinf.method import HinfUIO
@@ -17,23 +20,18 @@ from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.shown import Shown
 
-ComplexArray = NDArray[np.complex128]
-FREQUENCIES = 48
-REFINEMENTS = 6
 NEWTON = 30
-ROUNDS = 12
+ROUNDS, KEPT, NEAR = 12, 4, 16
 # Where a signal has no range, operating points are looked for within so many units of zero.
 REACH = 10.0
 # Distance kept from the ends of a range, as a share of its width: w moves the plant a little.
 DISTANCE = 1e-3
-Functions = tuple[ca.Function, ca.Function]
 CHUNK = 500
 # A longer disturbance is tried until the gain is this close to that of the linearisation.
 CLOSE = 1.0 - 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class OperatingPoints:
+class OperatingPoints(NamedTuple):
     """Points x = f(x, u, v), v faults and d, with Jacobians (N, n, n) by x."""
 
     x: FloatArray
@@ -41,130 +39,88 @@ class OperatingPoints:
     v: FloatArray
     jacobian: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.x)
-
     def take(self, index: NDArray[np.intp]) -> OperatingPoints:
         """Return some of the points."""
-        return OperatingPoints(self.x[index], self.u[index], self.v[index], self.jacobian[index])
+        return OperatingPoints(*(part[index] for part in self))
 
     def joined(self, other: OperatingPoints) -> OperatingPoints:
         """Return the points of both."""
-        pairs = ((getattr(self, k), getattr(other, k)) for k in ("x", "u", "v", "jacobian"))
-        return OperatingPoints(*(np.concatenate(pair) for pair in pairs))
+        return OperatingPoints(*map(np.concatenate, zip(self, other, strict=True)))
 
 
-def _functions(model: Plant) -> Functions:
-    """(x, u, v) -> rhs and its Jacobian by (x, u, v)."""
+@lru_cache(maxsize=4)
+def _motion(model: Plant) -> ca.Function:
+    """(x, u, v) -> f(x, u, v) - x and the Jacobian of f by (x, u, v), side by side."""
     n, n_u, n_f, n_d = (len(model.names(kind)) for kind in ("x", "u", "f", "d"))
     x, u, v = ca.SX.sym("x", n), ca.SX.sym("u", n_u), ca.SX.sym("v", n_f + n_d)
-    quiet = [ca.DM(noise_centre(model)), *(ca.DM.zeros(len(model.names(k))) for k in ("p", "rho"))]
-    value = model.function()(x, u, v[n_f:], v[:n_f], *quiet)[0]
-    slopes = ca.densify(ca.jacobian(value, ca.vertcat(x, u, v)))
-    return ca.Function("rhs", [x, u, v], [value]), ca.Function("slopes", [x, u, v], [slopes])
+    middle = ca.DM(noise_centre(model))
+    value = model.function()(x=x, u=u, d=v[n_f:], f=v[:n_f], w=middle)["rhs"]
+    slopes = ca.jacobian(value, ca.vertcat(x, u, v))
+    both = ca.densify(ca.horzcat(value - x, slopes))
+    return ca.Function("motion", [ca.vertcat(x, u, v)], [both])
 
 
-def _batch(function: ca.Function, *arguments: FloatArray) -> FloatArray:
-    count = len(arguments[0])
-    rows, columns = function.size_out(0)
-    value = np.array(function.map(count)(*(a.T for a in arguments)))
-    return np.moveaxis(value.reshape(rows, count, columns), 1, 0)
-
-
-def hold_points(
-    model: Plant, x: FloatArray, u: FloatArray, functions: Functions | None = None
-) -> OperatingPoints:
+def hold_points(model: Plant, x: FloatArray, u: FloatArray) -> OperatingPoints:
     """Move points x (N, n), u (N, n_u) to the nearest that faults and d can hold, if any."""
-    rhs, slopes = functions or _functions(model)
-    n, n_u = x.shape[1], u.shape[1]
-    z = np.hstack([x, u, np.zeros((len(x), rhs.size_in(2)[0]))])
-    boxes = np.vstack([_inner(model.box("x")), model.box("u")])
+    motion, n, held = _motion(model), x.shape[1], x.shape[1] + u.shape[1]
+    z = np.hstack([x, u, np.zeros((len(x), motion.size_in(0)[0] - held))])
+    low, high = np.vstack([_inner(model.box("x")), model.box("u")]).T
     # v costs next to nothing, so that x and u stay where they were wanted if they can.
-    weight = np.concatenate([np.ones(n + n_u), np.full(z.shape[1] - n - n_u, 1e4)])
-    selector = np.eye(n, z.shape[1])
+    weight = np.where(np.arange(z.shape[1]) < held, 1.0, 1e4)
 
-    def parts(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return points[:, :n], points[:, n : n + n_u], points[:, n + n_u :]
+    def evaluated(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if not len(z):
+            return np.zeros((0, n)), np.zeros((0, n, z.shape[1]))
+        both = np.array(motion.map(len(z))(z.T)).reshape(n, len(z), -1).swapaxes(0, 1)
+        return both[:, :, 0], both[:, :, 1:]
 
     for _ in range(NEWTON):
-        residual = _batch(rhs, *parts(z))[:, :, 0] - z[:, :n]
-        matrix = (_batch(slopes, *parts(z)) - selector) * weight
+        residual, slopes = evaluated(z)
+        matrix = (slopes - np.eye(n, z.shape[1])) * weight
         usable = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
         z, matrix, residual = z[usable], matrix[usable], residual[usable]
-        if not len(z):
-            break
         step = weight * (np.linalg.pinv(matrix) @ residual[:, :, None])[:, :, 0]
         z = z - step
-        z[:, : n + n_u] = np.clip(z[:, : n + n_u], boxes[:, 0], boxes[:, 1])
-        if np.abs(step).max(initial=0.0) < 1e-13 * max(1.0, np.abs(z).max(initial=0.0)):
+        z[:, :held] = np.clip(z[:, :held], low, high)
+        if np.abs(step).max(initial=0.0) < 1e-13 * np.abs(z).max(initial=1.0):
             break
-    residual = _batch(rhs, *parts(z))[:, :, 0] - z[:, :n] if len(z) else np.zeros((0, n))
-    size = 1.0 + np.abs(z).max(axis=1, initial=0.0)
-    z = z[np.abs(residual).max(axis=1, initial=0.0) < 1e-10 * size]
-    jacobian = _batch(slopes, *parts(z))[:, :, :n] if len(z) else np.zeros((0, n, n))
-    return OperatingPoints(*parts(z), jacobian)
+    residual, slopes = evaluated(z)
+    found = np.abs(residual).max(axis=1) < 1e-10 * (1.0 + np.abs(z).max(axis=1))
+    z, slopes = z[found], slopes[found]
+    return OperatingPoints(z[:, :n], z[:, n:held], z[:, held:], slopes[:, :, :n])
 
 
 def frozen_gain(
-    design: HinfDesign, jacobian: FloatArray, refinements: int = REFINEMENTS
+    design: HinfDesign, jacobian: FloatArray, **options: int
 ) -> tuple[FloatArray, FloatArray, ComplexArray]:
     """Return peak gain, frequency and w (N, n_w) of errors linearised with Jacobians (N, n, n)."""
     gains, C, W = design.gains, design.C, design.W
-    kept = np.eye(len(C.T)) - gains.F @ C
-    loop = kept @ jacobian - gains.K @ C
-    output = gains.H @ C @ jacobian + gains.D @ C
-    modes = np.linalg.eigvals(loop)
-    unstable = np.abs(modes).max(axis=1) >= 1.0
-    common = np.linspace(0.0, np.pi, FREQUENCIES)
-    grid = np.hstack([np.broadcast_to(common, (len(loop), FREQUENCIES)), np.abs(np.angle(modes))])
-    eye = np.eye(loop.shape[-1])
-    spacing = np.pi / (FREQUENCIES - 1)
-    rows = np.arange(len(loop))
-    for round_number in range(refinements + 1):
-        z = np.exp(1j * grid)[:, :, None, None]
-        response = np.linalg.solve(z * eye - loop[:, None], (kept @ W).astype(complex))
-        transfer = output[:, None] @ response + gains.H @ C @ W
-        # n_f is small, so the squares of the singular values are quicker than these.
-        squares = np.linalg.eigvalsh(transfer @ np.conj(np.swapaxes(transfer, -1, -2)))[..., -1]
-        best = np.argmax(squares, axis=1)
-        peak = grid[rows, best]
-        if round_number < refinements:
-            width = spacing * 0.2**round_number
-            grid = np.clip(peak[:, None] + np.linspace(-width, width, 11), 0.0, np.pi)
-    _, sizes, right = np.linalg.svd(transfer[rows, best])
-    return np.where(unstable, np.inf, sizes[:, 0]), peak, right[:, 0].conj()
+    kept, seen = np.eye(len(C.T)) - gains.F @ C, gains.H @ C
+    loop, output = kept @ jacobian - gains.K @ C, seen @ jacobian + gains.D @ C
+    return peak_gain(loop, kept @ W, output, seen @ W, **options)
 
 
-def search_points(
-    design: HinfDesign, count: int = 256, seed: int = 0, keep: int = 4
-) -> OperatingPoints:
+def search_points(design: HinfDesign, count: int, seed: int) -> OperatingPoints:
     """Find the operating points with the largest frozen gains: samples, then a random ascent."""
-    rng = np.random.default_rng(seed)
-    model, functions = design.plant, _functions(design.plant)
+    rng, model = np.random.default_rng(seed), design.plant
     boxes = [_finite(model.box(kind)) for kind in ("x", "u")]
     draws = [rng.uniform(b[:, 0], b[:, 1], (count, len(b))) for b in boxes]
-    found = hold_points(model, draws[0], draws[1], functions)
-    rest = [np.zeros((1, len(b))) for b in boxes]
-    origin = hold_points(model, rest[0], rest[1], functions)
-    found = found.joined(origin)
-    if not len(found):
+    found = hold_points(model, *(np.vstack([d, np.zeros(d.shape[1])]) for d in draws))
+    if not len(found.x):
         return found
-    gain = frozen_gain(design, found.jacobian, 1)[0]
-    spread = 0.1
-    for _ in range(ROUNDS):
-        top = np.argsort(-gain, kind="stable")[:keep]
+    gain = frozen_gain(design, found.jacobian, refinements=1)[0]
+    for spread in 0.1 * 0.5 ** np.arange(ROUNDS):
+        top = np.argsort(-gain, kind="stable")[:KEPT]
         found, gain = found.take(top), gain[top]
-        near = [
-            np.repeat(value, 16, axis=0)
-            + spread * (b[:, 1] - b[:, 0]) * rng.standard_normal((16 * len(found), len(b)))
-            for value, b in zip((found.x, found.u), boxes, strict=True)
-        ]
-        inside = [np.clip(v, b[:, 0], b[:, 1]) for v, b in zip(near, boxes, strict=True)]
-        more = hold_points(model, inside[0], inside[1], functions)
+        near = []
+        for value, b in zip((found.x, found.u), boxes, strict=True):
+            noise = rng.standard_normal((NEAR * len(value), len(b)))
+            moved = np.repeat(value, NEAR, axis=0) + spread * (b[:, 1] - b[:, 0]) * noise
+            near.append(np.clip(moved, b[:, 0], b[:, 1]))
+        more = hold_points(model, *near)
         found = found.joined(more)
-        gain = np.concatenate([gain, frozen_gain(design, more.jacobian, 1)[0]])
-        spread *= 0.5
-    return found.take(np.argsort(-gain, kind="stable")[:keep])
+        gain = np.concatenate([gain, frozen_gain(design, more.jacobian, refinements=1)[0]])
+    return found.take(np.argsort(-gain, kind="stable")[:KEPT])
 
 
 def _inner(box: FloatArray) -> FloatArray:
@@ -276,32 +232,30 @@ def worst_case(
         raise ObsynthError(f"worst_case is for HinfUIO; this observer is of {observer.method}")
     design: HinfDesign = observer.certificate.design
     candidates = search_points(design, points, seed)
-    if not len(candidates):
+    if not len(candidates.x):
         raise ObsynthError(
             f"{design.plant.name} cannot be held anywhere in the ranges of its states by faults "
             "and inputs; widen the ranges"
         )
-    loop = _Loop(observer, design)
-    best: WorstCase | None = None
+    chunk = loop_of(observer)
     limits, frequencies, directions = frozen_gain(design, candidates.jacobian)
+    found: list[WorstCase] = []
     length = min(CHUNK, steps)
     while True:
-        for k in range(len(candidates)):
-            w = _half_sine(length, frequencies[k], directions[k], amplitude)
-            found = loop.run(candidates.take(np.array([k])), w, limits[k], frequencies[k])
-            if best is None or found.gain > best.gain:
-                best = found
-        if length >= steps or best is None or best.gain >= CLOSE * float(limits.max()):
-            break
+        for k in range(len(limits)):
+            w = half_sine(length, frequencies[k], directions[k], amplitude)
+            point = candidates.take(np.array([k]))
+            found.append(excite(observer, chunk, point, w, limits[k], frequencies[k]))
+        best = max(found, key=lambda case: case.gain)
+        if length >= steps or best.gain >= CLOSE * float(limits.max()):
+            return best
         length = min(4 * length, steps)
-    if best is None:
-        raise ObsynthError("no disturbance could be simulated")
-    return best
 
 
-def _half_sine(
-    length: int, frequency: float, direction: NDArray[np.complex128], amplitude: float
+def half_sine(
+    length: int, frequency: float, direction: ComplexArray, amplitude: float
 ) -> FloatArray:
+    """Return a disturbance in a direction at a frequency, over half a sine, (length, n_w)."""
     k = np.arange(length)
     window = amplitude * np.sin(np.pi * (k + 0.5) / length)
     carried = np.exp(1j * frequency * k)[:, None] * direction
@@ -311,69 +265,54 @@ def _half_sine(
     return np.asarray(window[:, None] * carried.real)
 
 
-class _Loop:
-    """Plant and observer in one function, run in chunks."""
+def loop_of(observer: Observer) -> ca.Function:
+    """Return plant and observer as one function over `CHUNK` samples: states, faults, estimates."""
+    model: Plant = observer.certificate.design.plant
+    n, n_u, n_f, n_d = (len(model.names(kind)) for kind in ("x", "u", "f", "d"))
+    x, memory = ca.SX.sym("x", n), ca.SX.sym("memory", observer.step.size_in(0)[0])
+    u, w, at = ca.SX.sym("u", n_u), ca.SX.sym("w", len(model.w)), ca.SX.sym("at", n)
+    v, feedback = ca.SX.sym("v", n_f + n_d), ca.SX.sym("feedback", n_f + n_d, n)
+    held = v + feedback @ (x - at)
+    noise = w + ca.DM(noise_centre(model))
+    moved = model.function()(x=x, u=u, d=held[n_f:], f=held[:n_f], w=noise)
+    outputs = observer.step(memory, u, moved["y"])
+    loop = ca.Function(
+        "loop",
+        [ca.vertcat(x, memory), w, u, v, at, feedback],
+        [ca.vertcat(moved["rhs"], outputs[0]), held[:n_f], outputs[2]],
+    )
+    return loop.mapaccum("chunk", CHUNK)
 
-    def __init__(self, observer: Observer, design: HinfDesign) -> None:
-        model = design.plant
-        self.observer, self.design = observer, design
-        n, n_u, n_f, n_d = (len(model.names(kind)) for kind in ("x", "u", "f", "d"))
-        size = observer.step.size_in(0)[0]
-        x, memory = ca.SX.sym("x", n), ca.SX.sym("memory", size)
-        u, w, at = ca.SX.sym("u", n_u), ca.SX.sym("w", len(model.w)), ca.SX.sym("at", n)
-        v = ca.SX.sym("v", n_f + n_d)
-        feedback = ca.SX.sym("feedback", (n_f + n_d) * n)
-        held = v + ca.reshape(feedback, n_f + n_d, n) @ (x - at)
-        empty = [ca.DM.zeros(len(model.names(kind))) for kind in ("p", "rho")]
-        noise = w + ca.DM(noise_centre(model))
-        following, y = model.function()(x, u, held[n_f:], held[:n_f], noise, *empty)
-        outputs = observer.step(memory, u, y)
-        state = ca.Function(
-            "loop",
-            [ca.vertcat(x, memory), w, u, v, at, feedback],
-            [ca.vertcat(following, outputs[0]), held[:n_f], outputs[2]],
-        )
-        self._chunk = state.mapaccum("chunk", CHUNK)
-        self._n = n
 
-    def run(
-        self, point: OperatingPoints, w: FloatArray, limit: float, frequency: float
-    ) -> WorstCase:
-        """Simulate one disturbance at one operating point; one sample more shows the last fault."""
-        x, u, v = point.x[0], point.u[0], point.v[0]
-        feedback = holding_gain(point.jacobian[0], self.design.L)
-        padded = np.zeros((-(-(len(w) + 1) // CHUNK) * CHUNK, w.shape[1]))
-        padded[: len(w)] = w
-        state = np.concatenate([x, self.observer.memory0(x)])
-        fixed = [
-            np.repeat(value[:, None], CHUNK, axis=1) for value in (u, v, x, feedback.T.ravel())
-        ]
-        faults, estimates, visited = [], [], []
-        for start in range(0, len(padded), CHUNK):
-            piece = padded[start : start + CHUNK].T
-            states, held, fhat = (np.array(r) for r in self._chunk(state, piece, *fixed))
-            state = states[:, -1]
-            visited.append(states[: self._n].T)
-            faults.append(held.T)
-            estimates.append(fhat.T)
-        error = (np.vstack(faults)[:-1] - np.vstack(estimates)[1:])[: len(w)]
-        gain = float(np.linalg.norm(error) / np.linalg.norm(w))
-        box, path = self.design.plant.box("x"), np.vstack(visited)[: len(w)]
-        if not (np.isfinite(gain) and np.all(path >= box[:, 0]) and np.all(path <= box[:, 1])):
-            # Outside its domain the guarantee says nothing, so nothing found there counts.
-            gain = 0.0
-        level = float(self.design.bound.mu)
-        return WorstCase(
-            gain,
-            float(limit),
-            x,
-            u,
-            v,
-            float(frequency),
-            w,
-            error,
-            level,
-        )
+def excite(
+    observer: Observer,
+    chunk: ca.Function,
+    point: OperatingPoints,
+    w: FloatArray,
+    limit: float,
+    frequency: float,
+) -> WorstCase:
+    """Simulate one disturbance at one operating point; one sample more shows the last fault."""
+    design: HinfDesign = observer.certificate.design
+    x, u, v, jacobian = (part[0] for part in point)
+    feedback = np.tile(holding_gain(jacobian, design.L), CHUNK)
+    fixed = [*(np.repeat(part[:, None], CHUNK, axis=1) for part in (u, v, x)), feedback]
+    padded = np.zeros((-(-(len(w) + 1) // CHUNK) * CHUNK, w.shape[1]))
+    padded[: len(w)] = w
+    state = np.concatenate([x, observer.memory0(x)])
+    rows: list[tuple[FloatArray, ...]] = []
+    for piece in np.split(padded, len(padded) // CHUNK):
+        states, *seen = (np.array(part).T for part in chunk(state, piece.T, *fixed))
+        state = states[-1]
+        rows.append((states[:, : len(x)], *seen))
+    path, faults, estimates = map(np.vstack, zip(*rows, strict=True))
+    error = (faults[:-1] - estimates[1:])[: len(w)]
+    gain = float(np.linalg.norm(error) / np.linalg.norm(w))
+    low, high = design.plant.box("x").T
+    # Outside its domain the guarantee says nothing, so nothing found there counts.
+    inside = np.all(path[: len(w)] >= low) and np.all(path[: len(w)] <= high)
+    counted, level = gain if np.isfinite(gain) and inside else 0.0, float(design.bound.mu)
+    return WorstCase(counted, float(limit), x, u, v, float(frequency), w, error, level)
 
 
 def holding_gain(jacobian: FloatArray, L: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import exact, image, inverse, nearest, negative, positive
 from obsynth.designs.core.errors import InfeasibleDesign
+from obsynth.designs.core.frequency import peak_gain
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.interval.record import NEGATIVE, IntervalDesign
 from obsynth.designs.interval.rows import Part
@@ -26,22 +27,8 @@ def lipschitz_alpha(sigma_lower: FloatArray, sigma_upper: FloatArray) -> float:
 
 def largest_alpha(R: FloatArray) -> float:
     """Return the largest alpha of (20): 1 / ||(z I - R)^-1||_inf, 0 if unstable."""
-    if np.abs(np.linalg.eigvals(R)).max(initial=0.0) >= 1.0:
-        return 0.0
     eye = np.eye(len(R))
-
-    def smallest(angles: FloatArray) -> FloatArray:
-        pencils = np.exp(1j * angles)[:, None, None] * eye - R
-        values: FloatArray = np.linalg.svd(pencils, compute_uv=False)[:, -1]
-        return values
-
-    angles = np.linspace(0.0, np.pi, 721)
-    step = angles[1]
-    for _ in range(6):
-        best = angles[int(np.argmin(smallest(angles)))]
-        angles = np.clip(best + np.linspace(-step, step, 41), 0.0, np.pi)
-        step /= 20.0
-    return float(smallest(angles).min())
+    return 1.0 / float(peak_gain(R[None], eye, eye, np.zeros(R.shape))[0][0])
 
 
 def divergence(design: IntervalDesign, headline: str = "the bounds diverge") -> InfeasibleDesign:

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.hinf.worst_case import _half_sine, _Loop, frozen_gain, hold_points, worst_case
+from obsynth.designs.hinf.worst_case import (
+    excite,
+    frozen_gain,
+    half_sine,
+    hold_points,
+    loop_of,
+    worst_case,
+)
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "hinf_worst_case.py"
 
@@ -175,10 +182,10 @@ def test_a_search_that_leaves_the_domain_counts_for_nothing(bench):
     design = observer.certificate.design
     inner = hold_points(plant, np.array([[14.0, 19.9, 19.9]]), np.zeros((1, 3)))
     limit, frequency, direction = frozen_gain(design, inner.jacobian)
-    loop = _Loop(observer, design)
-    small = _half_sine(500, frequency[0], direction[0], 1e-4)
-    assert 0.0 < loop.run(inner, small, limit[0], frequency[0]).gain < 1e-3
-    assert loop.run(inner, 1e6 * small, limit[0], frequency[0]).gain == 0.0
+    chunk, about = loop_of(observer), (limit[0], frequency[0])
+    small = half_sine(500, frequency[0], direction[0], 1e-4)
+    assert 0.0 < excite(observer, chunk, inner, small, *about).gain < 1e-3
+    assert excite(observer, chunk, inner, 1e6 * small, *about).gain == 0.0
 
 
 def test_a_plant_that_cannot_be_held_anywhere():
