@@ -30,6 +30,7 @@ from obsynth.designs.lmi.solve import solve_reliably
 from obsynth.symbolic.arrays import FloatArray
 
 MOST_ENTRIES = 12
+SHARES = np.linspace(0.0, 1.0, 65)
 _exact = np.vectorize(Fraction, otypes=[object])
 
 
@@ -185,54 +186,31 @@ def _solution_space(A: Any, B_f: Any, C: Any, T: Any) -> Any:
     return basis
 
 
-def find_fixed_point(
-    A: Any,
-    B_f: Any,
-    C: Any,
-    T: Any,
-    vertices: Any,
-    seed: int = 0,
-    starts: int = 12,
-) -> FixedPoint | None:
-    """Search every vertex (N, n, n) for a fixed point that makes (51) infeasible, exactly."""
-    from scipy.optimize import minimize
+def find_fixed_point(A: Any, B_f: Any, C: Any, T: Any, vertices: Any) -> FixedPoint | None:
+    """Search every vertex (N, n, n) for a fixed point that makes (51) infeasible, exactly.
 
+    Where q1 and q2 are both positive somewhere every mean of them is, most of all along its
+    principal axis, and along one of these axes both are, unless two belong to the same value.
+    """
     space = _solution_space(A, B_f, C, T)
     if not len(space):
         return None
     n, n_f = np.shape(B_f)
     basis = space.T.astype(float)
-    rng = np.random.default_rng(seed)
-    numeric = [_exact(M).astype(float) for M in vertices]
-    # directions that do not move e only cost |s|^2: start without them
-    moves = np.abs(basis[:n]).max(axis=0)
-    for _ in range(starts):
-        c0 = np.where(moves > 0, rng.standard_normal(len(space)) / np.maximum(moves, 1e-3), 0.0)
-        for number, M in enumerate(numeric):
-            found = minimize(
-                _shortfall, c0, (basis, M, n_f), method="Nelder-Mead", options={"maxfev": 400}
-            )
-            if found.fun >= 0.0:
-                continue
-            data = (A, B_f, C, T, vertices[number])
-            point = _rounded_point(found.x, space, n, n_f, data, number)
-            if point is not None:
-                return point
+    e, s = basis[:n], basis[n + n_f :]
+    for number, M in enumerate(_exact(vertices).astype(float)):
+        unit = max(float(np.abs(M).max()), 1e-12)
+        Me = M @ e
+        forms = e.T @ (Me - s) / unit, (Me.T @ Me - s.T @ s) / unit**2
+        q1, q2 = (0.5 * (form + form.T) for form in forms)
+        for share in SHARES:
+            axis = np.linalg.eigh(share * q1 + (1.0 - share) * q2)[1][:, -1]
+            if min(axis @ q1 @ axis, axis @ q2 @ axis) > 0.0:
+                data = (A, B_f, C, T, vertices[number])
+                point = _rounded_point(axis, space, n, n_f, data, number)
+                if point is not None:
+                    return point
     return None
-
-
-def _shortfall(c: FloatArray, basis: FloatArray, M: FloatArray, n_f: int) -> float:
-    """Return ``-min(q1, q2)``, each relative to ``|e|`` and the size of M."""
-    vector = basis @ c
-    n = len(M)
-    e, s = vector[:n], vector[n + n_f :]
-    length = float(e @ e)
-    if length < 1e-12:
-        return 1.0
-    Me = M @ e
-    unit = max(float(np.abs(M).max()), 1e-12)
-    q1, q2 = float(e @ Me - s @ e) / length, float(Me @ Me - s @ s) / length
-    return -min(q1 / unit, q2 / unit**2)
 
 
 def _rounded_point(
