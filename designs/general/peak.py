@@ -5,6 +5,7 @@ docs/methods/general_class.md, Peak bounds, in the letters used here: X_k, S and
 those that errors drive. All is rounded up, but for `absolute_sums`, which a search uses.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,7 +13,8 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from obsynth.derive.rigour import TINY, Enclosure, add_up, gamma_bound, lowered, product_up, raised
-from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
+from obsynth.designs.core.certificate import Claim
+from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.general.system import ErrorSystem, Extra, magnitude
 from obsynth.symbolic.arrays import FloatArray
 
@@ -270,38 +272,26 @@ def contraction(G: FloatArray, b: FloatArray) -> float:
     return float(np.max(raised(product_up(inner, v) / v, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class PeakProof:
-    """Why a vector b bounds the errors at every instant.
-
-    slack: lower bounds of ``b - n - G b``; none is negative
-    small_gain: upper bound of the spectral radius of G, below one
-    remainder, steps: contraction and number of the powers that were summed
-    """
-
-    slack: FloatArray
-    small_gain: float
-    remainder: float
-    steps: int
-
-
-def prove_peak(sums: Sums, b: FloatArray, names: tuple[str, ...]) -> PeakProof:
+def prove_peak(sums: Sums, b: FloatArray, names: tuple[str, ...]) -> Iterator[Claim]:
     """Prove that a given b bounds the errors, whatever it came from; names of the N errors."""
     image = add_up(sums.n, product_up(sums.G, b))
-    short = ~(image <= b)
-    if np.any(short):
-        worst = int(np.argmax(np.where(short, (image - b) / np.maximum(image, 1e-300), -1.0)))
-        raise CertificateError(
-            f"peak bounds: {b[worst]:.9g} is not proved for the error of "
-            f"{names[worst % len(names)]}",
-            [f"n + G b = {image[worst]:.9g} exceeds it by {image[worst] - b[worst]:.3g}"],
-        )
+    held = image <= b
+    room = np.where(held, lowered(np.maximum(b - image, 0.0), 2), -np.inf)
+    lost = dict.fromkeys(names[k % len(names)] for k in np.flatnonzero(~held))
+    yield Claim(
+        "peak",
+        "n + G b <= b: the stored b bounds every error at every k",
+        bool(np.all(held)),
+        float((room / np.maximum(b, 1e-300)).min()),
+        f"sums of {sums.powers.steps} powers with an enclosed remainder of "
+        f"{sums.powers.contraction:.1e}, all numbers rounded up"
+        + (f"; too small for {', '.join(lost)}" if lost else ""),
+    )
     gain = contraction(sums.G, b)
-    if not gain < 1.0:
-        raise CertificateError(
-            "peak bounds: the spectral radius of G is not proved to be below one",
-            [f"max (G v)_i / v_i = {gain:.9g}"],
-            small_gain=gain,
-        )
-    slack = lowered(np.maximum(b - image, 0.0), 2)
-    return PeakProof(slack, gain, sums.powers.contraction, sums.powers.steps)
+    yield Claim(
+        "small_gain",
+        "the spectral radius of G is below 1",
+        gain < 1.0,
+        1.0 - gain,
+        "max (G v)_i / v_i for a positive v, rounded up",
+    )
