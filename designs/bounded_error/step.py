@@ -92,15 +92,8 @@ def equations(design: UioDesign) -> ca.Function:
     # estimate is clipped there so that the recursion stays finite, in coordinates that
     # enter nonlinearly. Inside, where the bound holds, clipping does nothing.
     box = np.where(curved_states(model)[:, None], model.box("x"), [-np.inf, np.inf])
-    next_state = model.function()(
-        clip(xhat, box, design.precision),
-        u,
-        ca.DM.zeros(len(model.d)),
-        fhat,
-        ca.DM(design.w_centre),
-        ca.DM.zeros(len(model.p)),
-        ca.DM.zeros(len(model.rho)),
-    )[0]
+    near, middle = clip(xhat, box, design.precision), ca.DM(design.w_centre)
+    next_state = model.function()(x=near, u=u, f=fhat, w=middle)["rhs"]
     outputs = {
         "xhat": xhat,
         "innovation": innovation,

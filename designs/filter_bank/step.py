@@ -102,16 +102,7 @@ class Corners:
                 for k, signal in enumerate(measured):
                     corner[design.plant.rho.index(signal)] = self.theta[k]
             arguments[kind] = column(corner)
-        rhs = design.plant.function()
-        value: ca.SX = rhs(
-            arguments["x"],
-            self.u,
-            ca.SX(0, 1),
-            arguments["f"],
-            arguments["w"],
-            arguments["p"],
-            arguments["rho"],
-        )[0][row]
+        value: ca.SX = design.plant.function()(u=self.u, **arguments)["rhs"][row]
         return value
 
 

@@ -37,23 +37,21 @@ def stages(design: GeneralDesign) -> tuple[ca.Function, ca.Function, ca.Function
     m = len(plant.output_names)
     sizes = {"x": N, "u": len(plant.u), "y": m, "nu": m}
     x, u, y, nu = (ca.SX.sym(name, size) for name, size in sizes.items())
-    empty = ca.DM(0, 1)
+    centre, function = ca.DM(design.v_centre), plant.function()
     box = np.where(curved_states(plant, noise=True)[:, None], plant.box("x"), [-np.inf, np.inf])
     inner = clip(x, box, design.precision)
     middle = design.middle
     outside = x - inner
-    rows, outputs = plant.function()(inner, u, empty, empty, ca.DM(design.v_centre), empty, empty)
+    found = function(x=inner, u=u, w=centre)
     A0, C0 = (ca.sparsify(ca.DM(part)) for part in (middle[:N, :N], middle[N:, :N]))
     loose = np.isfinite(box).any(axis=1)
     A0[:, np.flatnonzero(~loose).tolist()] = 0.0
     C0[:, np.flatnonzero(~loose).tolist()] = 0.0
-    rows = rows + ca.sparsify(A0) @ outside + ca.sparsify(ca.DM(design.K)) @ nu
-    innovation = y - (outputs + ca.sparsify(C0) @ outside)
+    rows = found["rhs"] + ca.sparsify(A0) @ outside + ca.sparsify(ca.DM(design.K)) @ nu
+    innovation = y - (found["y"] + ca.sparsify(C0) @ outside)
     # the outputs that L0 reads have constant slopes: no clipping there
-    plain = plant.function()(x, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
-    first = x + ca.sparsify(ca.DM(design.L0)) @ (y - plain)
-    if not design.extended.picked:
-        first = x
+    plain = function(x=x, u=u, w=centre)["y"]
+    first = x + ca.sparsify(ca.DM(design.L0)) @ (y - plain) if design.extended.picked else x
     second = x + ca.sparsify(ca.DM(design.Z)) @ innovation
     second, innovation = ca.densify(second), ca.densify(innovation)
     names = ["x", "u", "y"]
@@ -196,8 +194,7 @@ def build_core(design: GeneralDesign) -> Core:
     names, followed = design.plant.names("f"), design.extended.followed
     own = curved_states(plant, noise=True)[:n]
     domain = np.where(own[:, None], design.plant.box("x"), [-np.inf, np.inf])
-    outputs = plant.function()
-    empty = ca.DM(0, 1)
+    outputs, centre = plant.function(), ca.DM(design.v_centre)
 
     def spread(values: ca.SX, other: float) -> ca.SX:
         return column(
@@ -207,7 +204,7 @@ def build_core(design: GeneralDesign) -> Core:
     def run(seen: Seen) -> Known:
         prediction = seen.memory["prediction"]
         u = ca.vertcat(seen.u, seen.theta)
-        expected = outputs(prediction, u, empty, empty, ca.DM(design.v_centre), empty, empty)[1]
+        expected = outputs(x=prediction, u=u, w=centre)["y"]
         y = seen.readings(expected)
         q = first(prediction, u, y)
         c, nu = second(q, u, y)

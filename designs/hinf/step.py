@@ -28,11 +28,8 @@ def first_memory(design: HinfDesign, start: Start) -> dict[str, ArrayLike]:
 def predict(model: Plant, A: FloatArray, xhat: ca.SX, u: ca.SX) -> ca.SX:
     """Return A xhat + B u + g(c, u), c the nearest point of the box, by the plant's own rows."""
     nearest = clip(xhat, model.box("x"))
-    kinds = ("d", "f", "w", "p", "rho")
-    quiet = [ca.DM.zeros(len(model.names(kind))) for kind in kinds]
-    quiet[kinds.index("w")] = ca.DM(noise_centre(model))
-    value = model.function()(nearest, u, *quiet)[0]
-    return value + ca.DM(A) @ (xhat - nearest)
+    found = model.function()(x=nearest, u=u, w=ca.DM(noise_centre(model)))
+    return found["rhs"] + ca.DM(A) @ (xhat - nearest)
 
 
 def build_core(design: HinfDesign) -> Core:

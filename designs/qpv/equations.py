@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import sympy as sp
 
+from obsynth.designs.core.boxes import column
 from obsynth.designs.core.running import above
 from obsynth.designs.core.stepping import inside
 from obsynth.designs.qpv.record import QPVDesign
@@ -59,17 +60,10 @@ class Equations:
         n = len(plant.x)
         names = [s.name for s in measured_schedule(plant)]
         # what is not measured enters nowhere: the design refuses it
-        rho = [theta[names.index(s.name)] if s.name in names else 0 for s in plant.rho]
-        rhs, y = plant.function()(
-            state[:n],
-            u,
-            ca.DM.zeros(0),
-            state[n:],
-            ca.DM(self.design.w_centre) if w is None else w,
-            ca.DM.zeros(0),
-            ca.vertcat(*rho) if rho else ca.DM.zeros(0),
-        )
-        return rhs, y
+        rho = [theta[names.index(s.name)] if s.name in names else ca.SX(0) for s in plant.rho]
+        noise = ca.DM(self.design.w_centre) if w is None else w
+        found = plant.function()(x=state[:n], u=u, f=state[n:], w=noise, rho=column(rho))
+        return found["rhs"], found["y"]
 
     def innovation(self, state: ca.SX, u: ca.SX, y: ca.SX, theta: ca.SX) -> ca.SX:
         """Return readings less what is expected."""
