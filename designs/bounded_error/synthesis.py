@@ -11,7 +11,7 @@ from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi.expression import Affine, diagonal, full, symmetric, trace
 from obsynth.designs.lmi.margin import Margin, largest_margin
 from obsynth.designs.lmi.problem import Problem, symmetric_block
-from obsynth.designs.lmi.search import bisect_feasible, search_line, search_log_convex
+from obsynth.designs.lmi.search import bisect_feasible, search_line, search_scale
 from obsynth.designs.lmi.solve import solve_reliably
 from obsynth.symbolic.arrays import FloatArray
 
@@ -26,8 +26,8 @@ LEAST_GAMMA = 1e-9
 # Shares of the largest gamma that are tried before the golden sections.
 GRID = (0.1, 0.3, 0.5, 0.65, 0.8, 0.95)
 REFINE = 6
-# Of the trace for a given gain, against the proved lower bound.
-SEARCH_RTOL = 1e-3
+# Of the largest gamma for a given gain: where the search begins.
+LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,8 @@ def analyse_gain(
     def size(solution: EllipsoidSolution) -> float:
         return float(weights @ solution.inverse_diagonal)
 
-    return search_log_convex(solve, size, 0.0, 1.0 - radius**2, rtol=SEARCH_RTOL).result
+    top = 1.0 - radius**2
+    return search_scale(solve, size, LEAST_SHARE * top, top).result
 
 
 def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:

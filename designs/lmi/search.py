@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -91,14 +90,12 @@ class Search(Generic[Result]):
     """The best design along a line: the value, what the design returned there, its objective.
 
     tried: every value tried, in order, with its objective (inf where infeasible)
-    lower_bound: what no value of the line can be below; 0 where only a grid speaks
     """
 
     value: float
     result: Result
     objective: float
     tried: tuple[tuple[float, float], ...]
-    lower_bound: float = 0.0
 
 
 def search_line(
@@ -130,75 +127,30 @@ def search_line(
     return Search(value, result, least, tuple(record.tried))
 
 
-def search_log_convex(
+def search_scale(
     design: Callable[[float], Result],
     objective: Callable[[Result], float],
     low: float,
     high: float,
     *,
-    rtol: float = 1e-3,
+    rtol: float = 0.005,
     most: int = 40,
 ) -> Search[Result]:
-    """Minimise a log-convex objective along a line; chords say when to stop."""
+    """Minimise a positive objective with one minimum between positive ends, to some share of it."""
+    from scipy.optimize import minimize_scalar
+
     record = _Record(design, objective)
 
-    def left_over() -> float:
-        return _lower_bound(record, low, high)
+    def size(logarithm: float) -> float:
+        return float(np.log(record.measure(float(np.exp(logarithm)))))
 
-    def enough() -> bool:
-        return record.best is not None and left_over() >= (1.0 - rtol) * record.best[1]
-
-    _refine(record.measure, low, high, most, enough)
+    options = {"xatol": rtol, "maxiter": most}
+    with np.errstate(invalid="ignore"):
+        minimize_scalar(size, bounds=np.log([low, high]), method="bounded", options=options)
     if record.best is None:
         raise record.refusal(f"no value between {low:.4g} and {high:.4g} gives a design")
-    _require_log_convex(record, rtol)
     value, least, result = record.best
-    return Search(value, result, least, tuple(record.tried), min(left_over(), least))
-
-
-def _require_log_convex(record: _Record[Result], rtol: float) -> None:
-    points = sorted((v, m) for v, m in record.tried if np.isfinite(m))
-    for (a, at_a), (x, at_x), (b, at_b) in zip(points, points[1:], points[2:], strict=False):
-        share = (x - a) / (b - a)
-        chord = at_a ** (1.0 - share) * at_b**share
-        if at_x > (1.0 + rtol) * chord:
-            raise ObsynthError(
-                f"the objective is not log-convex: it is {at_x:.6g} at {x:.4g}, but {at_a:.6g} at "
-                f"{a:.4g} and {at_b:.6g} at {b:.4g} allow {chord:.6g} at most",
-                tried=tuple(record.tried),
-            )
-
-
-def _lower_bound(record: _Record[Result], low: float, high: float) -> float:
-    """Return what chords of log-convex values leave as the least value on [low, high]."""
-    points = sorted((v, float(np.log(m))) for v, m in record.tried if np.isfinite(m))
-    if len(points) < 2:
-        return 0.0
-    infeasible = [v for v, m in record.tried if not np.isfinite(m)]
-    low = max([low, *(v for v in infeasible if v < points[0][0])])
-    high = min([high, *(v for v in infeasible if v > points[-1][0])])
-    slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(points)]
-    least = np.inf
-    for k in range(len(points) + 1):
-        left = low if k == 0 else points[k - 1][0]
-        right = high if k == len(points) else points[k][0]
-        # left of the gap and right of it, a chord continued into the gap lies below
-        lines = []
-        if k >= 2:
-            lines.append((points[k - 1], slopes[k - 2]))
-        if k <= len(points) - 2:
-            lines.append((points[k], slopes[k]))
-        corners = {left, right}
-        if len(lines) == 2 and lines[0][1] != lines[1][1]:
-            (p, a), (q, b) = lines
-            corners.add((q[1] - p[1] + a * p[0] - b * q[0]) / (a - b))
-        heights = [
-            max((p[1] + a * (x - p[0]) for p, a in lines), default=-np.inf)
-            for x in corners
-            if left <= x <= right
-        ]
-        least = min([least, *heights])
-    return float(np.exp(least))
+    return Search(value, result, least, tuple(record.tried))
 
 
 class _Record(Generic[Result]):
@@ -233,19 +185,11 @@ class _Record(Generic[Result]):
         return kind(headline, self.troubles, tried=tuple(self.tried))
 
 
-def _refine(
-    measure: Callable[[float], float],
-    low: float,
-    high: float,
-    steps: int,
-    enough: Callable[[], bool] = lambda: False,
-) -> None:
+def _refine(measure: Callable[[float], float], low: float, high: float, steps: int) -> None:
     """Golden sections of [low, high], one evaluation per step."""
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = measure(left), measure(right)
     for _ in range(steps - 2):
-        if enough():
-            return
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)
