@@ -151,7 +151,7 @@ def analyse_gain(
         return float(weights @ solution.inverse_diagonal)
 
     top = 1.0 - radius**2
-    return search_scale(solve, size, LEAST_SHARE * top, top).result
+    return search_scale(solve, size, LEAST_SHARE * top, top, name="gamma").result
 
 
 def _decay_limit(system: ErrorSystem, gain: FloatArray) -> float:
@@ -197,9 +197,9 @@ def explain_infeasible(
         return [*lines, "no box is small enough: infeasible even for one constant Jacobian"], None
     return [
         *lines,
-        f"the same gamma is feasible if the Jacobian varies {100 * found.feasible:.0f} % as much "
+        f"the same gamma is feasible if the Jacobian varies {100 * found:.0f} % as much "
         "about its middle: make the box of the states smaller",
-    ], found.feasible
+    ], found
 
 
 def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: float = 1e-3) -> float:
@@ -211,7 +211,7 @@ def largest_feasible(state: Callable[[float], tuple[Problem, Affine]], rtol: flo
         return largest_margin(problem, caps=cap, explain=False).feasible
 
     found = bisect_feasible(feasible, LEAST_GAMMA, 1.0 - 1e-9, rtol=rtol, logarithmic=True)
-    return 0.0 if found is None else found.feasible
+    return found or 0.0
 
 
 def search_gamma(

@@ -193,7 +193,7 @@ def _bisected(
     found = bisect_feasible(feasible, inside, LEAST_LEVEL, rtol=1e-4, logarithmic=True)
     if found is None:
         raise SolverTrouble(f"no level could be found, although mu = {inside:.4g} has room")
-    return found.feasible
+    return found
 
 
 def _solve_with_caps(state: Callable[[float], Problem], caps: tuple[float, ...] = CAPS) -> Solution:

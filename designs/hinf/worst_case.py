@@ -319,12 +319,11 @@ def holding_gain(jacobian: FloatArray, L: FloatArray) -> FloatArray:
     """Return a feedback from x to faults that keeps the plant near a point; zero where it stays."""
     if np.abs(np.linalg.eigvals(jacobian)).max() < 1.0 - 1e-3:
         return np.zeros((L.shape[1], len(L)))
-    P: FloatArray = np.eye(len(L))
-    gain: FloatArray = np.zeros((L.shape[1], len(L)))
-    for _ in range(500):
-        weight = L.T @ P @ L + 1e-6 * np.eye(L.shape[1])
-        gain = -np.asarray(np.linalg.solve(weight, L.T @ P @ jacobian), dtype=float)
-        closed = jacobian + L @ gain
-        P = np.eye(len(L)) + 1e-6 * gain.T @ gain + closed.T @ P @ closed
-        P = P / max(1.0, float(np.abs(P).max()) / 1e12)
-    return gain
+    from scipy.linalg import solve_discrete_are
+
+    weight = 1e-6 * np.eye(L.shape[1])
+    try:
+        P = solve_discrete_are(jacobian, L, np.eye(len(L)), weight)
+    except np.linalg.LinAlgError:  # no fault reaches what grows
+        return np.zeros((L.shape[1], len(L)))
+    return np.asarray(-np.linalg.solve(L.T @ P @ L + weight, L.T @ P @ jacobian))

@@ -4,7 +4,9 @@ By a linear programme, the Sylvester equation, pole placement, or a direct searc
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -106,14 +108,11 @@ def placed_gains(data: Reduced) -> Iterator[tuple[FloatArray, FloatArray]]:
         return
     steps = np.arange(n2) - 0.5 * (n2 - 1)
     Q = np.ones((n2, m2)) + np.eye(n2)[:, np.arange(m2) % n2]
-    for middle in (0.01, 0.15, 0.3, 0.5, 0.7):
-        for apart in (0.05, 0.2):
-            poles = middle + apart * steps
-            if np.abs(poles).max() < 1.0:
-                try:
-                    yield sylvester_gain(A2, C2, np.diag(poles), Q)
-                except InfeasibleDesign:
-                    continue
+    for middle, apart in product((0.01, 0.15, 0.3, 0.5, 0.7), (0.05, 0.2)):
+        poles = middle + apart * steps
+        if np.abs(poles).max() < 1.0:
+            with suppress(InfeasibleDesign):
+                yield sylvester_gain(A2, C2, np.diag(poles), Q)
 
 
 def predicted_size(data: Reduced, P: FloatArray, L: FloatArray) -> float:
@@ -240,22 +239,18 @@ def sylvester_design(
     if R is not None:
         Q = np.ones((n2, m2)) if Q is None else np.array(Q)
         return given_gains(design, *sylvester_gain(A2, data.C2, np.array(R), Q))
-    done, last = [], None
+    tried = []
     for start in (0.0, 0.1, 0.2, 0.3, 0.5):
         poles = start + 0.1 * np.arange(n2) / max(n2 - 1, 1)
-        try:
-            P, L = sylvester_gain(A2, data.C2, np.diag(poles), np.ones((n2, m2)))
-        except InfeasibleDesign:
-            continue
-        last = with_gains(design, P, L)
-        found = complete(last)
-        if found is not None:
-            done.append(found)
+        with suppress(InfeasibleDesign):
+            gains = sylvester_gain(A2, data.C2, np.diag(poles), np.ones((n2, m2)))
+            tried.append(with_gains(design, *gains))
+    done = [found for found in map(complete, tried) if found is not None]
     if done:
         return min(done, key=lambda d: float(d.half_widths.sum()))
-    if last is None:
+    if not tried:
         raise InfeasibleDesign(
             "P A2 - R P = Q C2 has no regular solution for the R that were tried",
             ['give R= and Q=, or use gains="lp"'],
         )
-    raise divergence(last, "the bounds diverge for every R that was tried")
+    raise divergence(tried[-1], "the bounds diverge for every R that was tried")

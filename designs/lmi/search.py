@@ -16,15 +16,6 @@ Result = TypeVar("Result")
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 
-@dataclass(frozen=True)
-class Bisection:
-    """The limit of feasibility along a line; infeasible None if all of it is feasible."""
-
-    feasible: float
-    infeasible: float | None
-    evaluations: int
-
-
 def bisect_feasible(
     feasible: Callable[[float], bool],
     inside: float,
@@ -32,25 +23,24 @@ def bisect_feasible(
     *,
     rtol: float = 1e-3,
     logarithmic: bool = False,
-) -> Bisection | None:
-    """Find the feasible value closest to ``outside``."""
+) -> float | None:
+    """Return the feasible value closest to ``outside``, None where ``inside`` is not feasible."""
     if logarithmic and min(inside, outside) <= 0:
         raise ObsynthError(
             f"a logarithmic search needs positive ends, not {inside:.4g} and {outside:.4g}"
         )
     if feasible(outside):
-        return Bisection(outside, None, 1)
+        return outside
     if not feasible(inside):
         return None
-    good, bad, count = inside, outside, 2
+    good, bad = inside, outside
     tiny = rtol * abs(outside - inside)
     while abs(bad - good) > max(rtol * max(abs(good), abs(bad)), 1e-3 * tiny):
         middle = (good * bad) ** 0.5 if logarithmic else 0.5 * (good + bad)
         if middle in (good, bad):
             break
         good, bad = (middle, bad) if feasible(middle) else (good, middle)
-        count += 1
-    return Bisection(good, bad, count)
+    return good
 
 
 @dataclass(frozen=True)
@@ -79,13 +69,10 @@ def smallest_changes(knobs: Sequence[Knob], rtol: float = 0.01) -> list[str]:
                 f"{knob.current:.3g} {way} {knob.limit:.3g}"
             )
         else:
-            lines.append(
-                f"{knob.name}: {knob.current:.3g} is infeasible, {found.feasible:.3g} is feasible"
-            )
+            lines.append(f"{knob.name}: {knob.current:.3g} is infeasible, {found:.3g} is feasible")
     return lines
 
 
-@dataclass(frozen=True, eq=False)
 class Search(Generic[Result]):
     """The best design along a line: the value, what the design returned there, its objective.
 
@@ -94,8 +81,38 @@ class Search(Generic[Result]):
 
     value: float
     result: Result
-    objective: float
-    tried: tuple[tuple[float, float], ...]
+
+    def __init__(
+        self, design: Callable[[float], Result], measured: Callable[[Result], float]
+    ) -> None:
+        self.design, self.measured, self.objective = design, measured, np.inf
+        self.tried: list[tuple[float, float]] = []
+        self.refusals: list[tuple[float, ObsynthError]] = []
+
+    def measure(self, value: float) -> float:
+        """Design at a value and return the objective, infinite where that is refused."""
+        objective = np.inf
+        try:
+            result = self.design(value)
+            objective = float(self.measured(result))
+            if objective < self.objective:
+                self.value, self.result, self.objective = value, result, objective
+        except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
+            self.refusals.append((value, refusal))
+        self.tried.append((value, objective))
+        return objective
+
+    def require(self, name: str, low: float, high: float) -> None:
+        """Refuse a line without a design; it is infeasible only where every value is."""
+        if self.objective < np.inf:
+            return
+        only = all(isinstance(refusal, InfeasibleDesign) for _, refusal in self.refusals)
+        kind = InfeasibleDesign if only else SolverTrouble
+        raise kind(
+            f"{name}: no value between {low:.4g} and {high:.4g} gives a design",
+            [f"{value:.4g}: {str(told).splitlines()[0]}" for value, told in self.refusals],
+            tried=tuple(self.tried),
+        )
 
 
 def search_line(
@@ -110,21 +127,17 @@ def search_line(
     from rich.console import Console
     from rich.progress import track
 
-    record = _Record(design, objective)
+    search = Search(design, objective)
     terminal = Console().is_terminal
     for value in track(grid, description=name, disable=not terminal, transient=True):
-        record.measure(value)
-    if record.best is None:
-        raise record.refusal(
-            f"{name}: no value between {min(grid):.4g} and {max(grid):.4g} gives a design"
-        )
+        search.measure(value)
+    search.require(name, min(grid), max(grid))
     if refine:
         values = sorted(grid)
-        place = values.index(record.best[0])
+        place = values.index(search.value)
         low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
-        _refine(record.measure, low, high, refine)
-    value, least, result = record.best
-    return Search(value, result, least, tuple(record.tried))
+        _refine(search.measure, low, high, refine)
+    return search
 
 
 def search_scale(
@@ -134,55 +147,21 @@ def search_scale(
     high: float,
     *,
     rtol: float = 0.005,
-    most: int = 40,
+    name: str = "search",
 ) -> Search[Result]:
     """Minimise a positive objective with one minimum between positive ends, to some share of it."""
     from scipy.optimize import minimize_scalar
 
-    record = _Record(design, objective)
-
-    def size(logarithm: float) -> float:
-        return float(np.log(record.measure(float(np.exp(logarithm)))))
-
-    options = {"xatol": rtol, "maxiter": most}
+    search = Search(design, objective)
     with np.errstate(invalid="ignore"):
-        minimize_scalar(size, bounds=np.log([low, high]), method="bounded", options=options)
-    if record.best is None:
-        raise record.refusal(f"no value between {low:.4g} and {high:.4g} gives a design")
-    value, least, result = record.best
-    return Search(value, result, least, tuple(record.tried))
-
-
-class _Record(Generic[Result]):
-    """Everything tried so far and the best of it."""
-
-    def __init__(
-        self, design: Callable[[float], Result], objective: Callable[[Result], float]
-    ) -> None:
-        self.design, self.objective = design, objective
-        self.tried: list[tuple[float, float]] = []
-        self.troubles: list[str] = []
-        self.best: tuple[float, float, Result] | None = None
-        self.all_infeasible = True
-
-    def measure(self, value: float) -> float:
-        """Design at a value and return the objective, infinite where that is refused."""
-        measured = np.inf
-        try:
-            result = self.design(value)
-            measured = float(self.objective(result))
-            if self.best is None or measured < self.best[1]:
-                self.best = (value, measured, result)
-        except (InfeasibleDesign, SolverTrouble, CertificateError) as refusal:
-            self.troubles.append(f"{value:.4g}: {str(refusal).splitlines()[0]}")
-            self.all_infeasible &= isinstance(refusal, InfeasibleDesign)
-        self.tried.append((value, measured))
-        return measured
-
-    def refusal(self, headline: str) -> InfeasibleDesign | SolverTrouble:
-        """Say that nothing was found; infeasible only where every value was."""
-        kind = InfeasibleDesign if self.all_infeasible else SolverTrouble
-        return kind(headline, self.troubles, tried=tuple(self.tried))
+        minimize_scalar(
+            lambda logarithm: float(np.log(search.measure(float(np.exp(logarithm))))),
+            bounds=np.log([low, high]),
+            method="bounded",
+            options={"xatol": rtol, "maxiter": 40},
+        )
+    search.require(name, low, high)
+    return search
 
 
 def _refine(measure: Callable[[float], float], low: float, high: float, steps: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,46 +69,25 @@ def build_ode(design: QPVDesign) -> ca.Function:
     return make_ode({"memory": memory, **found}, outputs)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Numbers that the monitors need, from the proved P."""
-
-    half: FloatArray
-    reach: FloatArray
-    noise: FloatArray
-    region: float
-    inverse_Q: FloatArray
-
-    @classmethod
-    def of(cls, design: QPVDesign) -> _Sizes:
-        P, Q, data = design.P, design.region.Q, design.data
-        inverse = np.linalg.inv(P)
-        outputs = np.einsum("vmi,ij,vmj->vm", data.C, inverse, data.C).max(axis=0)
-        box = design.plant.box("w")
-        radius = np.where(
-            np.isfinite(box).all(axis=1),
-            np.maximum(box[:, 1] - design.w_centre, design.w_centre - box[:, 0]),
-            np.inf,
-        )
-        H = np.abs(data.H[:, :, : len(radius)]).max(axis=0)
-        with np.errstate(invalid="ignore"):
-            noise = np.where(H > 0, H * radius, 0.0).sum(axis=1)
-        root = np.linalg.cholesky(inverse)
-        largest = np.linalg.eigvalsh(root.T @ np.linalg.solve(Q, root))[-1]
-        return cls(
-            np.sqrt(design.inverse_diagonal) * _UP,
-            np.sqrt(outputs) * _UP,
-            noise * _UP,
-            float(np.sqrt(largest)) * _UP,
-            np.asarray(np.linalg.inv(Q), dtype=np.float64),
-        )
+def _shown(design: QPVDesign) -> tuple[FloatArray, FloatArray]:
+    """Bound what errors in E and disturbances move the outputs, (m,) each, from the proved P."""
+    data, box = design.data, design.plant.box("w")
+    outputs = np.einsum("vmi,ij,vmj->vm", data.C, np.linalg.inv(design.P), data.C).max(axis=0)
+    radius = np.maximum(box[:, 1] - design.w_centre, design.w_centre - box[:, 0])
+    H = np.abs(data.H[:, :, : len(radius)]).max(axis=0)
+    with np.errstate(invalid="ignore"):
+        noise = np.where(H > 0, H * radius, 0.0).sum(axis=1)
+    return np.sqrt(outputs) * _UP, noise * _UP
 
 
 def build_core(design: QPVDesign) -> Core:
     """Build the Runge-Kutta step, readings held, and the bound of V, begun anew after gaps."""
     n, m = len(design.plant.x), len(design.plant.output)
-    equations, sizes, follow = Equations(design), _Sizes.of(design), build_update(design)
+    equations, follow = Equations(design), build_update(design)
     precision, lost = design.precision, of_outputs(design)
+    sides, (seen_of_E, noise) = np.sqrt(design.inverse_diagonal) * _UP, _shown(design)
+    Q, root = design.region.Q, np.linalg.cholesky(np.linalg.inv(design.P))
+    largest = np.sqrt(np.linalg.eigvalsh(root.T @ np.linalg.solve(Q, root))[-1]) * _UP
     ulp, up = Rounding(precision).step, above(precision, 2 * n)
     added = design.rounding * up
 
@@ -126,17 +103,17 @@ def build_core(design: QPVDesign) -> Core:
         reach = ca.sqrt(level) * up + added if design.bounded else ca.SX(1)
         consistent = ca.SX(1)
         for i in range(m):
-            if np.isfinite(sizes.noise[i]):
-                allowed = up * (reach * sizes.reach[i] + sizes.noise[i]) + lost[i]
+            if np.isfinite(noise[i]):
+                allowed = up * (reach * seen_of_E[i] + noise[i]) + lost[i]
                 allowed = allowed + ulp * ca.fabs(y[i])
                 fits = ca.fabs(y[i] - expected[i]) <= allowed
                 consistent = ca.logic_and(consistent, fits)
-        away = _root(sizes.inverse_Q, offset, design.region.c, precision)
+        away = _root(np.linalg.inv(Q), offset, design.region.c, precision)
         if design.bounded:
-            away = away + reach * sizes.region
+            away = away + reach * float(largest)
         x = f = None
         if design.bounded:
-            half = ca.DM(sizes.half * up) * reach
+            half = ca.DM(sides * up) * reach
             half = half + 8.0 * ulp * (ca.fabs(state) + half)
             found = Ends(state - half, state + half).where(
                 certified, Ends.unbounded(state.numel(), precision)
