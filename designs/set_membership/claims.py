@@ -64,7 +64,7 @@ def least(matrix: ExactMatrix) -> float:
 
 def covers(design: SetMembershipDesign, fresh: SetMembershipModel) -> Iterator[Claim]:
     """Compare what is stored with the stored equations."""
-    around = fresh.around(np.zeros(len(fresh.half)), fresh.beside)
+    around = fresh.nearest
     size = np.abs(design.A).max(initial=1.0), np.abs(design.C).max(initial=1.0)
     same = np.allclose(design.A, around.J, rtol=_RTOL, atol=_RTOL * size[0])
     same &= np.allclose(design.C, around.H, rtol=_RTOL, atol=_RTOL * size[1])

@@ -140,11 +140,11 @@ class SetMembershipObserver(Method):
 
     def fix(self, model: SetMembershipModel, gains: Mapping[str, ArrayLike]) -> SetMembershipDesign:
         """Build the bank around a given ``L`` of shape (N, m)."""
-        around = model.around(np.zeros(len(model.half)), model.beside)
+        around = model.nearest
         L = read_gains(gains, {"L": around.H.T.shape})["L"]
         closed = (np.eye(len(L)) - L @ around.H) @ around.J
         bases = [synthesis.modes(closed, model.half), np.diag(model.half)]
-        found = [Gain(L, basis, around.J, around.H) for basis in bases if basis is not None]
+        found = [(L, basis) for basis in bases if basis is not None]
         return self._of(model, found, None, refuse=False)
 
     def options(self) -> Mapping[str, Any]:

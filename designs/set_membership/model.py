@@ -147,6 +147,11 @@ class SetMembershipModel:
         )
 
     @cached_property
+    def nearest(self) -> Around:
+        """The equations next to the point of operation: their slopes there."""
+        return self.around(np.zeros(len(self.half)), self.beside)
+
+    @cached_property
     def _around(self) -> ca.Function:
         """(lower, upper) of all variables and known signals -> J, columns, spread, H, sigma."""
         sweeps = self.enclosures.sweeps

@@ -23,6 +23,8 @@ from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 
 Coordinates = Literal["modal", "covariance", "states"]
+Gain = tuple[FloatArray, FloatArray]
+"""A gain (N, m) and coordinates (N, N)."""
 SHARES = (0.1, 0.3, 1.0, 3.0)
 """Of the readings' noise, for the filter's gain."""
 KEPT = (1, 2, 3, 5, 8, 12)
@@ -40,16 +42,6 @@ SHORTEST = 4
 _WORST_BASIS = 1e8
 _DECAYS, _HIDDEN = 1.0 - 1e-7, 1e-9
 _FLOOR = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Gain:
-    """A gain (N, m), coordinates (N, N), and the slopes (N, N), (m, N) that they were made for."""
-
-    L: FloatArray
-    V: FloatArray
-    A: FloatArray
-    C: FloatArray
 
 
 def hidden(A: FloatArray, C: FloatArray) -> list[tuple[complex, FloatArray]]:
@@ -75,8 +67,7 @@ def scaled(model: SetMembershipModel, around: Around) -> tuple[FloatArray, Float
 def watched(model: SetMembershipModel) -> SetMembershipModel:
     """Leave faults that nothing shows within their ranges; refuse states that nothing shows."""
     while True:
-        around = model.around(np.zeros(len(model.half)), model.beside)
-        A, C, _ = scaled(model, around)
+        A, C, _ = scaled(model, model.nearest)
         modes = hidden(A, C)
         n, plant = len(model.plant.x), model.plant
         names = (*plant.names("x"), *(plant.names("f")[j] for j in model.followed))
@@ -166,7 +157,7 @@ def candidates(
     kinds: tuple[Coordinates, ...],
 ) -> Iterator[Gain]:
     """Yield gains with coordinates for the reduction; the first is that of the peak bounds."""
-    around = model.around(np.zeros(len(model.half)), model.beside)
+    around = model.nearest
     gains: list[tuple[FloatArray, FloatArray | None]] = []
     if peak is not None and (L := peak_gain(model, peak)) is not None:
         gains.append((L, None))
@@ -181,7 +172,7 @@ def candidates(
         for kind in kinds:
             basis = bases[kind]
             if basis is not None:
-                yield Gain(L, basis, around.J, around.H)
+                yield L, basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +211,8 @@ class Wishes:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A gain with a bank, what it predicts from a share of the ranges, the mean, the size."""
+    """A bank, what it predicts from a share of the ranges, the mean, the size."""
 
-    gain: Gain
     bank: Bank
     found: Predicted
     mean: float
@@ -240,13 +230,13 @@ def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list
 
     def tried(gain: Gain, kept: int, zonotopes: int, share: float) -> Tried:
         restart = max(kept, SHORTEST, zonotopes) if wishes.restart is None else wishes.restart
-        W, columns = inverse(gain.V), kept * model.group
-        bank = Bank(gain.L, gain.V, W, columns, zonotopes, restart)
+        (L, V), columns = gain, kept * model.group
+        bank = Bank(L, V, inverse(V), columns, zonotopes, restart)
         found = predict(model, bank, wishes.held, share)
         if share < 1.0:  # how long the sets take to become as narrow is not known
             found = replace(found, calls=max(found.calls, LONGEST))
-        size = columns * (1.0 + CUT * zonotopes) * len(gain.V) * (len(gain.C) + 6)
-        return Tried(gain, bank, found, wishes.mean(model, found), size, share)
+        size = columns * (1.0 + CUT * zonotopes) * len(V) * (L.shape[1] + 6)
+        return Tried(bank, found, wishes.mean(model, found), size, share)
 
     counts = (0, 1) if wishes.zonotopes is None else (wishes.zonotopes,)
     # over ranges that are wide the equations may say nothing, whatever the gain is
@@ -256,7 +246,8 @@ def choose(model: SetMembershipModel, gains: list[Gain], wishes: Wishes) -> list
         if np.all((best.found.widths < declared(model.plant))[: len(model.plant.x)]):
             break
     lengths = [most] if wishes.columns is not None else [kept for kept in KEPT if kept <= most]
-    banks = [tried(best.gain, kept, count, share) for kept in lengths for count in counts]
+    chosen = best.bank.L, best.bank.V
+    banks = [tried(chosen, kept, count, share) for kept in lengths for count in counts]
     if wishes.fitting:
         return sorted(banks, key=lambda one: one.mean)
     return sorted(banks, key=lambda one: one.mean * (1.0 + one.size / LARGE))
@@ -317,18 +308,18 @@ def complete(
     options: Mapping[str, Any],
 ) -> SetMembershipDesign:
     """Return the design of a choice."""
-    gain, bank, names = chosen.gain, chosen.bank, model.plant.names("f")
-    held = frame(gain.V)
+    bank, names = chosen.bank, model.plant.names("f")
+    held = frame(bank.V)
     design = SetMembershipDesign(
         plant=model.plant,
         followed=tuple(names[j] for j in model.followed),
-        L=gain.L,
+        L=bank.L,
         V=held.V,
         W=held.W,
         size=held.size,
         leak=held.leak,
-        A=gain.A,
-        C=gain.C,
+        A=model.nearest.J,
+        C=model.nearest.H,
         columns=bank.columns,
         kept=bank.columns // model.group,
         zonotopes=bank.zonotopes,
