@@ -109,52 +109,6 @@ def _parts(data: ModelData, arithmetic: Arithmetic) -> Mapping[str, Any]:
     }
 
 
-def plain_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
-    """Error system (16)-(18), xi = (e, e_f), v = (w_k, eps_k, w_{k+1}), with E W2 put right."""
-    n, n_f, m, n_w = data.sizes
-    part = _parts(data, arithmetic)
-
-    def one(value: FloatArray) -> Any:
-        return lift(value, arithmetic)
-
-    top = part["T"] @ (part["A"] + part["M"])
-    Abar = block([[top, part["T"] @ one(data.B_f)], [one(np.zeros((n_f, n))), one(np.eye(n_f))]])
-    Cbar = block([[part["C"], one(np.zeros((m, n_f)))]])
-    Wbar = block(
-        [
-            [part["T"] @ part["W1s"], one(np.zeros((n, n_f))), part["E"] @ part["W2s"]],
-            [one(np.zeros((n_f, n_w))), one(np.diag(data.rate)), one(np.zeros((n_f, n_w)))],
-        ]
-    )
-    Vbar = block([[part["W2s"], one(np.zeros((m, n_f + n_w)))]])
-    return ErrorSystem(Abar, Cbar, Wbar, Vbar, np.eye(n), 3)
-
-
-def shifted_error(data: ModelData, arithmetic: Arithmetic = "float") -> ErrorSystem:
-    """Error system in zeta = T x - z (the method's page), in coordinates of the range of T."""
-    n, n_f, m, n_w = data.sizes
-    keep = kept_coordinates(data.T)
-    part = _parts(data, arithmetic)
-
-    def one(value: FloatArray) -> Any:
-        return lift(value, arithmetic)
-
-    basis = np.eye(n)[:, keep]
-    down = one(np.ascontiguousarray(basis.T))
-    AM = part["A"] + part["M"]
-    top = down @ (part["T"] @ AM) @ one(basis)
-    noise = down @ (part["T"] @ AM @ (part["E"] @ part["W2s"]) + part["T"] @ part["W1s"])
-    p = len(keep)
-    Cz = part["C"] @ one(basis)
-    Vw = part["Pi"] @ part["W2s"]
-    zero = one(np.zeros((n_f, p)))
-    Abar = block([[top, down @ (part["T"] @ one(data.B_f))], [zero, one(np.eye(n_f))]])
-    Cbar = block([[Cz, one(np.zeros((m, n_f)))]])
-    Wbar = block([[noise, zero.T], [one(np.zeros((n_f, n_w))), one(np.diag(data.rate))]])
-    Vbar = block([[Vw, one(np.zeros((m, n_f)))]])
-    return ErrorSystem(Abar, Cbar, Wbar, Vbar, basis, 2)
-
-
 def kept_coordinates(T: FloatArray) -> list[int]:
     """Return the coordinates onto which T projects, for T = diag(0 or 1)."""
     diagonal = np.diag(T)
@@ -171,9 +125,36 @@ def kept_coordinates(T: FloatArray) -> list[int]:
 def build_error_system(
     data: ModelData, error: ErrorKind, arithmetic: Arithmetic = "float"
 ) -> ErrorSystem:
-    """Build the error system of a kind, see `plain_error` and `shifted_error`."""
-    build = plain_error if error == "plain" else shifted_error
-    return build(data, arithmetic)
+    """Form the error system of a kind.
+
+    plain: (16)-(18), xi = (e, e_f), v = (w_k, eps_k, w_{k+1}), with E W2 put right
+    shifted: in zeta = T x - z (the method's page), in coordinates of the range of T
+    """
+    n, n_f, m, n_w = data.sizes
+    part = _parts(data, arithmetic)
+    T, E, W1s, W2s = (part[name] for name in ("T", "E", "W1s", "W2s"))
+
+    def one(value: FloatArray) -> Any:
+        return lift(value, arithmetic)
+
+    basis, moved, driven = np.eye(n), T @ (part["A"] + part["M"]), T @ one(data.B_f)
+    seen, read, noise = part["C"], W2s, [T @ W1s, one(np.zeros((n, n_f))), E @ W2s]
+    if error == "shifted":
+        basis = basis[:, kept_coordinates(data.T)]
+        down = one(np.ascontiguousarray(basis.T))
+        noise = [down @ (moved @ (E @ W2s) + T @ W1s), one(np.zeros((basis.shape[1], n_f)))]
+        moved, driven = down @ moved @ one(basis), down @ driven
+        seen, read = seen @ one(basis), part["Pi"] @ W2s
+    late = [one(np.zeros((n_f, n_w)))] * (len(noise) - 2)
+    own = [one(np.zeros((n_f, n_w))), one(np.diag(data.rate)), *late]
+    return ErrorSystem(
+        Abar=block([[moved, driven], [one(np.zeros((n_f, basis.shape[1]))), one(np.eye(n_f))]]),
+        Cbar=block([[seen, one(np.zeros((m, n_f)))]]),
+        Wbar=block([noise, own]),
+        Vbar=block([[read, one(np.zeros((m, n_f + n_w * len(late))))]]),
+        basis=basis,
+        blocks=len(noise),
+    )
 
 
 def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:
@@ -206,7 +187,7 @@ def multiplier_block(
     U: Any = None,
 ) -> Any:
     """Inequality (51), as printed or repaired, times -1; H (n + n_f, m), a, b, U (n, n)."""
-    base, M = plain_error(data.without_nonlinearity()), data.vertices
+    base, M = build_error_system(data.without_nonlinearity(), "plain"), data.vertices
     n, n_f, _, _ = data.sizes
     V, Y = np.eye(n, n + n_f), np.eye(n + n_f, n) @ data.T
     X = P @ base.Abar - H @ base.Cbar

@@ -63,17 +63,13 @@ def units(design: GeneralDesign, weights: FloatArray) -> Units:
     data, m = scaled(design), design.L0.shape[1]
     share = weights * data.x
     share = share / share.sum() if share.sum() > 0 else np.full(len(share), 1.0 / len(share))
-    search, best = GainSearch(data, share), None
-    for Z in riccati_starts(data):
-        value = search.value(Z)
-        key = (value.mean, value.rho, value.radius)
-        if best is None or key < best[0]:
-            best = key, value, Z
+    search = GainSearch(data, share)
+    tried = [(search.value(Z), Z) for Z in riccati_starts(data)]
     y = np.ones(m)
     y[data.free] = data.y
-    if best is None:
+    if not tried:
         return Units(np.zeros((len(data.x), m)), data.x, y, bounded=False)
-    _, value, Z = best
+    value, Z = min(tried, key=lambda pair: (pair[0].mean, pair[0].rho, pair[0].radius))
     bounded = bool(np.isfinite(value.b).all())
     size = np.maximum(value.b[len(data.x) :], 1e-5) if bounded else np.ones(len(data.x))
     return Units(data.deployed(Z, m), size * data.x, y, bounded)

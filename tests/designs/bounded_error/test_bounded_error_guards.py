@@ -10,8 +10,6 @@ import pytest
 import obsynth as ob
 from obsynth.designs.bounded_error.lmis import (
     build_error_system,
-    plain_error,
-    shifted_error,
 )
 from obsynth.designs.bounded_error.model import NoiseBox, read
 from obsynth.designs.bounded_error.record import UioDesign
@@ -32,7 +30,7 @@ def run(tank, base, alone):
 
 def recursion_residual(design, tank_split, run, Wbar, shift=0):
     """Largest violation of eq. (16) along a simulated run."""
-    system = plain_error(design.data.without_nonlinearity())
+    system = build_error_system(design.data.without_nonlinearity(), "plain")
     X = system.Abar[0] - design.gain("plain") @ system.Cbar
     Z = (Wbar - design.gain("plain") @ system.Vbar) / design.data_scale
     Y = np.vstack([design.T, np.zeros((2, 4))])
@@ -56,23 +54,23 @@ def scaled(design):
 
 
 def test_error_recursion_16(scaled, tank_split, run):
-    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar
+    Wbar = build_error_system(scaled.data.without_nonlinearity(), "plain").Wbar
     assert recursion_residual(scaled, tank_split, run, Wbar) < 1e-12
 
 
 def test_error_recursion_16_with_the_printed_third_block_fails(scaled, tank_split, run):
-    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar.copy()
+    Wbar = build_error_system(scaled.data.without_nonlinearity(), "plain").Wbar.copy()
     Wbar[:4, -3:] = scaled.E @ np.zeros((3, 3))  # E W1, as (18) prints it
     assert recursion_residual(scaled, tank_split, run, Wbar) > 0.05
 
 
 def test_error_recursion_16_with_a_set_of_the_next_instant_fails(scaled, tank_split, run):
-    Wbar = plain_error(scaled.data.without_nonlinearity()).Wbar
+    Wbar = build_error_system(scaled.data.without_nonlinearity(), "plain").Wbar
     assert recursion_residual(scaled, tank_split, run, Wbar, shift=1) > 0.05
 
 
 def test_h3_is_not_covered_with_the_printed_third_block(scaled, run):
-    system = plain_error(scaled.data)
+    system = build_error_system(scaled.data, "plain")
     Wbar = system.Wbar.copy()
     Wbar[..., :4, -3:] = 0.0
     noise = NoiseBox(scaled.w_centre, scaled.w_radius, scaled.rate).equal_weights()
@@ -289,7 +287,7 @@ def test_a_step_without_the_fault_is_not_certified_by_chance(base, alone, tank):
 
 def test_shifted_error_recursion(design, tank_split, run):
     """zeta = T x - z follows its own recursion, without w_{k+1}."""
-    still = shifted_error(design.data.without_nonlinearity())
+    still = build_error_system(design.data.without_nonlinearity(), "shifted")
     scale = np.concatenate([design.w_radius, design.rate])
     kept = [0, 1, 3]
     gain = np.vstack([design.K[kept], design.F])

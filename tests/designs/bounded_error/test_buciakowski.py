@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.designs.bounded_error.lmis import plain_error
+from obsynth.designs.bounded_error.lmis import build_error_system
 from obsynth.designs.bounded_error.printed import (
     box_vertices,
     find_fixed_point,
@@ -152,7 +152,7 @@ def test_repaired_form(tank_split, tank_bounds):
 @pytest.mark.long
 def test_repaired_form_has_a_smaller_largest_gamma(base, tank_bounds):
     exact = UioDesign.from_record(base.record).data
-    assert largest_gamma(plain_error(exact)) == pytest.approx(0.00903, rel=0.005)
+    assert largest_gamma(build_error_system(exact, "plain")) == pytest.approx(0.00903, rel=0.005)
     vertices = box_vertices(tank_bounds)
     assert largest_multiplier_gamma(exact.at(vertices)) == pytest.approx(0.00776, rel=0.01)
 
@@ -175,7 +175,9 @@ def test_largest_gamma_with_the_printed_bounds(base):
     together = (vertices[:, 0, 2] == -vertices[:, 2, 2]) & (vertices[:, 1, 3] == -vertices[:, 3, 3])
     vertices = vertices[together]
     assert len(vertices) == 16
-    assert largest_gamma(plain_error(data.at(vertices))) == pytest.approx(0.00917, rel=0.005)
+    assert largest_gamma(build_error_system(data.at(vertices), "plain")) == pytest.approx(
+        0.00917, rel=0.005
+    )
 
 
 @pytest.mark.long
