@@ -64,7 +64,7 @@ def recursion_block(
     one = lift(np.ones((1, 1)), arithmetic)
     noise = gamma * lift(np.diag(bound.weights[number]), arithmetic)
     P = lift(bound.P[number], arithmetic)
-    return lmis.fixed_gain_block(X, Z, P, one - gamma, noise)
+    return lmis.boundedness_block(P, P @ X, P @ Z, one - gamma, noise)
 
 
 def prove_ellipsoid(design: UioDesign) -> tuple[Claim, ...]:

@@ -76,6 +76,10 @@ class ErrorSystem:
         """p, m, n_v."""
         return self.Abar.shape[-1], self.Cbar.shape[-2], self.Vbar.shape[-1]
 
+    def weighed(self, P: Any, H: Any) -> tuple[Any, Any]:
+        """P Abar - H Cbar and P Wbar - H Vbar."""
+        return P @ self.Abar - H @ self.Cbar, P @ self.Wbar - H @ self.Vbar
+
     def closed_loop(self, gain: Any) -> tuple[Any, Any]:
         """X = Abar - Kbar Cbar and Z = Wbar - Kbar Vbar for a given gain (p, m)."""
         return self.Abar - gain @ self.Cbar, self.Wbar - gain @ self.Vbar
@@ -157,23 +161,17 @@ def build_error_system(
     )
 
 
-def direct_block(system: ErrorSystem, P: Any, H: Any, keep: Any, noise: Any) -> Any:
+def boundedness_block(P: Any, X: Any, Z: Any, keep: Any, noise: Any) -> Any:
     """Quadratic boundedness ``V+ <= (1 - gamma) V + gamma v'Q_v v`` at every vertex, not relaxed.
 
-        [ keep P            *       *
-          0                 noise   *
-          P Abar - H Cbar   P Wbar - H Vbar   P ]  > 0
+        [ keep P   *       *
+          0        noise   *
+          X        Z       P ]  > 0
 
-    Shapes: P, H (p, p), (p, m), keep = 1 - gamma (1, 1), noise = gamma Q_v (n_v, n_v).
+    Shapes: P (p, p), keep = 1 - gamma (1, 1), noise = gamma Q_v (n_v, n_v); X and Z are P times
+    the maps of the closed loop, ``P Abar - H Cbar`` and ``P Wbar - H Vbar`` with H = P Kbar.
     """
-    X = P @ system.Abar - H @ system.Cbar
-    Z = P @ system.Wbar - H @ system.Vbar
     return symmetric_block([[P * keep], [0, noise], [X, Z, P]])
-
-
-def fixed_gain_block(X: Any, Z: Any, P: Any, keep: Any, noise: Any) -> Any:
-    """Quadratic boundedness for a gain that is given: X, Z as in eq. (16) with M inserted."""
-    return symmetric_block([[P * keep], [0, noise], [P @ X, P @ Z, P]])
 
 
 def multiplier_block(
@@ -190,8 +188,7 @@ def multiplier_block(
     base, M = build_error_system(data.without_nonlinearity(), "plain"), data.vertices
     n, n_f, _, _ = data.sizes
     V, Y = np.eye(n, n + n_f), np.eye(n + n_f, n) @ data.T
-    X = P @ base.Abar - H @ base.Cbar
-    Z = P @ base.Wbar - H @ base.Vbar
+    X, Z = base.weighed(P, H)
     S1 = P * keep - np.eye(n + n_f, n) @ he(a @ M) @ V
     rows = [[S1], [a @ V, b], [0, 0, noise], [-X, -(P @ Y), -Z, P]]
     if U is None:

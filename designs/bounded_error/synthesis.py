@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from obsynth.designs.bounded_error.lmis import ErrorSystem, direct_block, fixed_gain_block
+from obsynth.designs.bounded_error.lmis import ErrorSystem, boundedness_block
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.lmi.expression import Affine, diagonal, full, symmetric, trace
 from obsynth.designs.lmi.margin import Margin, largest_margin
@@ -99,10 +99,10 @@ def design_problem(
     P = symmetric("P", p)
     Q = _noise(noise, n_v, problem)
     if gain is None:
-        block = direct_block(scaled, P, full("H", p, m), 1.0 - gamma, Q)
+        X, Z = scaled.weighed(P, full("H", p, m))
     else:
-        X, Z = scaled.closed_loop(gain / scale[:, None])
-        block = fixed_gain_block(X, Z, P, 1.0 - gamma, Q)
+        X, Z = (P @ part for part in scaled.closed_loop(gain / scale[:, None]))
+    block = boundedness_block(P, X, Z, 1.0 - gamma, Q)
     problem.add_lmi("invariance", block, ">>", margin=MARGIN)
     set_objective(problem, P, objective, weights, scale)
     return problem
@@ -171,11 +171,8 @@ def decay_problem(
     """State ``[(1 - gamma) P, X'P; P X, P] > 0``: quadratic boundedness without noise."""
     p, m, _ = system.sizes
     problem = Problem(f"decay at gamma = {gamma:.6g}")
-    P = symmetric("P", p)
-    if gain is None:
-        X = P @ system.Abar - full("H", p, m) @ system.Cbar
-    else:
-        X = P @ system.closed_loop(gain)[0]
+    P, H = symmetric("P", p), full("H", p, m)
+    X, _ = system.weighed(P, H) if gain is None else (P @ system.closed_loop(gain)[0], None)
     problem.add_lmi("decay", symmetric_block([[P * (1.0 - gamma)], [X, P]]), ">>")
     return problem, P
 
