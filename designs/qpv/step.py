@@ -87,6 +87,7 @@ def build_core(design: QPVDesign) -> Core:
     precision, lost = design.precision, of_outputs(design)
     sides, (seen_of_E, noise) = np.sqrt(design.inverse_diagonal) * _UP, _shown(design)
     Q, root = design.region.Q, np.linalg.cholesky(np.linalg.inv(design.P))
+    inverse_Q: FloatArray = np.asarray(np.linalg.inv(Q), dtype=np.float64)
     largest = np.sqrt(np.linalg.eigvalsh(root.T @ np.linalg.solve(Q, root))[-1]) * _UP
     ulp, up = Rounding(precision).step, above(precision, 2 * n)
     added = design.rounding * up
@@ -108,7 +109,7 @@ def build_core(design: QPVDesign) -> Core:
                 allowed = allowed + ulp * ca.fabs(y[i])
                 fits = ca.fabs(y[i] - expected[i]) <= allowed
                 consistent = ca.logic_and(consistent, fits)
-        away = _root(np.linalg.inv(Q), offset, design.region.c, precision)
+        away = _root(inverse_Q, offset, design.region.c, precision)
         if design.bounded:
             away = away + reach * float(largest)
         x = f = None
