@@ -255,21 +255,8 @@ def split(
         raise DerivationError(
             f"row {row + 1} of the split could not be proved equal to the plant's", row=row
         )
-    return Split(
-        model=model,
-        A=A,
-        B=B,
-        D=D.value,
-        B_f=B_f.value,
-        C=C.value,
-        W1=W1.value,
-        W2=W2.value,
-        D_f=D_f.value,
-        g=g,
-        linear=linear,
-        at=point,
-        proof=proof,
-    )
+    blocks = {name: part.value for name, part in parts.items()}
+    return Split(model=model, A=A, B=B, g=g, linear=linear, at=point, proof=proof, **blocks)
 
 
 def _exact(matrix: FloatArray) -> sp.Matrix:

@@ -179,22 +179,16 @@ def _halves(
     bounds: JacobianBounds, entries: MatrixEntries, exact: sp.Matrix, rtol: float, effort: str
 ) -> Ends:
     """Ranges of the symmetric part; bounded anew only where two entries of J meet."""
-    found = _known(bounds, entries, 0)
-    meeting = []
-    for k, (i, j) in enumerate(entries.places):
-        if i == j:
-            continue
-        if exact[i, j] != 0 and exact[j, i] != 0:
-            meeting.append(k)
-            continue
-        row, column = (i, j) if exact[i, j] != 0 else (j, i)
-        found.lower[k], found.upper[k] = (
-            0.5 * bounds.min[row, column],
-            0.5 * bounds.max[row, column],
-        )
-        index = [bounds.variables.index(name) for name in entries.names]
-        ends = np.nan_to_num(bounds.attained_at[row, column][:, index])
-        found.points_lower[k], found.points_upper[k] = ends
+    at = bounds.attained_at
+    half = replace(
+        bounds,
+        min=0.5 * (bounds.min + bounds.min.T),
+        max=0.5 * (bounds.max + bounds.max.T),
+        attained_at=np.where(np.isnan(at), at.swapaxes(0, 1), at),
+    )
+    found = _known(half, entries, 0)
+    pairs = [(i != j and exact[i, j] != 0 and exact[j, i] != 0) for i, j in entries.places]
+    meeting = np.flatnonzero(pairs).tolist()
     if meeting:
         anew = entries.take(meeting)
         ranges = anew.ranges(rtol, effort, "(J + J')/2")

@@ -122,11 +122,6 @@ def remainder(a: Interval, b: Interval) -> Interval:
     return np.where(nothing, np.nan, lo), np.where(nothing, np.nan, hi)
 
 
-def sign(a: Interval) -> Interval:
-    """Enclose the sign; over zero that is [-1, 1], the generalised derivative of |x|."""
-    return np.sign(a[0]), np.sign(a[1])
-
-
 def copysign(a: Interval, b: Interval) -> Interval:
     """Enclose |a| with the sign of b; both signs where b may be zero, since zero has two."""
     size = absolute(a)
@@ -135,16 +130,6 @@ def copysign(a: Interval, b: Interval) -> Interval:
     lo = np.where(plus, size[0], other[0])
     hi = np.where(minus, other[1], size[1])
     return lo, hi
-
-
-def floor(a: Interval) -> Interval:
-    """Enclose floor, exactly."""
-    return np.floor(a[0]), np.floor(a[1])
-
-
-def ceiling(a: Interval) -> Interval:
-    """Enclose ceil, exactly."""
-    return np.ceil(a[0]), np.ceil(a[1])
 
 
 def less(a: Interval, b: Interval) -> Interval:

@@ -5,7 +5,7 @@ fewer than that. So all products whose factors are known are taken in one call, 
 row per product and one column per box, then all sums that have become possible, and so on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -15,6 +15,18 @@ import numpy as np
 from obsynth.derive.intervals.rules import COMMUTATIVE, PARTIAL, RULES, uncertain
 from obsynth.derive.rigour import Interval
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+
+
+def reached(starts: Iterable[int], onwards: Callable[[int], Iterable[int]]) -> set[int]:
+    """Collect what is met on the way from some nodes, these among it."""
+    found: set[int] = set()
+    stack = list(starts)
+    while stack:
+        node = stack.pop()
+        if node not in found:
+            found.add(node)
+            stack.extend(onwards(node))
+    return found
 
 
 @dataclass(frozen=True)

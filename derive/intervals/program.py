@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.intervals.graph import Graph, Node, Schedule
+from obsynth.derive.intervals.graph import Graph, Node, Schedule, reached
 from obsynth.derive.intervals.rewriting.rewrites import REWRITES
 from obsynth.derive.intervals.rules import JUMPS, NAMES, PARTIAL
 from obsynth.symbolic.arrays import BoolArray, FloatArray
@@ -113,15 +113,12 @@ class Program(Graph):
         """List the nodes needed for some outputs, in order; remembered between calls."""
         key = tuple(outputs)
         if key not in self._live:
-            needed: set[int] = set()
-            stack = [self.outputs[k] for k in outputs]
-            while stack:
-                index = stack.pop()
-                if index not in needed:
-                    needed.add(index)
-                    if index not in self.constants:
-                        stack.extend(self.nodes[index].args)
-            self._live[key] = sorted(needed)
+            self._live[key] = sorted(
+                reached(
+                    (self.outputs[k] for k in outputs),
+                    lambda k: () if k in self.constants else self.nodes[k].args,
+                )
+            )
         return self._live[key]
 
     def schedule(self, outputs: Sequence[int], judged: int) -> Schedule:
@@ -152,15 +149,13 @@ class Program(Graph):
 
     def decisive(self, output: int) -> list[int]:
         """List the nodes under an output without which it has no range, in order."""
-        needed: set[int] = set()
-        stack = [self.outputs[output]]
-        while stack:
-            index = stack.pop()
-            if index not in needed and index not in self.constants:
-                needed.add(index)
-                node = self.nodes[index]
-                stack.extend(node.args[1:] if node.op == "meet" else node.args)
-        return sorted(needed)
+
+        def onwards(k: int) -> tuple[int, ...]:
+            node = self.nodes[k]
+            return node.args[1:] if node.op == "meet" else () if k in self.constants else node.args
+
+        found = reached([self.outputs[output]], onwards)
+        return sorted(found.difference(self.constants))
 
     def support(self, output: int) -> tuple[int, ...]:
         """List the variables on which an output depends."""

@@ -53,6 +53,12 @@ NAMES: dict[int, str] = {
     for op, name in (*((name, name) for name in _SAME.split()), *_OTHERS.items())
 }
 
+
+def _both(function: Callable[[FloatArray], FloatArray]) -> Callable[[Interval], Interval]:
+    """Make the rule of an increasing function that is exact; of sign over zero it is [-1, 1]."""
+    return lambda a: (function(a[0]), function(a[1]))
+
+
 _HALF = float(np.nextafter(0.5 * np.pi, np.inf))
 
 
@@ -97,10 +103,10 @@ RULES: dict[str, Callable[..., Interval]] = {
     "arctangent2": fn.arctangent2,
     "hypotenuse": fn.hypotenuse,
     "remainder": fn.remainder,
-    "sign": fn.sign,
+    "sign": _both(np.sign),
     "copysign": fn.copysign,
-    "floor": fn.floor,
-    "ceiling": fn.ceiling,
+    "floor": _both(np.floor),
+    "ceiling": _both(np.ceil),
     "less": fn.less,
     "less_equal": fn.less_equal,
     "equal": fn.equal,

@@ -6,7 +6,6 @@ of pieces with a sign each.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
@@ -23,25 +22,18 @@ from obsynth.symbolic.signals import Role, Signal
 Signs = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """One increasing function sign(g) |g|^a in an equation, with the symbol that stands for it."""
-
-    signal: Signal
-    inner: sp.Expr
-
-
 class Monotone:
     """Signs of slopes of the equations of a plant over its declared ranges.
 
     plant: see `with_ranges` for another box
+    pieces: signals that stand for increasing functions sign(g) |g|^a in the equations, each with g
     """
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         values = plant.constant_values
         self.rows: list[sp.Expr] = []
-        self.pieces: list[Piece] = []
+        self.pieces: list[tuple[Signal, sp.Expr]] = []
         for row in plant.rhs:
             self.rows.append(self._replace(sp.expand(substitute(row, values))))
 
@@ -67,9 +59,9 @@ class Monotone:
         """Return the slope as a sum of products, each listed by its factors."""
         parts = [[slope(row, symbol)]]
         parts += [
-            [slope(row, piece.signal.symbol), slope(piece.inner, symbol)]
-            for piece in self.pieces
-            if row.has(piece.signal.symbol)
+            [slope(row, signal.symbol), slope(inner, symbol)]
+            for signal, inner in self.pieces
+            if row.has(signal.symbol)
         ]
         return parts
 
@@ -87,9 +79,8 @@ class Monotone:
         if expression.is_number:
             value = float(sp.sign(expression))
             return value, value
-        entries = matrix_entries(
-            {(0, 0): expression}, self.plant, [piece.signal for piece in self.pieces]
-        )
+        signals = [signal for signal, _ in self.pieces]
+        entries = matrix_entries({(0, 0): expression}, self.plant, signals)
         found = entries.search(1e-2, "fast")
         return float(found.lower[0]), float(found.upper[0])
 
@@ -115,7 +106,7 @@ class Monotone:
         signal = Signal(
             symbol.name, symbol, Role.SCHEDULING, ends[0] - wide, ends[1] + wide, measured=False
         )
-        self.pieces.append(Piece(signal, inner))
+        self.pieces.append((signal, inner))
         return symbol
 
 

@@ -18,17 +18,12 @@ import casadi as ca
 
 Tree = tuple[Any, ...]
 
-_HALF = Fraction(1, 2)
+_HALVES = ((0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 2, 0))
 TABLEAUS: dict[str, tuple[list[list[Fraction]], list[Fraction]]] = {
     "euler": ([[Fraction(0)]], [Fraction(1)]),
     "rk4": (
-        [
-            [Fraction(0)] * 4,
-            [_HALF, Fraction(0), Fraction(0), Fraction(0)],
-            [Fraction(0), _HALF, Fraction(0), Fraction(0)],
-            [Fraction(0), Fraction(0), Fraction(1), Fraction(0)],
-        ],
-        [Fraction(1, 6), Fraction(1, 3), Fraction(1, 3), Fraction(1, 6)],
+        [[Fraction(a, 2) for a in row] for row in _HALVES],
+        [Fraction(b, 6) for b in (1, 2, 2, 1)],
     ),
 }
 """Coefficients A and b of the methods."""

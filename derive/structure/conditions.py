@@ -23,7 +23,6 @@ class Decoupling:
 
     residual: largest entry of ``|(I + E C) D|`` for the stored doubles, computed exactly: 0 where
         the decoupling is exact
-    projector: whether ``I + E C`` of the stored doubles is exactly a projector and equal to `T`
     """
 
     E: FloatArray
@@ -31,7 +30,6 @@ class Decoupling:
     Pi: FloatArray
     rank: int
     residual: float
-    projector: bool
 
 
 def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
@@ -43,7 +41,7 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     m, n = C.shape
     q = D.shape[1]
     if q == 0:
-        return Decoupling(np.zeros((n, m)), np.eye(n), np.eye(m), 0, 0.0, True)
+        return Decoupling(np.zeros((n, m)), np.eye(n), np.eye(m), 0, 0.0)
     exact_C, exact_D = ExactMatrix.of(C), ExactMatrix.of(D)
     CD = exact_C @ exact_D
     gram = CD.T @ CD
@@ -61,8 +59,7 @@ def decouple(C: FloatArray, D: FloatArray) -> Decoupling:
     T = exact_T.to_floats()
     Pi = (np.eye(m) + exact_C @ exact_E).to_floats()
     residual = float(np.max(np.abs((exact_T @ exact_D).to_floats()), initial=0.0))
-    projector = (exact_T @ exact_T).entries == exact_T.entries == ExactMatrix.of(T).entries
-    return Decoupling(E, T, Pi, q, residual, bool(projector))
+    return Decoupling(E, T, Pi, q, residual)
 
 
 def column_sizes(matrix: FloatArray | Numbers) -> FloatArray:
@@ -274,8 +271,6 @@ class WeakestMember:
     """
 
     margin: float
-    scalars: dict[str, float]
-    matrix: FloatArray
     mode: complex | None
     members: int
 
@@ -346,8 +341,8 @@ def weakest_member(split: Split, bounds: JacobianBounds) -> WeakestMember:
         if found.fun < best_margin:
             best, best_margin = np.clip(low + found.x * width, low, high), float(found.fun)
     value, mode = margin(best)
-    scalars = dict(zip(family.labels, best.tolist(), strict=True))
     if mode is not None and value <= _HIDDEN:
+        scalars = dict(zip(family.labels, best.tolist(), strict=True))
         listed = ", ".join(f"{name} = {s:.6g}" for name, s in scalars.items())
         raise StructureError(
             f"state and faults cannot be detected where {listed}, inside the Jacobian family: the "
@@ -358,4 +353,4 @@ def weakest_member(split: Split, bounds: JacobianBounds) -> WeakestMember:
             mode=mode,
             matrix=family.at(best),
         )
-    return WeakestMember(value, scalars, family.at(best), mode, looked)
+    return WeakestMember(value, mode, looked)

@@ -10,7 +10,7 @@ import sympy as sp
 from obsynth.derive.algebra.slopes import slope
 from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import substitute
-from obsynth.derive.structure.frozen import Frozen, balls, freeze, original, precision, rank
+from obsynth.derive.structure.frozen import Frozen, balls, freeze, precision, rank
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.taking import takes
@@ -124,7 +124,8 @@ def excitation(model: Plant) -> Excitation:
     >>> found.points, str(found.effects[0])
     (1, 'f1 enters with constant coefficients')
     """
-    plant = original(model.check())
+    # the equations of a continuous plant are shorter than those of its step
+    plant = model.check().continuous or model
     names = plant.names("f")
     if not names:
         return Excitation((), 0, 1, 0)

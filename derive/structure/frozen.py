@@ -36,11 +36,6 @@ class Frozen:
     point: dict[str, float]
 
 
-def original(model: Plant) -> Plant:
-    """Return the continuous plant behind a model, whose equations are shorter, or itself."""
-    return model.continuous or model
-
-
 def freeze(model: Plant, count: int = _POINTS) -> list[Frozen]:
     """Evaluate the derivatives of a plant at fixed random points of its box."""
     values = model.constant_values

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.derive.errors import StructureError
-from obsynth.derive.structure.frozen import freeze, original, precision, rank, transfer
+from obsynth.derive.structure.frozen import freeze, precision, rank, transfer
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.table import Table
@@ -147,7 +147,8 @@ def fault_isolability(model: Plant) -> FaultIsolability:
     >>> str(fault_isolability(quadruple_tank()))
     'f1, f2 can be told from every other single fault; at most 2 at the same time'
     """
-    plant = original(model.check())
+    # the equations of a continuous plant are shorter than those of its step
+    plant = model.check().continuous or model
     names = plant.names("f")
     n_f, q = len(names), len(plant.d)
     points = freeze(plant) if n_f or q else []

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 
 import sympy as sp
 
@@ -166,18 +166,12 @@ def _telescopes(term: sp.Expr, signals: Symbols) -> Iterator[Option]:
     if not term.has(*signals):
         yield Option((), term, "")
         return
-    for form, weights, replaced, z in _linear_arguments(term, signals):
+    alone = [(s, ((j, sp.Integer(1)),), term, s) for j, s in enumerate(signals) if term.has(s)]
+    for form, weights, replaced, z in chain(_linear_arguments(term, signals), alone):
         start, quotient = at_zero(replaced, z), secant(replaced, z)
         if start is not None and quotient is not None:
             shares = _shares(weights, quotient, _derivative(replaced, z), z, form, signals)
             yield from _continued(start, signals, shares, sp.sstr(form))
-    for j, signal in enumerate(signals):
-        if not term.has(signal):
-            continue
-        start, quotient = at_zero(term, signal), secant(term, signal)
-        if start is not None and quotient is not None:
-            share = Share(j, quotient, _derivative(term, signal), (signal,))
-            yield from _continued(start, signals, (share,), str(signal))
 
 
 def _continued(

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import casadi as ca
 import sympy as sp
 
+from obsynth.derive.intervals.graph import reached
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.rewriting.quotients import Quotient, Quotients
 from obsynth.derive.intervals.search.reduction import SxGraph
@@ -161,27 +162,16 @@ class _Search:
 
     def _depends_only_on(self, k: int, base: int) -> bool:
         """Whether a node sees the variables through another node only."""
-        stack, seen = [k], set()
-        while stack:
-            node = stack.pop()
-            if node == base or node in seen or not self.graph.supports[node]:
-                continue
-            seen.add(node)
-            code, args, _ = self.graph.nodes[node]
-            if code == ca.OP_INPUT:
-                return False
-            stack.extend(args)
-        return True
+        nodes, seen = self.graph.nodes, self.graph.supports
+        met = reached([k], lambda n: () if n == base or not seen[n] else nodes[n][1])
+        return not any(nodes[n][0] == ca.OP_INPUT and seen[n] and n != base for n in met)
 
     def _bases(self, k: int) -> list[int]:
         """Nodes through which alone a node sees its variables, itself first."""
         graph, support = self.graph, self.graph.supports[k]
-        stack, cone = [k], set()
-        while stack:
-            node = stack.pop()
-            if node not in cone and graph.supports[node] == support:
-                cone.add(node)
-                stack.extend(graph.nodes[node][1])
+        cone = reached(
+            [k], lambda n: [a for a in graph.nodes[n][1] if graph.supports[a] == support]
+        )
         return [b for b in sorted(cone, reverse=True) if self._depends_only_on(k, b)]
 
     # -- replacements ----------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ from obsynth.derive.intervals.search.curvature import (
     taylor_spread,
 )
 from obsynth.derive.rigour import Interval, up
-from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+from obsynth.symbolic.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -72,7 +72,6 @@ _MATRIX_NUMBERS = 1_000_000
 # One small box without a bound settles its goal: follow a few rows down to it, not all of them.
 _SINGULAR_ROWS = 8
 _SINGULAR_WIDTH = 2.0**-20
-_SAMPLES = 48
 # Nodes of a program from which on fewer boxes are looked at, and without second derivatives.
 _LONG_PROGRAM = 2_000
 _LONGEST_CURVED = 10_000
@@ -121,9 +120,9 @@ class Search:
     def __init__(self, problem: Problem, rtol: float) -> None:
         goals = 2 * len(problem.gradient)
         self.problem, self.rtol = problem, rtol
-        self.limited = np.isfinite(problem.lower) & np.isfinite(problem.upper)
-        low = np.where(self.limited, problem.lower, 0.0)
-        high = np.where(self.limited, problem.upper, 0.0)
+        limited = np.isfinite(problem.lower) & np.isfinite(problem.upper)
+        low = np.where(limited, problem.lower, 0.0)
+        high = np.where(limited, problem.upper, 0.0)
         middle = np.clip(0.5 * low + 0.5 * high, problem.lower, problem.upper)
         self.middle = np.where(np.isfinite(middle), middle, 0.0)
         self.root_width = np.where(high > low, high - low, 1.0)
@@ -165,19 +164,6 @@ class Search:
         self.points[rows.goal[better]] = rows.lower[:, better].T
         self.best[rows.goal[better]] = found.lower[better]
         return found
-
-    def sample(self, goals: IntArray) -> None:
-        """Try points of a fixed pattern and corners of the box for unsettled goals."""
-        problem = self.problem
-        rng = np.random.default_rng(0)
-        share = rng.random((len(problem.lower), _SAMPLES))
-        share[:, : _SAMPLES // 3] = rng.integers(0, 2, (len(problem.lower), _SAMPLES // 3))
-        low = np.where(self.limited, problem.lower, self.middle)[:, None]
-        high = np.where(self.limited, problem.upper, self.middle)[:, None]
-        where = np.clip(low + share * (high - low), low, high)
-        goal = np.repeat(goals, _SAMPLES)
-        at = np.tile(where, (1, len(goals)))
-        self.record(Rows(goal, at, at, np.zeros(len(goal))))
 
     def tolerance(self) -> FloatArray:
         """Return the gap that is good enough, goal by goal."""
@@ -324,8 +310,6 @@ class Search:
             while rows.count and self.boxes < budget.boxes and self.sweeps < budget.sweeps:
                 now = self.choose(rows)
                 rows = self.sweep(rows.take(now)).join(rows.take(~now))
-                if self.sweeps == 1 and rows.count:
-                    self.sample(np.unique(rows.goal))
                 rows = rows.take(self.close(rows))
                 tell(f"bounding: {self.boxes} boxes done, {rows.count} open")
         self.open = rows.join(others)
@@ -362,7 +346,8 @@ class Search:
         endless = np.asarray(endless.any(axis=0))
         some = rows.take(endless)
         if some.count:
-            self.sample(np.unique(some.goal))
+            at = np.tile(self.middle[:, None], some.count)
+            self.record(replace(some, lower=at, upper=at))
             upper = enclose_rows(self.problem, some, slopes=False).upper
             for k, goal in enumerate(some.goal.tolist()):
                 if np.isfinite(upper[k]):

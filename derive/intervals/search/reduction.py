@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from obsynth.derive.intervals.graph import reached
 from obsynth.symbolic.arrays import FloatArray
 
 _Key = tuple[int, tuple[int, ...], float | tuple[int, int] | None]
@@ -83,14 +84,7 @@ class SxGraph:
             self.supports.append(own.union(*(self.supports[a] for a in args)))
 
     def _live(self, root: int) -> list[int]:
-        found: set[int] = set()
-        stack = [root]
-        while stack:
-            index = stack.pop()
-            if index not in found:
-                found.add(index)
-                stack.extend(self.nodes[index][1])
-        return sorted(found, reverse=True)
+        return sorted(reached([root], lambda k: self.nodes[k][1]), reverse=True)
 
     def _inside(self, root: int) -> int:
         """Go down through operations with constants that are affine, and so change nothing."""
