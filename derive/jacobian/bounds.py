@@ -259,31 +259,28 @@ class JacobianBounds(Shown):
     def _title(self) -> str:
         return f"{int(self.varying.sum())} varying entries, {self.counted}"
 
+    def _rows(self) -> list[tuple[str, ...]]:
+        """Name, bounds, gap and status of the entries that vary."""
+        return [
+            (
+                entry_name(p),
+                *(f"{end[p]:.8g}" for end in (self.min, self.max)),
+                f"{gap:.1e}",
+                s.word,
+            )
+            for (p, s), gap in zip(np.ndenumerate(self.status), self.gap.flat, strict=True)
+            if self.varying[p]
+        ]
+
     def __str__(self) -> str:
         lines = [self._title]
-        for (i, j), status in np.ndenumerate(self.status):
-            if self.varying[i, j]:
-                lines.append(
-                    f"  {entry_name((i, j))} in [{self.min[i, j]:.8g}, {self.max[i, j]:.8g}]  "
-                    f"gap {self.gap[i, j]:.1e}  {status.word}"
-                )
+        lines += [f"  {p} in [{a}, {b}]  gap {gap}  {s}" for p, a, b, gap, s in self._rows()]
         lines += [f"  {d}" for d in self.dependences if d.coefficients]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        rows = [
-            (
-                entry_name(p),
-                f"{self.min[p]:.8g}",
-                f"{self.max[p]:.8g}",
-                f"{self.gap[p]:.1e}",
-                s.word,
-            )
-            for p, s in np.ndenumerate(self.status)
-            if self.varying[p]
-        ]
         reasons = [d for d in self.dependences if d.coefficients]
-        table = Table("", ("entry", "min", "max", "gap", "status"), rows)
+        table = Table("", ("entry", "min", "max", "gap", "status"), self._rows())
         return card(self._title, table, reasons)
 
 

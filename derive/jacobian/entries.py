@@ -167,12 +167,10 @@ def _mean_widths(
     function = ca.Function("forms", [variables, extra], [ca.densify(form.T) for form in forms])
     program = Program.from_casadi(function, {1: constants})
     rng = np.random.default_rng(0)
-    size = np.where(np.isfinite(box[:, 1] - box[:, 0]), _SHARE * (box[:, 1] - box[:, 0]), np.inf)
-    start = np.where(np.isfinite(size), box[:, 0], 0.0)[:, None]
-    step = np.where(np.isfinite(size), size, 0.0)[:, None]
-    low = start + rng.random((len(box), _BOXES)) * (1.0 / _SHARE - 1.0) * step
-    high = np.where(np.isfinite(size)[:, None], low + step, box[:, 1:])
-    low = np.where(np.isfinite(size)[:, None], low, box[:, :1])
+    finite = np.isfinite(box).all(axis=1, keepdims=True)
+    width = np.diff(np.where(finite, box, 0.0), axis=1)
+    low = box[:, :1] + rng.random((len(box), _BOXES)) * (1.0 - _SHARE) * width
+    high = np.where(finite, low + _SHARE * width, box[:, 1:])
     lower, upper = evaluate(program, low, high)
     with np.errstate(invalid="ignore"):
         return list(np.split(upper - lower, 2))
