@@ -56,9 +56,18 @@ def read_rows(rows: Any, symbols: Mapping[str, sp.Symbol], what: str) -> tuple[s
 def read_dynamics(
     rows: Any, symbols: Mapping[str, sp.Symbol], states: Sequence[str]
 ) -> tuple[sp.Expr, ...]:
-    """Read one row for each state."""
+    """Read one row for each state, in their order or by their names."""
     if not states:
         raise PlantError("a plant needs at least one state; declare states first")
+    if isinstance(rows, Mapping):
+        named = {str(state): row for state, row in rows.items()}
+        if set(named) != set(states):
+            raise PlantError(
+                f"dynamics has rows of {', '.join(named) or 'nothing'}; one each is needed of the "
+                f"states {', '.join(states)}",
+                states=tuple(states),
+            )
+        rows = [named[state] for state in states]
     found = read_rows(rows, symbols, "dynamics")
     if len(found) != len(states):
         raise PlantError(
@@ -74,6 +83,8 @@ def read_outputs(
     rows: Any, symbols: Mapping[str, sp.Symbol], names: Any, unit: Any, limits: Any
 ) -> tuple[dict[str, sp.Expr], tuple[str, ...], tuple[tuple[float, float], ...]]:
     """Read outputs with their names, units and the ranges of their sensors."""
+    if isinstance(rows, Mapping) and names is None:
+        names, rows = [*map(str, rows)], list(rows.values())
     found = read_rows(rows, symbols, "outputs")
     if not found:
         raise PlantError("outputs is empty: an observer needs at least one measurement")

@@ -106,8 +106,8 @@ class Plant:
 
         Parameters
         ----------
-        rows : sequence of expressions, or a column matrix
-            One per state, in their order: SymPy, numbers, or text.
+        rows : sequence of expressions, a column matrix, or mapping of state to expression
+            One per state, without a mapping in their order: SymPy, numbers, or text.
         Ts : float or sympy.Rational, optional
             Sampling time in s of a discrete plant.
         """
@@ -125,10 +125,10 @@ class Plant:
 
         Parameters
         ----------
-        rows : sequence of expressions, or a column matrix
+        rows : sequence of expressions, a column matrix, or mapping of name to expression
             Functions of states, inputs, disturbances, parameters.
         names : str or sequence of str, optional
-            One per row; ``y1``, ``y2``, ... by default.
+            One per row; those of a mapping, or ``y1``, ``y2``, ... by default.
         unit : str or sequence of str
         range : pair of float or sequence of pairs, optional
             What a healthy sensor shows: (lower, upper), or one pair per row, None where

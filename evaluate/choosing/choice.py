@@ -222,7 +222,10 @@ class Choice:
         if len(observers) < len(self.names):
             columns, *rows = map(list, zip(columns, *rows, strict=True))
             columns[0] = "signal"
-        note = "Mean of the second half of the run (guaranteed); without a range, / the narrowest."
+        note = (
+            "Means of the second half of the run (guaranteed once settled, which may take longer "
+            "than the run); without a range, / the narrowest."
+        )
         return Table("Half width / half range of every state and fault", columns, rows, note)
 
     @property

@@ -151,6 +151,17 @@ def test_rows_as_text_matrix_or_array():
         assert plant.rhs.shape == (2, 1)
 
 
+def test_rows_by_name_are_put_in_order():
+    """Mutants: rows in the order of the mapping; names of outputs by number."""
+    plant = Plant("p")
+    a, b = plant.states("a b", range=(0, 1))
+    with pytest.raises(PlantError, match="has rows of a, c; one each is needed of the states a, b"):
+        plant.dynamics({"a": -a, "c": b})
+    plant.dynamics({b: -2 * b, "a": -a})
+    assert plant.outputs({"level": a + b, "other": b}) == ("level", "other")
+    assert [*plant.rhs] == [-a, -2 * b] and [*plant.output] == [a + b, b]
+
+
 def test_expressions_are_canonical_and_piecewise_is_closed():
     plant = Plant("p")
     (x,) = plant.states("x", range=(-1, 1))

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.errors import StructureError
 from obsynth.derive.forms.qpv.augment import Augmented
 from obsynth.derive.forms.qpv.form import QPVLayout
@@ -96,9 +97,9 @@ def _columns(
 def _not_polynomial(term: sp.Expr, present: Sequence[sp.Symbol], row: str) -> StructureError:
     names = ", ".join(map(str, present))
     return StructureError(
-        f"the row of {row} has the term {term}, which is no polynomial in {names}; a quadratic "
-        "form needs polynomials of degree 2 at most. Use quasi_lpv or jacobian_bounds for this "
-        "plant",
+        f"the row of {row} has the term {text(term)}, which is no polynomial in {names}; a "
+        "quadratic form needs polynomials of degree 2 at most. Use quasi_lpv or jacobian_bounds "
+        "for this plant",
         row=row,
         term=term,
         degree=None,
@@ -130,7 +131,8 @@ def _too_high(
         if positions[3] and total > 1:
             allowed += "; a fault that multiplies others has to become a state (augment=)"
     return StructureError(
-        f"the row of {row} has the term {term} of degree {total} ({'; '.join(parts)}); {allowed}",
+        f"the row of {row} has the term {text(term)} of degree {total} "
+        f"({'; '.join(parts)}); {allowed}",
         row=row,
         term=term,
         degree=total,

@@ -255,6 +255,7 @@ def test_a_term_without_a_place_is_named_with_row_and_degree(name, row, term, de
     [
         ("u*u", "x", "x", "degree 2.*2 in the inputs u"),
         ("x*y*u", "x", "x", "degree 3.*2 in the states x, y; 1 in the inputs u"),
+        ("x*y*u/7.1", "x", "x", r"the term 0\.140845\*u\*x\*y of degree 3"),
         ("w*x", "x", "x", "degree 2.*1 in the states x; 1 in the disturbances w"),
         ("x/y", "x", "x", "no polynomial in x, y"),
         ("x", "x*y", "y1", "degree 2.*outputs have to be affine"),
