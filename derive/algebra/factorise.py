@@ -14,6 +14,7 @@ from functools import lru_cache
 import sympy as sp
 
 from obsynth.derive.algebra.sizes import LARGEST_ROW, is_short, simplified, size
+from obsynth.derive.algebra.zero_test import varies
 
 _LARGEST_SUM = 200
 # The stages of a Runge-Kutta step stand in it many times over.
@@ -138,7 +139,10 @@ def _linear_form(term: sp.Expr, states: Sequence[sp.Symbol]) -> Divisor | None:
             z = sp.Dummy(real=True)
             first, slope = coefficients[0]
             rest = form - slope * states[first]
-            replaced = simplified(term.subs(states[first], (z - rest) / slope))
+            replaced = term.subs(states[first], (z - rest) / slope)
+            if varies(replaced, {states[k] for k in present}):
+                continue
+            replaced = simplified(replaced)
             if not replaced.has(*states) and _vanishes(replaced, z):
                 return Divisor(form, tuple(coefficients))
     return None

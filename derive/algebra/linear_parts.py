@@ -9,7 +9,7 @@ import sympy as sp
 from obsynth.derive.algebra.sizes import LARGEST_ROW, simplified, size, text
 from obsynth.derive.algebra.sizes import symbols as symbols_of
 from obsynth.derive.algebra.slopes import slope
-from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.algebra.zero_test import is_zero, varies
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
@@ -56,7 +56,8 @@ def constant_columns(
             if symbol not in present:
                 continue
             factor = slope(row, symbol)
-            if factor.free_symbols - set(values):
+            open_symbols = factor.free_symbols - set(values)
+            if open_symbols and not varies(factor, open_symbols):
                 factor = simplified(factor)
             others = sorted(str(s) for s in factor.free_symbols - set(values))
             if others:

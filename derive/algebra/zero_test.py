@@ -7,6 +7,7 @@ from random import Random
 from typing import Any
 
 import sympy as sp
+from sympy.core.function import AppliedUndef
 
 from obsynth.derive.algebra.secants import quotients
 from obsynth.derive.algebra.sizes import LARGEST_SIMPLIFY, is_short, simplified, size
@@ -40,6 +41,18 @@ def is_zero(expression: sp.Expr) -> str:
         return ""
     found = _prove(expression, exponentials=False)
     return "" if found == NUMERIC else found
+
+
+def varies(expression: sp.Expr, variables: set[sp.Symbol]) -> bool:
+    """Whether numbers show that an expression varies with some of its symbols: a quick refusal.
+
+    SymPy simplifies for minutes what is nearly constant, as of coefficients that are rounded.
+    """
+    if expression.atoms(AppliedUndef):
+        return False
+    moved = {symbol: sp.Dummy(symbol.name, real=True) for symbol in variables}
+    values = _values([expression, -expression.xreplace(moved)], {})
+    return values is not None and not _vanish(values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.algebra.sizes import expanded, simplified
-from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.algebra.zero_test import is_zero, varies
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import UNIT_ROUNDOFF, round_number, up
 from obsynth.symbolic.arrays import FloatArray
@@ -303,6 +303,8 @@ class _Prover:
         difference = self.entries[entry] - combined
         rest = expanded(difference)
         if rest.free_symbols & self.variables:
+            if varies(rest, self.variables):
+                return None
             rest = simplified(rest)
             if rest.free_symbols & self.variables:
                 return None

@@ -4,7 +4,7 @@ import pytest
 import sympy as sp
 
 from obsynth.derive.algebra import zero_test
-from obsynth.derive.algebra.zero_test import NUMERIC, FormProof, is_zero, prove_zero
+from obsynth.derive.algebra.zero_test import NUMERIC, FormProof, is_zero, prove_zero, varies
 
 x, y = sp.symbols("x y", real=True)
 
@@ -104,3 +104,18 @@ def test_many_denominators_are_not_multiplied_out():
 )
 def test_symbolic_zero_tests(expression, how):
     assert is_zero(expression) == how
+
+
+@pytest.mark.parametrize(
+    ("expression", "moves"),
+    [
+        (y + sp.sin(x) ** 2 + sp.cos(x) ** 2, False),
+        (y + x / (1 + x) + 1 / (1 + x), False),
+        (y + sp.sin(x) ** 2 + sp.cos(x) ** 2 + x / 10**30, True),
+        (sp.Function("g")(x), False),  # nothing is known of it
+        (sp.sqrt(x - 5), True),
+    ],
+)
+def test_numbers_show_what_varies(expression, moves):
+    """Mutants: only what is equal at one point is looked at; what cannot be computed varies."""
+    assert varies(expression, {x}) is moves
