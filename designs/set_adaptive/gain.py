@@ -21,7 +21,6 @@ from obsynth.symbolic.arrays import FloatArray
 _ITERATIONS = 40
 _SHIFT = 1e-12
 _LEAST = 1e-9
-_ACCURATE = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 _OTHER = 'in other coordinates it may be: coordinates="auto"'
 # Rounds gains down to a grid: a smaller entry only raises the off-diagonal entries of A - L C.
 _GRID = 2.0**40
@@ -58,9 +57,8 @@ def design_gain(
     bound = float(np.abs(A_upper).sum() + cap * np.abs(C).sum())
     guess = -bound
     for _ in range(_ITERATIONS):
-        problem = gain_problem(A_lower, A_upper, C, cap, guess)
-        found = problem.solve(accept_inaccurate=True, **_ACCURATE)
-        L = np.clip(found["W"] / np.maximum(np.diag(found["P"]), _LEAST)[:, None], -cap, cap)
+        p, W = _feasible(A_lower, A_upper, C, cap, guess)
+        L = np.clip(W / p[:, None], -cap, cap)
         gain = judge(L) if judge else analyse_gain(A_lower, A_upper, C, _metzler(L, A_lower, C))
         if best is None or gain.alpha > alpha:
             step, alpha, best = gain.alpha - alpha, gain.alpha, gain
@@ -133,6 +131,35 @@ def off_diagonal(matrix: FloatArray) -> FloatArray:
     result = matrix.copy()
     np.fill_diagonal(result, 0.0)
     return result
+
+
+def _feasible(
+    A_lower: FloatArray, A_upper: FloatArray, C: FloatArray, cap: float, alpha: float
+) -> tuple[FloatArray, FloatArray]:
+    """Solve max t with p'A_upper - 1'W C + alpha p' <= -t p_j-independent margin, p normalised."""
+    from scipy.optimize import linprog
+
+    n, m = A_lower.shape[0], C.shape[0]
+
+    def row(p: FloatArray, W: FloatArray, margin: float = 0.0) -> FloatArray:
+        return np.concatenate([p, W.ravel(), [margin]])
+
+    rows, none = [], np.zeros((n, m))
+    for i, own in enumerate(np.eye(n)):
+        rows += [row(-A_lower[i, j] * own, np.outer(own, C[:, j])) for j in range(n) if j != i]
+        for unit in np.eye(m):
+            rows += [row(-cap * own, np.outer(own, sign * unit)) for sign in (1.0, -1.0)]
+    for j, own in enumerate(np.eye(n)):
+        rows.append(row(A_upper[:, j] + alpha * own, np.tile(-C[:, j], (n, 1)), 1.0))
+    total, objective = row(np.ones(n), none)[None], row(np.zeros(n), none, -1.0)
+    limits = np.zeros(len(rows))
+    bounds = [(_LEAST, None)] * n + [(None, None)] * (n * m) + [(None, None)]
+    found = linprog(objective, np.array(rows), limits, total, [1.0], bounds, method="highs-ds")
+    if found.x is None:
+        raise SolverTrouble(f"the gain program was not solved: {found.message}")
+    x = np.asarray(found.x)
+    # the solver keeps to bounds within a tolerance that is larger than this one
+    return np.maximum(x[:n], _LEAST), x[n:-1].reshape(n, m)
 
 
 def _metzler(L: FloatArray, A_lower: FloatArray, C: FloatArray) -> FloatArray:
