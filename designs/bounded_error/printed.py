@@ -203,13 +203,14 @@ def find_fixed_point(A: Any, B_f: Any, C: Any, T: Any, vertices: Any) -> FixedPo
         Me = M @ e
         forms = e.T @ (Me - s) / unit, (Me.T @ Me - s.T @ s) / unit**2
         q1, q2 = (0.5 * (form + form.T) for form in forms)
-        for share in SHARES:
-            axis = np.linalg.eigh(share * q1 + (1.0 - share) * q2)[1][:, -1]
-            if min(axis @ q1 @ axis, axis @ q2 @ axis) > 0.0:
-                data = (A, B_f, C, T, vertices[number])
-                point = _rounded_point(axis, space, n, n_f, data, number)
-                if point is not None:
-                    return point
+        means = (share * q1 + (1.0 - share) * q2 for share in SHARES)
+        axes = (np.linalg.eigh(mean)[1][:, -1] for mean in means)
+        room, axis = max(((min(c @ q1 @ c, c @ q2 @ c), c) for c in axes), key=lambda pair: pair[0])
+        if room > 0.0:
+            data = (A, B_f, C, T, vertices[number])
+            point = _rounded_point(axis, space, n, n_f, data, number)
+            if point is not None:
+                return point
     return None
 
 
