@@ -4,8 +4,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any
 
+import numpy as np
+
+from obsynth.derive import DerivationError, equilibrium
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.method import Method
 from obsynth.evaluate.choosing.choice import Choice
 from obsynth.evaluate.choosing.kalman import ExtendedKalman
@@ -106,18 +111,27 @@ def choose(
 
 
 def _gentle(model: Plant, kalman: Any, seed: int) -> Scenario:
-    """Return the longest gentle scenario that keeps the state in its box, then the least gentle."""
+    """Return the longest gentle scenario that keeps the state in its box, then the least gentle.
+
+    About the nominal state, then about the one that nominal inputs hold.
+    """
+    about, why = [np.zeros(len(model.x))], ""
+    try:
+        about.append(equilibrium(model).x - operating_values(model, "x"))
+    except DerivationError as error:
+        why = f" ({error})"
     for steps in (1000, 300, 100, 50, 25):
-        for share in (0.05, 0.02, 0.005):
-            scenario = gentle(model, steps, seed, share)
+        for share, off in product((0.05, 0.02, 0.005), about):
+            plain = gentle(model, steps, seed, share)
+            scenario = replace(plain, x0=np.add(plain.x0, off), guess=np.add(plain.guess, off))
             try:
                 if simulate(model, kalman, scenario, seed).domain.x_inside.all():
                     return scenario
             except SimulationError:
                 continue
     raise SimulationError(
-        f"{model.name} leaves its box within 25 samples of any gentle scenario: give scenario= of "
-        "inputs that keep it there."
+        f"{model.name} leaves its box within 25 samples of any gentle scenario{why}: give "
+        "scenario= of inputs that keep it there."
     )
 
 

@@ -275,3 +275,27 @@ def test_the_gallery_has_a_table_in_under_five_minutes(name):
     mine = made.index(found.best)
     assert widths[mine].mean() <= 1.05 * min(w.mean() for w in widths)
     assert not any("Error:" in one.reason for one in found.tries)
+
+
+def turning(nominal, middle):
+    """States that turn about a middle, slowly coming nearer."""
+    plant = ob.Plant("turning")
+    a, b = plant.states("a b", range=[(-1, 1)] * 2, nominal=nominal)
+    (f,) = plant.faults("f", range=(-0.01, 0.01), rate=0.001)
+    c, s = 0.99 * np.cos(0.5), 0.99 * np.sin(0.5)
+    da, db = a - middle, b - middle
+    plant.dynamics({a: middle + c * da - s * db + f, b: middle + s * da + c * db}, Ts=1)
+    plant.outputs([a, b])
+    return plant
+
+
+def test_the_common_run_is_where_the_plant_rests():
+    """Mutants: about nominal values alone; about a point of rest where those would do."""
+    few = [ob.IntervalObserver()]
+    found = ob.choose(turning([-0.5, -0.5], 0.6), methods=few)
+    assert found.kalman.run.scenario == "gentle 0" and len(found.kalman.run.t) == 1001
+    assert np.abs(found.kalman.run.x[0] - 0.6).max() < 0.06
+    held = ob.choose(turning([0.55, 0.55], 0.6), methods=few)
+    assert np.abs(held.kalman.run.x[0] - 0.55).max() < 0.051 and held.kalman.run.x[0, 0] < 0.59
+    with pytest.raises(ob.SimulationError, match=r"25 samples .*rests outside the range.*a = 1\.7"):
+        ob.choose(turning([0.0, 0.0], 1.7), methods=few)
