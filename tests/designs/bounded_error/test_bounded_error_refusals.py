@@ -70,8 +70,27 @@ def test_disturbance_without_bound():
 
 
 def test_fault_without_rate():
-    with pytest.raises(ob.StructureError, match="f1"):
-        ob.BoundedErrorUIO().design(tank(rate=None))
+    with pytest.raises(ob.StructureError, match="f1, f2 has no bound"):
+        ob.BoundedErrorUIO().design(tank(outputs=(0, 2), rate=None))
+
+
+def test_faults_without_rate_are_divided_out_where_outputs_show_them():
+    """f2 and the inflow both move tank 3, in no constant ratio: its row is a direction of its own.
+
+    Mutant: what a fault does to another row taken a tenth too small.
+    """
+    observer = ob.BoundedErrorUIO(bounds="peak").design(tank(rate=None))
+    rest, steps = ob.equilibrium(observer.model), 300
+    rng = np.random.default_rng(0)
+    faults = np.vstack([np.zeros(2), rng.uniform(2.0, 3.0, (steps, 2))])
+    near = np.column_stack([rest.x - 1.0, rest.x + 1.0])
+    inputs, inflow = np.tile(rest.u, (steps + 1, 1)), rng.uniform(-0.5, 0.5, (steps + 1, 1))
+    scenario = ob.Scenario(
+        "wild", steps, rest.x, rest.x, inputs, faults, unknown_inputs=inflow, x_range=near
+    )
+    run = ob.simulate(observer.model, observer, scenario, seed=1)
+    assert run.kept and set(run.coverage.values()) == {1.0}
+    assert 0.7 < observer.half_widths[3] < 0.9 and observer.half_widths[4] < 4.0
 
 
 @pytest.mark.parametrize(
