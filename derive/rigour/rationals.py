@@ -181,7 +181,7 @@ def is_positive_definite(matrix: Any) -> bool:
         raise ObsynthError(f"the exact {exact.shape} matrix is not symmetric")
     from flint import fmpz_mat
 
-    rows = exact.entries.numer_denom()[0].tolist()
+    rows = [[int(v) for v in row] for row in exact.entries.numer_denom()[0].tolist()]
     minors = ([row[:k] for row in rows[:k]] for k in range(1, len(rows) + 1))
     return all(fmpz_mat(minor).det() > 0 for minor in minors)
 

@@ -19,6 +19,10 @@ def peak_gain(
     (N, n_w). Infinite where A is not stable.
     """
     modes, rows = np.linalg.eigvals(A), np.arange(len(A))
+    size = np.abs(modes).max(axis=1)
+    unstable = size >= 1.0
+    # their peak is no number, and where a mode lies on the circle there is no inverse
+    A = A / np.where(unstable, 1.001 * size, 1.0)[:, None, None]
     common = np.broadcast_to(np.linspace(0.0, np.pi, FREQUENCIES), (len(A), FREQUENCIES))
     grid, width = np.hstack([common, np.abs(np.angle(modes))]), np.pi / (FREQUENCIES - 1)
     B, C, D = (part if part.ndim == 2 else part[:, None] for part in (B, C, D))
@@ -34,5 +38,4 @@ def peak_gain(
             grid = np.clip(peak[:, None] + np.linspace(-width, width, 11), 0.0, np.pi)
             width *= 0.2
     _, sizes, right = np.linalg.svd(transfer[rows, best])
-    unstable = np.abs(modes).max(axis=1) >= 1.0
     return np.where(unstable, np.inf, sizes[:, 0]), peak, right[:, 0].conj()

@@ -14,6 +14,8 @@ from obsynth.symbolic.errors import ObsynthError
 Result = TypeVar("Result")
 
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0
+# above the logarithm of every double
+_REFUSED = 1e4
 
 
 def bisect_feasible(
@@ -149,17 +151,24 @@ def search_scale(
     rtol: float = 0.005,
     name: str = "search",
 ) -> Search[Result]:
-    """Minimise a positive objective with one minimum between positive ends, to some share of it."""
+    """Minimise a positive objective with one minimum between positive ends, to some share of it.
+
+    What is refused lies above what is not, so that it counts as the worse, the larger it is.
+    """
     from scipy.optimize import minimize_scalar
 
     search = Search(design, objective)
-    with np.errstate(invalid="ignore"):
-        minimize_scalar(
-            lambda logarithm: float(np.log(search.measure(float(np.exp(logarithm))))),
-            bounds=np.log([low, high]),
-            method="bounded",
-            options={"xatol": rtol, "maxiter": 40},
-        )
+
+    def height(logarithm: float) -> float:
+        found = search.measure(float(np.exp(logarithm)))
+        return float(np.log(found)) if found < np.inf else _REFUSED + logarithm
+
+    minimize_scalar(
+        height,
+        bounds=np.log([low, high]),
+        method="bounded",
+        options={"xatol": rtol, "maxiter": 40},
+    )
     search.require(name, low, high)
     return search
 

@@ -80,15 +80,20 @@ def _shown(design: QPVDesign) -> tuple[FloatArray, FloatArray]:
     return np.sqrt(outputs) * _UP, noise * _UP
 
 
+def _region(design: QPVDesign) -> tuple[FloatArray, float]:
+    """Return the inverse of the region's Q, and how far errors in E reach in its norm."""
+    Q, root = design.region.Q, np.linalg.cholesky(np.linalg.inv(design.P))
+    largest = np.linalg.eigvalsh(root.T @ np.linalg.solve(Q, root))[-1]
+    return np.asarray(np.linalg.inv(Q), dtype=np.float64), float(np.sqrt(largest)) * _UP
+
+
 def build_core(design: QPVDesign) -> Core:
     """Build the Runge-Kutta step, readings held, and the bound of V, begun anew after gaps."""
     n, m = len(design.plant.x), len(design.plant.output)
     equations, follow = Equations(design), build_update(design)
     precision, lost = design.precision, of_outputs(design)
     sides, (seen_of_E, noise) = np.sqrt(design.inverse_diagonal) * _UP, _shown(design)
-    Q, root = design.region.Q, np.linalg.cholesky(np.linalg.inv(design.P))
-    inverse_Q: FloatArray = np.asarray(np.linalg.inv(Q), dtype=np.float64)
-    largest = np.sqrt(np.linalg.eigvalsh(root.T @ np.linalg.solve(Q, root))[-1]) * _UP
+    inverse_Q, largest = _region(design)
     ulp, up = Rounding(precision).step, above(precision, 2 * n)
     added = design.rounding * up
 
@@ -111,7 +116,7 @@ def build_core(design: QPVDesign) -> Core:
                 consistent = ca.logic_and(consistent, fits)
         away = _root(inverse_Q, offset, design.region.c, precision)
         if design.bounded:
-            away = away + reach * float(largest)
+            away = away + reach * largest
         x = f = None
         if design.bounded:
             half = ca.DM(sides * up) * reach

@@ -93,6 +93,19 @@ def test_one_minimum_is_found_next_to_values_without_a_design():
         search_scale(lyapunov_trace, float, 0.5, 0.999)
 
 
+@pytest.mark.parametrize("largest", [0.3, 0.003, 2e-4])
+def test_designs_far_below_what_is_refused_are_found(largest):
+    """Mutant: all that is refused as bad as all else that is."""
+
+    def design(gamma):
+        if gamma > largest:
+            raise InfeasibleDesign("too large")
+        return 1.0 / gamma + 1.0 / (1.01 * largest - gamma)
+
+    found = search_scale(design, float, 1e-4, 1.0)
+    assert found.objective < 1.01 * 4.0 / (1.01 * largest)
+
+
 def test_changes_are_listed_and_what_does_not_help_is_said():
     lines = smallest_changes(
         [
