@@ -34,7 +34,8 @@ def exact_inverse(matrix: list[list[Fraction]]) -> list[list[Fraction]]:
 )
 def test_sums_of_powers_are_above_the_exact_ones(values, radius, norm, unit):
     """For A >= 0 the sum of all powers is (I - A)^-1, computed here in fractions."""
-    matrix = np.array(values).reshape(3, 3)
+    # no coefficient is as small as 1e-100, whose balanced size would be lost beside the rest
+    matrix = np.array([value if value > 1e-100 else 0.0 for value in values]).reshape(3, 3)
     matrix *= norm / max(matrix.sum(axis=1).max(), 1e-3)
     matrix[0, 1:] *= unit
     matrix[1:, 0] /= unit
