@@ -15,10 +15,12 @@ def bar() -> Iterator[Callable[..., None]]:
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
     console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        # Progress(disable=True) of Rich before 14.3 writes an empty line at its end
+        yield lambda *_: None
+        return
     columns = (SpinnerColumn(), TextColumn("{task.description:<34}"), BarColumn(28), _times())
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as shown:
+    with Progress(*columns, console=console, transient=True) as shown:
         task = shown.add_task("", total=None)
 
         def say(stage: str, done: float | None = None) -> None:
