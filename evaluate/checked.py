@@ -1,6 +1,7 @@
 """What a simulation is given, checked: the scenario's signals and the observer's functions."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -14,65 +15,15 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 
-WORDS: Mapping[str, str] = {
-    "u": "inputs",
-    "d": "unknown_inputs",
-    "f": "faults",
-    "w": "disturbances",
-    "rho": "scheduling",
-}
-"""What a scenario calls each group of signals, in the order in which plants take them."""
-
 _INPUTS = ("memory", "u", "y")
 
 
 def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, FloatArray]:
-    """Return the scenario's signals as checked arrays of N + 1 samples; no u in a feedback."""
+    """Return the scenario's signals as arrays of N + 1 samples; no u in a feedback."""
     if isinstance(seed, bool) or int(seed) != seed or seed < 0:
         raise SimulationError(f"seed={seed!r} is not a whole number from 0 on.", seed=seed)
-    arrays: Mapping[str, Any] = scenario.arrays(model, int(seed))
-    fields: dict[str, FloatArray] = {}
-    for key, word in WORDS.items():
-        names = model.names(key)
-        value = arrays.get(key)
-        if value is None:
-            if key == "u" and scenario.feedback:
-                continue
-            if names:
-                raise SimulationError(
-                    f"scenario {scenario.name!r} gives no {word} for {', '.join(names)}.",
-                    field=word,
-                )
-            value = np.empty((scenario.steps + 1, 0))
-        fields[key] = _checked(value, (scenario.steps + 1, len(names)), word, names)
-    return fields
-
-
-def _checked(value: Any, shape: tuple[int, int], word: str, names: tuple[str, ...]) -> FloatArray:
-    try:
-        array = np.array(value, dtype=float, order="C")
-    except (TypeError, ValueError) as error:
-        raise SimulationError(
-            f"the {word} are no array of numbers: {error}.", field=word
-        ) from error
-    if array.shape != shape:
-        raise SimulationError(
-            f"the {word} have shape {array.shape}; {shape} is needed: one row for each of the "
-            f"{shape[0]} samples, one column for each of {', '.join(names) or 'no signal'}.",
-            field=word,
-            shape=array.shape,
-        )
-    bad = np.argwhere(~np.isfinite(array))
-    if bad.size:
-        k, i = (int(v) for v in bad[0])
-        raise SimulationError(
-            f"the {word} are not finite: {names[i]} is {array[k, i]} at k = {k} "
-            f"({len(bad)} such values in all).",
-            field=word,
-            symbol=names[i],
-            instant=k,
-        )
-    return array
+    arrays = scenario.arrays(model, int(seed)).items()
+    return {key: np.array(value) for key, value in arrays if value is not None}
 
 
 def vector(value: Any, names: tuple[str, ...], word: str) -> FloatArray:
@@ -80,38 +31,17 @@ def vector(value: Any, names: tuple[str, ...], word: str) -> FloatArray:
     row: FloatArray = np.asarray(value, dtype=float)
     if row.shape != (len(names),):
         raise SimulationError(
-            f"{word} has shape {row.shape}; one number for each of {', '.join(names)} is needed.",
+            f"{word} has shape {row.shape}; one number for each of "
+            f"{', '.join(names) or 'no signal'} is needed.",
             field=word,
             shape=row.shape,
         )
-    return _checked(row.reshape(1, -1), (1, len(names)), word, names).reshape(-1)
-
-
-def function_values(
-    function: Callable[[float], Any], points: FloatArray, names: tuple[str, ...], word: str
-) -> FloatArray:
-    """Return a function of the real-valued k at many points, one row for each."""
-    rows = [np.ravel(np.asarray(function(k), dtype=float)) for k in points.tolist()]
-    for k, row in zip(points, rows, strict=True):
-        if row.shape != (len(names),):
+    for name, number in zip(names, row.tolist(), strict=True):
+        if not math.isfinite(number):
             raise SimulationError(
-                f"the {word} at k = {k:g} are {row.size} numbers; one for each of "
-                f"{', '.join(names) or 'no signal'} is needed.",
-                field=word,
-                shape=row.shape,
+                f"{word}: {name} is {number}, no finite number.", field=word, symbol=name
             )
-    values: FloatArray = np.array(rows)
-    bad = np.argwhere(~np.isfinite(values))
-    if bad.size:
-        row_of, i = (int(v) for v in bad[0])
-        raise SimulationError(
-            f"the {word} are not finite: {names[i]} is {values[row_of, i]} at k = "
-            f"{points[row_of]:.12g}.",
-            field=word,
-            symbol=names[i],
-            instant=float(points[row_of]),
-        )
-    return values
+    return row
 
 
 def finite(values: FloatArray, names: tuple[str, ...]) -> None:

@@ -1,8 +1,8 @@
 """Plant and continuous-time observer as one differential equation."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -11,11 +11,9 @@ from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import MEAN_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
-    WORDS,
     broken_assumptions,
     finite,
     first_memory,
-    function_values,
     refuse_algebraic_loop,
     scenario_fields,
     scheduling_columns,
@@ -34,6 +32,8 @@ from obsynth.evaluate.truth import (
 )
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.discretise import runge_kutta
+from obsynth.symbolic.scenario import WORDS
 
 # Runge-Kutta steps evaluated in one call; bounds what the signals' values take of memory.
 _CHUNK = 8192
@@ -215,7 +215,8 @@ def _stages(
         points = np.arange(2 * per * begin, 2 * per * end + 1) / (2.0 * per)
         for key, function in scenario.functions.items():
             names = system.model.names(key)
-            values = function_values(function, points, names, WORDS[key])
+            rows = ((k, np.ravel(function(k))) for k in points.tolist())
+            values = np.array([vector(r, names, f"{WORDS[key]} at k = {k:.12g}") for k, r in rows])
             first[:, columns[key]] = values[:-1:2]
             middle[:, columns[key]] = values[1::2]
             last[:, columns[key]] = values[2::2]
@@ -249,18 +250,9 @@ def _with_signals(
 def _runge_kutta(system: _System) -> ca.Function:
     z = ca.MX.sym("z", system.n_x + system.n_memory)
     first, middle, last = (ca.MX.sym(name, system.n_v) for name in ("first", "middle", "last"))
-    h, rates = system.h, _called(system.rates)
-    k1 = rates(z, first)
-    k2 = rates(z + h / 2 * k1, middle)
-    k3 = rates(z + h / 2 * k2, middle)
-    k4 = rates(z + h * k3, last)
-    following = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    at, rates = iter((first, middle, middle, last)), cast(Any, system.rates)
+    following = runge_kutta(lambda stage: rates(stage, next(at)), z, system.h)
     return _scalar(ca.Function("step", [z, first, middle, last], [following]))
-
-
-def _called(function: ca.Function) -> Callable[..., Any]:
-    # CasADi's stubs do not know that a call of symbols returns symbols.
-    return function
 
 
 def _with_feedback(
@@ -268,81 +260,32 @@ def _with_feedback(
 ) -> FloatArray:
     """Integrate with inputs that read the output of every stage; return z, and u in the fields."""
     refuse_algebraic_loop(scenario, system.plant)
-    model = system.model
-    names = model.names("u")
-    n_u = len(names)
-    u = fields["u"] = np.zeros((scenario.steps + 1, n_u))
+    names, per, law = system.model.names("u"), system.substeps, cast(Any, scenario.inputs)
+    u = fields["u"] = np.zeros((scenario.steps + 1, len(names)))
     samples = _samples(fields)
-    loop = _Stages(system)
-    law: Any = scenario.inputs
+    measure, move = Call(system.output), Call(system.rates)
 
-    def control(k: float) -> FloatArray:
-        value = np.asarray(law(k, loop.y.copy()), dtype=float)
-        if value.shape == (n_u,) and np.isfinite(value.sum()):
-            return value
-        return vector(value, names, f"inputs at k = {k:.12g}")
+    def control(at: float, z: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the inputs where the others of the signals v are known, as y does not need u."""
+        measure.args[0][:], measure.args[1][:] = z, v
+        measure.evaluate()
+        return vector(law(at, measure.results[0].copy()), names, f"inputs at k = {at:.12g}")
 
-    z = np.empty((scenario.steps + 1, loop.z.size))
-    z[0] = loop.z[:] = system.start(observer, scenario, samples[0])
-    per, v = system.substeps, loop.v
-    for begin, _, (first, middle, last) in _stages(system, scenario, samples):
-        for j in range(len(first)):
-            k, within = begin + j // per, 2 * (j % per)
-            points = [(2 * per * k + within + i) / (2.0 * per) for i in range(3)]
-            v[:] = first[j]
-            loop.measure.evaluate()
-            for stage, now, ahead, at in zip(
-                loop.stages,
-                (first, middle, middle, last),
-                (middle, middle, last, last),
-                (0, 1, 1, 2),
-                strict=True,
-            ):
-                v[:] = now[j]
-                v[:n_u] = control(points[at])
-                loop.next_v[:] = ahead[j]
-                stage.evaluate()
-                if at == within == 0:
-                    u[k] = v[:n_u]
-            loop.z[:] = loop.next_z
-            if within == 2 * (per - 1):
-                z[k + 1] = loop.z
-    v[:] = samples[-1]
-    loop.measure.evaluate()
-    u[-1] = control(float(scenario.steps))
+    def rates(z: FloatArray) -> FloatArray:
+        point, v = next(ahead)
+        move.args[0][:], move.args[1][:] = z, v
+        move.args[1][: len(names)] = value = control(point / (2.0 * per), z, v)
+        if point % (2 * per) == 0 and v is first:
+            u[point // (2 * per)] = value
+        move.evaluate()
+        return move.results[0].copy()
+
+    z = np.empty((scenario.steps + 1, system.n_x + system.n_memory))
+    z[0] = now = system.start(observer, scenario, samples[0])
+    for begin, _, stages in _stages(system, scenario, samples):
+        for j, (first, middle, last) in enumerate(zip(*stages, strict=True), begin * per):
+            points = (2 * j, 2 * j + 1, 2 * j + 1, 2 * j + 2)
+            ahead = zip(points, (first, middle, middle, last), strict=True)
+            now = z[j // per + 1] = runge_kutta(rates, now, system.h)
+    u[-1] = control(float(scenario.steps), now, samples[-1])
     return z
-
-
-class _Stages:
-    """The stages of one Runge-Kutta step on shared buffers; each leaves the next one's output in y.
-
-    As y does not depend on u, the output of the next stage can be taken before u is known.
-    """
-
-    def __init__(self, system: _System) -> None:
-        h, rates, output = system.h, _called(system.rates), _called(system.output)
-        n_z = system.n_x + system.n_memory
-        z, k1, k2, k3 = (ca.MX.sym(name, n_z) for name in ("z", "k1", "k2", "k3"))
-        v, ahead = ca.MX.sym("v", system.n_v), ca.MX.sym("ahead", system.n_v)
-        self.z, self.next_z, *slopes = (np.zeros(n_z) for _ in range(5))
-        self.v, self.next_v = np.zeros(system.n_v), np.zeros(system.n_v)
-        self.y = np.zeros(len(system.model.output_names))
-        now = [self.z, self.v]
-
-        def stage(
-            inputs: list[Any], outputs: list[Any], args: list[FloatArray], results: list[FloatArray]
-        ) -> Call:
-            return Call(_scalar(ca.Function("stage", inputs, outputs)), args, results)
-
-        self.measure = stage([z, v], [output(z, v)], now, [self.y])
-        self.stages = []
-        earlier: list[Any] = []
-        reached, buffers = z, earlier[:]
-        for k, weight, slope in zip((k1, k2, k3), (h / 2, h / 2, h), slopes, strict=True):
-            rate = rates(reached, v)
-            after = output(z + weight * rate, ahead)
-            given, shared = [z, v, *earlier, ahead], [*now, *buffers, self.next_v]
-            self.stages.append(stage(given, [rate, after], shared, [slope, self.y]))
-            reached, earlier, buffers = z + weight * k, [k], [slope]
-        following = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(reached, v))
-        self.stages.append(stage([z, v, k1, k2, k3], [following], [*now, *slopes], [self.next_z]))

@@ -9,7 +9,6 @@ from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
-    WORDS,
     broken_assumptions,
     claims_of,
     finite,
@@ -28,6 +27,7 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Truth
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.scenario import WORDS
 from obsynth.symbolic.taking import takes
 
 

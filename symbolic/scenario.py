@@ -14,13 +14,14 @@ from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import labelled
 
-_FIELDS = {
+WORDS = {
     "u": "inputs",
     "d": "unknown_inputs",
     "f": "faults",
     "w": "disturbances",
     "rho": "scheduling",
 }
+"""What a scenario calls each kind of signals, in the order in which plants take them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,7 +129,7 @@ class Scenario(Tabled):
         >>> list(sine.functions)
         ['u']
         """
-        given: dict[str, Any] = {key: getattr(self, field) for key, field in _FIELDS.items()}
+        given: dict[str, Any] = {key: getattr(self, field) for key, field in WORDS.items()}
         if self.feedback:
             del given["u"]
         if callable(self.disturbances) and self._sampled:

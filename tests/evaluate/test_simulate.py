@@ -203,32 +203,6 @@ def test_a_feedback_that_returns_nonsense_is_refused_with_its_instant(toy):
         simulate(toy.plant, observer, misshapen)
 
 
-def test_arrays_of_a_foreign_scenario_are_checked_again(toy):
-    class Foreign:
-        name, steps, feedback, inputs = "foreign", 3, False, None
-        x0, guess, x_range, f_range = [0.0, 0.0], [0.0, 0.0], None, None
-
-        def __init__(self, **arrays):
-            self.given = arrays
-
-        def arrays(self, model, seed):
-            fields = {key: np.zeros((4, 1)) for key in "udfw"}
-            return {**fields, "rho": np.zeros((4, 0)), **self.given}
-
-    observer = toy.observer(toy.plant)
-    assert simulate(toy.plant, observer, Foreign()).x.shape == (4, 2)
-    with pytest.raises(SimulationError, match="gives no faults for f"):
-        simulate(toy.plant, observer, Foreign(f=None))
-    with pytest.raises(SimulationError, match=r"faults have shape \(3, 1\); \(4, 1\) is needed"):
-        simulate(toy.plant, observer, Foreign(f=np.zeros((3, 1))))
-    nan = np.zeros((4, 1))
-    nan[2] = np.nan
-    with pytest.raises(SimulationError, match="not finite: w is nan at k = 2"):
-        simulate(toy.plant, observer, Foreign(w=nan))
-    with pytest.raises(SimulationError, match="no array of numbers"):
-        simulate(toy.plant, observer, Foreign(d=["a"] * 4))
-
-
 def test_another_plant_is_refused_with_both_lists_of_names(toy):
     other = Plant("other")
     (a,) = other.states("a", range=(0, 1))
