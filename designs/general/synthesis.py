@@ -4,7 +4,7 @@ The unknowns are scaled by bounds that some gain already has where there is one:
 identity. Scaled by ranges alone, a solver has called values optimal that were a tenth off.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -26,8 +26,8 @@ from obsynth.symbolic.arrays import FloatArray, IntArray
 MARGIN = 1e-7
 # An answer with such a gap of the objective serves, as a proof follows.
 GAP = 1e-5
-# Of the search for gamma: the first step, and the gain that is worth another solve.
-STEP, WORTH, MOST = 1.8, 2e-3, 9
+# Of the search for gamma: the first step, what is worth another, what may be missed, most solves.
+STEP, WORTH, ENOUGH, MOST = 1.8, 2e-3, 0.02, 12
 LEAST_GAMMA, LARGEST_GAMMA = 1e-5, 0.98
 # What keeps rounded weights inside the simplex.
 BELOW_ONE = 1.0 - 2.0**-44
@@ -298,34 +298,58 @@ def guess_gamma(stated: Stated, weights: FloatArray) -> float:
 def search_gamma(
     solve: Callable[[float], tuple[float, Found] | None], start: float
 ) -> Found | None:
-    """Walk from a guess to the smallest size, and once to where a parabola has its minimum."""
-    tried: dict[int, tuple[float, Found] | None] = {}
+    """Walk from a guess to the smallest size, then on while the secants leave room for less."""
+    tried: dict[float, tuple[float, Found] | None] = {}
 
-    def at(step: int) -> float:
+    def at(step: float) -> float:
         if step not in tried:
             gamma = start * STEP**step
             fits = LEAST_GAMMA <= gamma <= LARGEST_GAMMA
             tried[step] = solve(gamma) if fits and len(tried) < MOST else None
         found = tried[step]
-        return np.inf if found is None else found[0]
+        return np.inf if found is None else float(np.log(found[0]))
 
-    place = 0
+    place = 0.0
     while at(place) == np.inf and start * STEP ** (place - 3) >= LEAST_GAMMA and len(tried) < MOST:
         place -= 3
     if at(place) == np.inf:
         return None
     way = 1 if at(place + 1) < at(place) else -1
-    while at(place + way) < at(place) * (1.0 - WORTH):
+    while at(place + way) < at(place) - WORTH:
         place += way
-    low, middle, high = (np.log(at(place + k)) for k in (-1, 0, 1))
-    best = min((pair for pair in tried.values() if pair is not None), key=lambda pair: pair[0])
-    if np.isfinite([low, high]).all() and low + high - 2.0 * middle > 0.0:
-        shift = 0.5 * (low - high) / (low + high - 2.0 * middle)
-        won = 0.5 * (low + high - 2.0 * middle) * shift**2
-        last = solve(start * STEP ** (place + shift)) if won > WORTH else None
-        if last is not None and last[0] < best[0]:
-            best = last
-    return best[1]
+    sizes = {step: at(step) for step in (place - 1, place, place + 1, *tried)}
+    while len(tried) < MOST and (probe := _next_step(sizes)) is not None:
+        sizes[probe] = at(probe)
+    return min((pair for pair in tried.values() if pair is not None), key=lambda pair: pair[0])[1]
+
+
+def _next_step(sizes: Mapping[float, float]) -> float | None:
+    """Return where the logarithm of a size, were it convex, could be less by `ENOUGH`.
+
+    A jump up, or an end of what is feasible, leaves no room beyond and all on this side.
+    """
+    steps = sorted(sizes)
+    k = min(range(1, len(steps) - 1), key=lambda k: sizes[steps[k]])
+    best, rooms = steps[k], []
+    for way in (-1, 1):
+        near, far, beyond = steps[k + way], steps[k - way], k + 2 * way
+        length, slope = abs(best - near), (sizes[far] - sizes[best]) / abs(best - far)
+        room = slope * length
+        if slope == np.inf and 0 <= beyond < len(steps) and sizes[near] < np.inf:
+            slope = (sizes[steps[beyond]] - sizes[near]) / abs(near - steps[beyond])
+            room = sizes[best] - sizes[near] + slope * length
+        if room > ENOUGH:
+            rooms.append((room, near))
+    if not rooms:
+        return None
+    near = max(rooms)[1]
+    a, b = best - steps[k - 1], steps[k + 1] - best
+    left, right = (sizes[steps[j]] - sizes[best] for j in (k - 1, k + 1))
+    if left + right < np.inf:
+        share = 0.5 * (left * b**2 - right * a**2) / (left * b + right * a) / (near - best)
+        if 0.2 <= share <= 0.8:
+            return best + share * (near - best)
+    return 0.5 * (best + near)
 
 
 def solve_energy(
