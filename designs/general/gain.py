@@ -25,8 +25,9 @@ SLOWEST = LEFT ** (1.0 / MOST_STEPS)
 INFEASIBLE = 1e9
 INFLATIONS = (1.0, 10.0, 0.1, 100.0)
 ERRORS = (0.02, 0.2)
-# Of every state; the second where constants, which nothing drives, would be found too slowly.
-LEAST_NOISE = (1e-10, 1e-4)
+# Noise of every state and the decay that is asked for: what comes after the first pair is for
+# errors that it leaves too slow to be summed, as of constants, which nothing drives.
+STARTS = ((1e-10, 1.0), (1e-4, 1.0), (1e-10, SLOWEST), (1e-10, 0.99))
 # Evaluations of a search, and numbers that all of them together may handle.
 MOST_EVALUATIONS, WORK = 1500, 6e10
 SMALL = 1e-12
@@ -279,14 +280,16 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
             floor = max(float(np.trace(noise)) / max(len(noise), 1), 1e-9)
             noise = noise + 1e-5 * floor * np.eye(len(noise))
             C = data.C0 @ data.T
-            for least in LEAST_NOISE:
+            for least, decay in STARTS:
+                # the filter of A / decay leaves errors of A that fall at least so fast
                 try:
-                    X = solve_discrete_are(AT.T, C.T, Q @ Q.T + least * np.eye(N), noise)
+                    X = solve_discrete_are(AT.T / decay, C.T, Q @ Q.T + least * np.eye(N), noise)
                     Z = X @ C.T @ np.linalg.inv(C @ X @ C.T + noise)
                 except np.linalg.LinAlgError:
                     continue
                 yield Z
-                if spectral_radius(AT - Z @ (data.C0 @ AT)) < SLOWEST:
+                fast = spectral_radius(AT - Z @ (data.C0 @ AT)) < SLOWEST
+                if fast and (least, decay) == STARTS[0]:
                     break
 
 

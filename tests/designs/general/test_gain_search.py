@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import sympy as sp
 
+import obsynth as ob
 from methods import motor
 from obsynth.designs.general.gain import GainSearch, find_gain, riccati_starts, scaled
 from obsynth.designs.general.method import bound_peak
@@ -57,3 +59,31 @@ def test_no_neighbour_of_what_is_found_is_better_and_the_same_is_found_again(des
     for _ in range(20):
         moved = Z * (1 + 0.01 * rng.standard_normal(Z.shape))
         assert search.value(search.data.gain(moved)).mean > best * (1 - 1e-4)
+
+
+def quarter_car() -> ob.Plant:
+    """A suspension over an unknown road, whose actuator loses force slowly; steps of 1 ms."""
+    plant = ob.Plant("quarter car")
+    ranges = [(-0.15, 0.15), (-1.5, 1.5), (-0.1, 0.1), (-3, 3)]
+    zs, vs, zu, vu = plant.states("zs vs zu vu", range=ranges)
+    (u,) = plant.inputs("u", range=(-1000, 1000))
+    (road,) = plant.unknown_inputs("road")
+    plant.actuator_faults("f", of=u, rate=20, range=(-500, 500))
+    n1, n2, n3 = plant.disturbances("n1 n2 n3", bound=[0.001, 0.001, 0.01])
+    d, v = zs - zu, vs - vu
+    force = 16000 * d + 100000 * d**3 + 1000 * v + 300 * v * sp.tanh(5 * v)
+    tyre = 160000 * (road - zu)
+    plant.dynamics({zs: vs, vs: (u - force) / 300, zu: vu, vu: (force - u + tyre) / 40})
+    plant.outputs([d + n1, zu + n2, vu + n3])
+    return plant.discretise("euler", Ts=0.001)
+
+
+def test_starts_that_are_too_slow_are_asked_for_a_decay():
+    """Mutant: no decay is asked for; then no start holds, and f is said to be in its range."""
+    design = read(quarter_car()).design
+    data = scaled(design)
+    search = GainSearch(data, np.full(design.size, 1.0 / design.size))
+    found = [search.value(Z) for Z in riccati_starts(data)]
+    assert not np.isfinite(found[0].mean)
+    best = min(found, key=lambda value: value.mean)
+    assert best.radius < 0.998 and best.b[-1] < 0.4  # of the range of f; .21 once searched
