@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
-from obsynth.derive.algebra.sizes import size
+from obsynth.derive.algebra.sizes import size, text
 from obsynth.derive.algebra.slopes import jacobian
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem
@@ -108,7 +108,7 @@ class MatrixEntries:
             box = {name: whole[name] for name in self.support(place)}
             name = f"{what}[{place[0] + 1},{place[1] + 1}]"
             where = ", ".join(f"{s} in [{lo:.9g}, {hi:.9g}]" for s, (lo, hi) in box.items())
-            shown = f" = {self.exact[place]}" if size(self.exact[place]) <= _SHORT else ""
+            shown = f" = {text(self.exact[place])}" if size(self.exact[place]) <= _SHORT else ""
             lines.append(f"{name}{shown} ({failure.operation} at {where})")
             boxes[name] = box
         raise UnboundedError(
