@@ -225,54 +225,30 @@ def _fields(layout: Mapping[str, slice]) -> tuple[Field, ...]:
 
 def _scheduling(step: ca.Function, model: Plant) -> tuple[int, ...]:
     """Return the places of the scheduling signals that a step reads as theta."""
-    if step.n_in() < len(STEP_INPUTS):
+    if STEP_INPUTS[-1] not in step.name_in():
         return ()
-    last = step.name_in()[-1]
-    if last != "theta":
-        raise CodegenError(
-            f"the last input of the step is called {last!r}; a fourth input has to be theta, the"
-            " measured scheduling signals",
-            symbol=last,
-        )
-    measured = tuple(i for i, signal in enumerate(model.rho) if signal.measured)
-    if not measured:
-        raise CodegenError(
-            f"the step reads theta, but {model.name!r} declares no measured scheduling signal:"
-            " declare them by plant.scheduling(...)",
-            symbol="theta",
-        )
-    return measured
+    return tuple(i for i, signal in enumerate(model.rho) if signal.measured)
 
 
 def _check_step(step: ca.Function, model: Plant, n_memory: int, n_theta: int) -> None:
+    """Refuse a step that takes or returns other numbers than its plant and memory have."""
     n, n_f = len(model.x), len(model.f)
-    inputs, outputs = tuple(step.name_in()), tuple(step.name_out())
-    names = STEP_INPUTS if n_theta else STEP_INPUTS[:-1]
-    expected_in = (n_memory, len(model.u), len(model.output_names)) + (n_theta,) * bool(n_theta)
-    behind = outputs[len(STEP_OUTPUTS) :]
+    behind = tuple(step.name_out()[len(STEP_OUTPUTS) :])
     behind = behind if behind in FURTHER_OUTPUTS else ()
-    lengths = (n_f, n_f, n_f, 1)[: len(behind)]
-    results = (*STEP_OUTPUTS, *behind)
-    expected_out = (n_memory, n, n_f, n, n, n_f, n_f, 1, *lengths)
-    found_in = tuple(step.numel_in(i) for i in range(step.n_in()))
-    found_out = tuple(step.numel_out(i) for i in range(step.n_out()))
-    if len(inputs) != len(names) or len(outputs) != len(results):
-        raise CodegenError(
-            f"the step maps {inputs} to {outputs}; it has to map {names} to {results}"
-        )
-    for name, found, expected in zip(
-        (*names, *(f"the returned {name}" for name in results)),
-        (*found_in, *found_out),
-        (*expected_in, *expected_out),
-        strict=True,
-    ):
-        if found != expected:
+    takes = dict(zip(STEP_INPUTS, (n_memory, len(model.u), len(model.output_names)), strict=False))
+    takes |= {STEP_INPUTS[-1]: n_theta} if n_theta else {}
+    gives = dict(zip(STEP_OUTPUTS, (n_memory, n, n_f, n, n, n_f, n_f, 1), strict=True))
+    gives |= dict(zip(behind, (n_f, n_f, n_f, 1), strict=False))
+    found_in = [step.numel_in(i) for i in range(step.n_in())]
+    found_out = [step.numel_out(i) for i in range(step.n_out())]
+    for word, wanted, found in (("takes", takes, found_in), ("returns", gives, found_out)):
+        if found != [*wanted.values()]:
+            told = ", ".join(f"{name} ({size})" for name, size in wanted.items())
             raise CodegenError(
-                f"{name} of the step has {found} entries; the plant {model.name!r} and the"
-                f" memory layout ask for {expected}",
-                symbol=name,
+                f"the step {word} vectors of {found} numbers; the plant {model.name!r} and the"
+                f" memory layout ask for {told}",
                 found=found,
-                expected=expected,
+                expected=wanted,
             )
 
 

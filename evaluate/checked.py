@@ -15,8 +15,6 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 
-_INPUTS = ("memory", "u", "y")
-
 
 def scenario_fields(model: Plant, scenario: Scenario, seed: int) -> dict[str, FloatArray]:
     """Return the scenario's signals as arrays of N + 1 samples; no u in a feedback."""
@@ -121,22 +119,18 @@ def claims_of(step: ca.Function, log: FloatArray) -> dict[str, FloatArray]:
 
 def scheduling_columns(function: ca.Function, model: Plant, word: str) -> list[int]:
     """Return which scheduling signals step or ode reads; refuse inputs that do not fit."""
-    given = tuple(function.name_in())
-    if given[:3] != _INPUTS or given[3:] not in ((), ("theta",)):
+    columns = [i for i, signal in enumerate(model.rho) if signal.measured]
+    columns = columns if "theta" in function.name_in() else []
+    sizes = (function.numel_in(0), len(model.u), len(model.output_names), len(columns))
+    names = ("memory", "u", "y", *(["theta"] if columns else []))
+    wanted = dict(zip(names, sizes, strict=False))
+    given = {name: function.numel_in(name) for name in function.name_in()}
+    if given != wanted:
+        told = [", ".join(f"{name}: {size}" for name, size in d.items()) for d in (given, wanted)]
         raise SimulationError(
-            f"the observer's {word} takes ({', '.join(given)}); (memory, u, y[, theta]) is needed.",
-            given=given,
+            f"the observer's {word} takes ({told[0]}) numbers; ({told[1]}) are needed.",
+            given=tuple(given),
         )
-    measured = [i for i, signal in enumerate(model.rho) if signal.measured]
-    columns = measured if len(given) == 4 else []
-    counts = {"u": len(model.u), "y": len(model.output_names), "theta": len(columns)}
-    for i, name in enumerate(given[1:], start=1):
-        if function.numel_in(i) != counts[name]:
-            raise SimulationError(
-                f"the observer's {word} takes {function.numel_in(i)} numbers as {name}; the model "
-                f"has {counts[name]}.",
-                field=name,
-            )
     return columns
 
 

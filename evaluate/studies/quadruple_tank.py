@@ -29,17 +29,18 @@ GAMMA = 0.005
 OWN: dict[str, Any] = {"cuts": (), "horizon": 10**9}
 
 BEFORE, ELLIPSOID, PEAK = "(51), repaired", "ellipsoid", "peak"
-# The stages with their share of the time, for progress bars.
-STAGES = {
-    "deriving bounds with proof": 2,
-    "asking for the printed design": 1,
-    "designing by (51), repaired": 5,
-    "designing the ellipsoid": 3,
-    "designing for peak bounds": 12,
-    "simulating": 2,
-    "writing and comparing the C code": 6,
-    "writing the report": 8,
-}
+STAGES = (
+    ("deriving bounds with proof", 0.0),
+    ("asking for the printed design", 0.05),
+    ("designing by (51), repaired", 0.08),
+    ("designing the ellipsoid", 0.21),
+    ("designing for peak bounds", 0.28),
+    ("simulating", 0.59),
+    ("writing and comparing the C code", 0.64),
+    ("writing the report", 0.79),
+    ("done", 1.0),
+)
+"""The stages with the share of the time that is over when they begin, for progress bars."""
 
 RUN = "obsynth run"
 """What the manifest of a study's folder says that it is."""
@@ -86,7 +87,7 @@ class QuadrupleTank:
             claims_table("What the paper prints, and what holds", self.claims),
             width_table(self.designs),
             coverage_summary(self.runs),
-            code_table(self.project),
+            self.project.table(),
         ]
 
 
@@ -105,7 +106,11 @@ def quadruple_tank(
     if seeds < 1:
         raise SimulationError(f"seeds={seeds}; at least one noise seed is needed.", seeds=seeds)
     cases = [shortened(name, steps) for name in ("FS1", "FS2")]
-    say = _stages(progress)
+
+    def say(i: int) -> None:
+        if progress is not None:
+            progress(*STAGES[i])
+
     with complete_folder(folder, RUN) as place:
         say(0)
         parts = split(tank())
@@ -137,20 +142,8 @@ def quadruple_tank(
         )
         say(7)
         _write(study, place / "report.html")
-    if progress is not None:
-        progress("done", 1.0)
+    say(8)
     return study
-
-
-def _stages(progress: Progress | None) -> Callable[[int], None]:
-    words, shares = list(STAGES), np.array(list(STAGES.values()), dtype=float)
-    done = np.concatenate([[0.0], np.cumsum(shares)]) / shares.sum()
-
-    def say(i: int) -> None:
-        if progress is not None:
-            progress(words[i], float(done[i]))
-
-    return say
 
 
 def _runs(observer: Observer, cases: Sequence[Scenario], seeds: int) -> tuple[Run, ...]:
@@ -212,21 +205,6 @@ def width_table(designs: Mapping[str, Observer]) -> Table:
         rows,
         marked=[len(rows) - 1],
     )
-
-
-def code_table(project: CProject) -> Table:
-    """Say what the C project is and how it was compared."""
-    rows: list[list[Any]] = [["operations of one step", str(project.operations)]]
-    if project.build is not None and project.comparison is not None:
-        rows += [
-            ["compiler", project.build.compiler],
-            ["flags", " ".join(project.build.flags)],
-            ["steps compared with CasADi", f"{project.comparison.vectors:,}"],
-            ["values equal to the last bit", f"{project.comparison.values:,} of them, all"],
-        ]
-    else:
-        rows.append(["comparison", "not done: no C compiler found"])
-    return Table("C project", ["", ""], rows)
 
 
 def half_widths(observer: Observer) -> FloatArray:

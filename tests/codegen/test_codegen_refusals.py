@@ -43,7 +43,7 @@ def test_a_fault_delay_of_two(toy: Any, tmp_path: Path) -> None:
         ("z", slice(5, 6), "without gaps"),
         ("z", slice(4, 6, 2), "without gaps"),
         ("z", slice(4, None), "without gaps"),
-        ("z", slice(4, 5), "memory of the step has 6 entries"),
+        ("z", slice(4, 5), r"takes vectors of \[6, 1, 2\] numbers; .* ask for memory \(5\)"),
     ],
 )
 def test_a_layout_that_does_not_cover_the_memory(
@@ -61,8 +61,8 @@ def test_an_empty_layout(toy: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"xhat": ca.SX(3, 1)}, "returned xhat of the step has 3 entries"),
-        ({"status": ca.SX(2, 1)}, "returned status"),
+        ({"xhat": ca.SX(3, 1)}, r"returns vectors of \[6, 3, .*xhat \(2\)"),
+        ({"status": ca.SX(2, 1)}, r"returns vectors of .*, 2\] .*status \(1\)"),
     ],
 )
 def test_a_step_of_other_sizes(
@@ -75,7 +75,7 @@ def test_a_step_of_other_sizes(
 def test_a_step_with_other_outputs(toy: Any, tmp_path: Path) -> None:
     x = ca.SX.sym("x")
     toy.step = ca.Function("step", [x], [x])
-    refused(toy, tmp_path / "p", "has to map")
+    refused(toy, tmp_path / "p", r"takes vectors of \[1\]")
 
 
 def test_zeros_have_to_count_as_not_initialised(toy: Any, make_step: Any, tmp_path: Path) -> None:

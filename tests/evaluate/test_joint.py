@@ -319,7 +319,7 @@ def test_refusals():
     with pytest.raises(SimulationError, match="takes 3 numbers as memory and returns 2"):
         simulate(plant, luenberger(plant, ode=short), scenario(), engine="joint")
     unnamed = ca.Function("ode", [m, u, y], [m])
-    with pytest.raises(SimulationError, match=r"ode takes \(i0, i1, i2\)"):
+    with pytest.raises(SimulationError, match=r"ode takes \(i0: \d, i1: 1, i2: 1\)"):
         simulate(plant, luenberger(plant, ode=unnamed), scenario(), engine="joint")
 
 

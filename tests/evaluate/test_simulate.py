@@ -267,7 +267,7 @@ def test_wrong_step_signatures_are_refused(toy):
             good = super().step
             return ca.Function("s", good.sx_in(), good.call(good.sx_in()))
 
-    with pytest.raises(SimulationError, match=r"step takes \(i0, i1, i2\)"):
+    with pytest.raises(SimulationError, match=r"step takes \(i0: \d, i1: 1, i2: 1\)"):
         simulate(toy.plant, Renamed(toy.plant), toy.scenario())
 
     class Short(toy.observer):

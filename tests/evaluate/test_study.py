@@ -72,7 +72,7 @@ def test_tables_and_page_say_what_the_paper_prints_and_what_holds(study):
         "too narrow",
         "infeasible for every γ and gain",
         "100 %",
-        "flags",
+        "-std=c99",
     ):
         assert expected in text, expected
         assert expected in page, expected
