@@ -2,16 +2,13 @@
 
 from collections.abc import Callable
 from functools import cache
-from importlib.resources import files
 
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.plant_file import PlantText
-from obsynth.symbolic.plants.bicycle import bicycle
-from obsynth.symbolic.plants.hinf_example import hinf_example
-from obsynth.symbolic.plants.leaking_tanks import leaking_tanks
 from obsynth.symbolic.plants.planar_arm import planar_arm, planar_arm_bias, planar_arm_terms
 from obsynth.symbolic.plants.tanks_in_a_row import tanks_in_a_row
-from obsynth.symbolic.plants.van_der_pol import van_der_pol
+from obsynth.symbolic.plants.variants import bicycle, hinf_example, leaking_tanks, van_der_pol
+from obsynth.symbolic.plants.variants import text as text
 
 __all__ = [
     "battery",
@@ -46,11 +43,6 @@ __all__ = [
     "van_der_pol",
     "water_tanks",
 ]
-
-
-def text(name: str) -> str:
-    """Return the text of a plant that is one, to begin one's own from."""
-    return (files(__name__) / f"{name}.toml").read_text(encoding="utf-8")
 
 
 @cache
