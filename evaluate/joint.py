@@ -11,8 +11,6 @@ from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import MEAN_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
-    broken_assumptions,
-    finite,
     first_memory,
     refuse_algebraic_loop,
     scenario_fields,
@@ -64,19 +62,15 @@ def joint(
     n = len(model.x)
     x, memory = np.ascontiguousarray(z[:, :n]), np.ascontiguousarray(z[:, n:])
     y = np.concatenate([_mapped(system.output, part)[0] for part in _parts(z, _samples(fields))])
-    finite(x, model.names("x"))
-    finite(y, tuple(model.output_names))
-    truths = {"x": x, "y": y, **fields}
-    broken = broken_assumptions(observer, scenario, truths)
     return Run.collect(
         model=model,
         observer=observer,
-        scenario=scenario.name,
-        seed=int(seed),
+        scenario=scenario,
+        seed=seed,
         truth=system.describe(scenario),
-        outside=(*system.outside, *broken),
-        t=np.arange(scenario.steps + 1, dtype=np.float64) * np.float64(system.Ts),
-        truths=truths,
+        outside=system.outside,
+        Ts=system.Ts,
+        truths={"x": x, "y": y, **fields},
         claims=_claims(step_function(observer, model), model, memory, y, fields),
     )
 

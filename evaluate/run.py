@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.comparison import list_voids
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.evaluate.checked import state_box
+from obsynth.evaluate.checked import broken_assumptions, finite, state_box
 from obsynth.evaluate.data.tables import to_dataset
 from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.trace import Trace, Violation, as_told, take
-from obsynth.symbolic import Plant
+from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.shown import card
 from obsynth.symbolic.table import Table
@@ -94,17 +94,20 @@ class Run:
     def collect(
         cls,
         *,
-        model: "Plant",
-        observer: "Observer | FaultDetector",
-        scenario: str,
+        model: Plant,
+        observer: Observer | FaultDetector,
+        scenario: Scenario,
         seed: int,
         truth: str,
         outside: tuple[str, ...],
-        t: FloatArray,
+        Ts: float,
         truths: Mapping[str, FloatArray],
         claims: Mapping[str, FloatArray],
     ) -> "Run":
-        """Label what the simulation loop recorded."""
+        """Label what the simulation loop recorded; refuse a truth that is no number any more."""
+        finite(truths["x"], model.names("x"))
+        finite(truths["y"], tuple(model.output_names))
+        t = np.arange(scenario.steps + 1, dtype=np.float64) * np.float64(Ts)
         groups = {key: getattr(model, key) for key in ("x", "u", "d", "f", "w", "rho")}
         names = {key: tuple(s.name for s in signals) for key, signals in groups.items()}
         units = {key: tuple(s.unit for s in signals) for key, signals in groups.items()}
@@ -121,11 +124,11 @@ class Run:
             half_widths=None if half_widths is None else np.asarray(half_widths, dtype=float),
             fault_delay=int(observer.fault_delay),
             model=model.name,
-            scenario=scenario,
-            seed=seed,
+            scenario=scenario.name,
+            seed=int(seed),
             method=observer.method,
             truth=truth,
-            outside=outside,
+            outside=(*outside, *broken_assumptions(observer, scenario, truths)),
             **arrays,
         )
 

@@ -9,9 +9,7 @@ from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
-    broken_assumptions,
     claims_of,
-    finite,
     first_memory,
     refuse_algebraic_loop,
     scenario_fields,
@@ -168,18 +166,15 @@ def _loop(
     x, said = map(np.concatenate, zip(*parts, strict=True))
     fields["u"] = rows[:, : len(names)]
     y, log = np.split(said, [output.results[1].size], axis=1)
-    finite(x, model.names("x"))
-    finite(y, tuple(model.output_names))
     fields["w"] = truth.remainders(fields, x)
-    truths = {"x": x, "y": y, **fields}
     return Run.collect(
         model=model,
         observer=observer,
-        scenario=scenario.name,
-        seed=int(seed),
+        scenario=scenario,
+        seed=seed,
         truth=truth.description,
-        outside=(*truth.outside, *broken_assumptions(observer, scenario, truths)),
-        t=np.arange(N + 1, dtype=np.float64) * np.float64(truth.Ts),
-        truths=truths,
+        outside=truth.outside,
+        Ts=truth.Ts,
+        truths={"x": x, "y": y, **fields},
         claims=claims_of(function, log),
     )

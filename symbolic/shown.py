@@ -1,6 +1,7 @@
 """How objects show themselves: a line as repr, in notebooks a card, whose text is escaped here."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from html import escape
 from typing import Any
 
@@ -45,6 +46,24 @@ def _part(part: Any) -> str:
         return f"<p>{escape(part)}</p>" if part else ""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in part)
     return f"<ul>{items}</ul>" if items else ""
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON has; numbers that are none, or not finite, become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "columns") and hasattr(value, "rows"):
+        rows = [dict(zip(value.columns, row, strict=True)) for row in value.rows]
+        return {"title": value.title, "rows": plain(rows)}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return str(value)
 
 
 class Shown:

@@ -1,6 +1,5 @@
 """The smallest disturbance bounds that explain a measured record, attained and certified."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from obsynth.evaluate.bounds.validation import Validation, validate
 from obsynth.evaluate.errors import BoundsError
 from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.shown import plain
 from obsynth.symbolic.table import Table, Tabled
 from obsynth.symbolic.taking import takes
 
@@ -215,7 +215,7 @@ class LeastBounds(Tabled):
         told |= {"instants": len(self.record), "declared": self._declared}
         for name in ("bounds", "weights", "upper", "lower", "params", "refuted"):
             told[name] = getattr(self, name)
-        return dict(json.loads(json.dumps(told), parse_constant=lambda name: None))
+        return dict(plain(told))
 
     @property
     def pressed(self) -> dict[str, int]:

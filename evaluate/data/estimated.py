@@ -22,6 +22,7 @@ from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.trace import Trace, take
 from obsynth.symbolic import Record
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
+from obsynth.symbolic.shown import plain
 from obsynth.symbolic.table import Table, text
 
 
@@ -315,7 +316,7 @@ class Estimate:
             "refuted": None if refuted is None else {**vars(refuted), "said": str(refuted)},
             "notes": list(self.record.notes),
         }
-        return {key: _plain(value) for key, value in told.items()}
+        return dict(plain(told))
 
     def columns(self) -> dict[str, FloatArray]:
         """Return every signal by its name, (N,) each, all about the instant of their row.
@@ -381,10 +382,3 @@ class Estimate:
 
     def _repr_html_(self) -> str:
         return self.summary()._repr_html_()
-
-
-def _plain(value: Any) -> Any:
-    """Replace numbers that are not finite by None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
@@ -28,7 +27,7 @@ ENDS = "Exit codes: 0 done, 1 refused or bad input, 2 usage, 3 the data refute t
 class Told:
     """What a command found.
 
-    facts: for machines, whatever `plain` takes
+    facts: for machines, whatever `shown.plain` takes
     shown: for people, tables and sentences
     failed, refuted: why the command ends with 1 or with 3, if it does
     """
@@ -68,6 +67,8 @@ def command(
 
 def _end(told: Told, as_json: bool) -> None:
     if as_json:
+        from obsynth.symbolic.shown import plain
+
         print(json.dumps(plain(told.facts), indent=1, allow_nan=False))
     else:
         console = _console()
@@ -82,24 +83,6 @@ def _end(told: Told, as_json: bool) -> None:
         raise typer.Exit(code=3)
     if told.failed:
         refuse(told.failed)
-
-
-def plain(value: Any) -> Any:
-    """Return what JSON has; numbers that are none, or not finite, become null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "columns") and hasattr(value, "rows"):
-        rows = [dict(zip(value.columns, row, strict=True)) for row in value.rows]
-        return {"title": value.title, "rows": plain(rows)}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    return str(value)
 
 
 @contextmanager
