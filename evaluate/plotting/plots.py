@@ -84,41 +84,31 @@ def plot_signal(
                 window=(start, stop),
             )
     with style():
-        if ax is not None:
-            _draw(ax, trace)
-            _labels(ax, trace)
-            if legend:
-                name_lines([ax], ax)
-            if windows:
-                low, high = ax.get_ylim()
-                ax.set_ylim(low, high + 0.8 * (high - low))
-            for i, window in enumerate(windows):
-                inset = ax.inset_axes((0.13 + 0.47 * i, 0.66, 0.37, 0.3))
-                _draw(inset, trace, window)
-                inset.locator_params(nbins=3)
-            return ax
-        figure = new_figure(4.2 if windows else 2.2)
-        if not windows:
-            main = figure.subplots()
-            _draw(main, trace)
-            _labels(main, trace)
-            if legend:
-                name_lines([main], main)
-            return np.array([main])
-        grid = figure.add_gridspec(2, len(windows), height_ratios=(1.35, 1.0))
-        main = figure.add_subplot(grid[0, :])
+        main, below = ax, []
+        if ax is None:
+            figure = new_figure(4.2 if windows else 2.2)
+            heights = (1.35, 1.0)[: 2 if windows else 1]
+            grid = figure.add_gridspec(len(heights), max(len(windows), 1), height_ratios=heights)
+            main = figure.add_subplot(grid[0, :])
+            below = [figure.add_subplot(grid[1, i]) for i in range(len(windows))]
         _draw(main, trace)
         _labels(main, trace)
-        axes = [main]
-        for i, window in enumerate(windows):
-            panel = figure.add_subplot(grid[1, i])
+        for i, (panel, window) in enumerate(zip(below, windows, strict=False)):
             _draw(panel, trace, window)
             _labels(panel, trace, title=_window_title(i, window, zooms is None))
             main.axvspan(*window, color=SOFT, alpha=0.18, linewidth=0)
-            axes.append(panel)
         if legend:
-            name_lines(axes, main)
-        return np.array(axes)
+            name_lines([main, *below], main)
+        if ax is None:
+            return np.array([main, *below])
+        if windows:
+            low, high = ax.get_ylim()
+            ax.set_ylim(low, high + 0.8 * (high - low))
+        for i, window in enumerate(windows):
+            inset = ax.inset_axes((0.13 + 0.47 * i, 0.66, 0.37, 0.3))
+            _draw(inset, trace, window)
+            inset.locator_params(nbins=3)
+        return ax
 
 
 @takes(run="Run Estimate")

@@ -1,6 +1,6 @@
 """Plants that are a text with options: what the options change in it."""
 
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 import sympy as sp
@@ -12,7 +12,7 @@ from obsynth.symbolic.plant_file import PlantText
 
 def text(name: str) -> str:
     """Return the text of a plant that is one, to begin one's own from."""
-    return (files("obsynth.symbolic.plants") / f"{name}.toml").read_text(encoding="utf-8")
+    return (Path(__file__).parent / f"{name}.toml").read_text(encoding="utf-8")
 
 
 def _variant(name: str, changes: dict[str, Any]) -> Plant:
