@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from obsynth.codegen.kernel import Call, dense
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.observer import MEAN_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import (
@@ -23,7 +24,6 @@ from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import (
     continuous_plant,
     parameter_text,
-    parameters,
     same_signals,
     sample_time,
     substeps_of,
@@ -97,7 +97,7 @@ class _System:
         self.model, self.substeps = model, substeps
         self.Ts = sample_time(own)
         self.h = self.Ts / substeps
-        self.p = parameters(self.plant)
+        self.p = operating_values(self.plant, "p")
         self._join(ode)
 
     def _join(self, ode: ca.Function) -> None:

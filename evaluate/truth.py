@@ -31,7 +31,7 @@ class Truth:
         self.Ts = sample_time(own)
         self.outside: tuple[str, ...] = ()
         self._ode = observer.ode
-        p = parameters(model)
+        p = operating_values(model, "p")
         if substeps is not None:
             self._continuous(substeps, own)
             step = _held(self.plant, self.Ts, substeps, p)
@@ -39,8 +39,8 @@ class Truth:
                 step = self._with_remainder(step, p)
         else:
             self._discrete(own)
-            x, u, d, f, w, rho = _symbols(model)
-            step = ca.Function("truth", [x, u, d, f, w, rho], _call(model, x, u, d, f, w, p, rho))
+            signals = _symbols(model)
+            step = ca.Function("truth", signals, _call(model, p, *signals))
         if self._ode is not None and not observer.step_covered:
             self.outside += (
                 "the guarantee speaks of the observer's differential equation; its sampled step, "
@@ -57,7 +57,7 @@ class Truth:
         x, u, d, f, w, rho = _symbols(self.model)
         kept = w[: w.numel() - len(self.model.remainder or ())]
         quiet = ca.vertcat(kept, ca.SX.zeros(w.numel() - kept.numel()))
-        ours = _call(self.model, x, u, d, f, quiet, p, rho)[0]
+        ours = _call(self.model, p, x, u, d, f, quiet, rho)[0]
         self.rest = ca.Function("rest", [x, u, d, f, w, rho], [ours])
         moved, y = step(x, u, d, f, kept, rho)
         return ca.Function("truth", [x, u, d, f, w, rho], [moved, y])
@@ -159,11 +159,6 @@ def continuous_plant(model: Plant, why: str) -> Plant:
     return source
 
 
-def parameters(model: Plant) -> FloatArray:
-    """Return the constant parameters of the truth: nominal, else mid-range."""
-    return operating_values(model, "p")
-
-
 def parameter_text(model: Plant, p: FloatArray) -> str:
     """Say which parameters the truth has, to be put behind its description."""
     if not p.size:
@@ -171,26 +166,20 @@ def parameter_text(model: Plant, p: FloatArray) -> str:
     return "; " + ", ".join(f"{s.name} = {v:g}" for s, v in zip(model.p, p, strict=True))
 
 
-def _symbols(plant: Plant) -> tuple[ca.SX, ...]:
-    return tuple(ca.SX.sym(key, len(plant.names(key))) for key in ("x", "u", "d", "f", "w", "rho"))
+def _symbols(plant: Plant) -> list[Any]:
+    return [ca.SX.sym(key, len(plant.names(key))) for key in ("x", "u", "d", "f", "w", "rho")]
 
 
-def _call(
-    plant: Plant, x: Any, u: Any, d: Any, f: Any, w: Any, p: FloatArray, rho: Any
-) -> tuple[Any, Any]:
-    rhs, y = plant.function()(x, u, d, f, w, p, rho)
+def _call(plant: Plant, p: FloatArray, *signals: Any) -> tuple[Any, Any]:
+    *others, rho = signals
+    rhs, y = plant.function()(*others, p, rho)
     return rhs, y
 
 
 def _held(plant: Plant, Ts: float, substeps: int, p: FloatArray) -> ca.Function:
     """Classical Runge-Kutta over one sample with everything but x held."""
-    x, u, d, f, w, rho = _symbols(plant)
-
-    def rate(state: Any) -> Any:
-        return _call(plant, state, u, d, f, w, p, rho)[0]
-
+    x, *held = _symbols(plant)
     state: Any = x
     for _ in range(substeps):
-        state = runge_kutta(rate, state, Ts / substeps)
-    y = _call(plant, x, u, d, f, w, p, rho)[1]
-    return ca.Function("truth", [x, u, d, f, w, rho], [state, y])
+        state = runge_kutta(lambda at: _call(plant, p, at, *held)[0], state, Ts / substeps)
+    return ca.Function("truth", [x, *held], [state, _call(plant, p, x, *held)[1]])

@@ -5,9 +5,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.stepping import clip, make_step
-from obsynth.evaluate.truth import parameters
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 
@@ -32,7 +32,7 @@ class ExtendedKalman:
             ca.SX.sym(kind, len(getattr(plant, kind))) for kind in ("x", "f", "d", "w", "u", "rho")
         )
         every = ca.vertcat(x, f, ca.SX.sym("before", m), d, w)
-        moved, shown, *_ = plant.function()(x, u, d, f, w, parameters(plant), rho)
+        moved, shown, *_ = plant.function()(x, u, d, f, w, operating_values(plant, "p"), rho)
         outs = [ca.vertcat(moved, f, f), shown]
         outs += [ca.densify(ca.jacobian(out, every)) for out in outs]
         self.both = ca.Function("both", [every, u, rho], outs)
