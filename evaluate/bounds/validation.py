@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import comb
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.special import betaincinv
 
 from obsynth.evaluate.bounds.certified import least
 from obsynth.evaluate.bounds.problem import Problem
@@ -40,11 +39,7 @@ class Validation(Tabled):
         (Campi, Garatti 2008), for exchangeable windows.
         """
         n, d = len(self.factors), min(self.free, len(self.factors))
-
-        def tail(eps: float) -> float:
-            return sum(comb(n, i) * eps**i * (1.0 - eps) ** (n - i) for i in range(d))
-
-        return float(brentq(lambda eps: tail(eps) - (1.0 - CONFIDENCE), 0.0, 1.0))
+        return float(betaincinv(d, n - d + 1, CONFIDENCE))
 
     @property
     def safety(self) -> float:

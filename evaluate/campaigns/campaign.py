@@ -117,13 +117,12 @@ class Campaign(Tabled):
 
 def interval(successes: int, trials: int) -> tuple[float, float]:
     """Return the Clopper-Pearson interval of a probability at 95 % confidence."""
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    tail = 0.5 * (1.0 - _LEVEL)
-    failures = trials - successes
-    low = 0.0 if successes == 0 else float(beta.ppf(tail, successes, failures + 1))
-    high = 1.0 if failures == 0 else float(beta.ppf(1.0 - tail, successes + 1, failures))
-    return low, high
+    if trials == 0:
+        return 0.0, 1.0
+    found = binomtest(successes, trials).proportion_ci(_LEVEL, method="exact")
+    return float(found.low), float(found.high)
 
 
 @takes(designs="Observer FaultDetector dict")
