@@ -12,6 +12,7 @@ import sympy as sp
 
 from obsynth.evaluate.plotting.layout import INK, SOFT
 from obsynth.symbolic import Plant
+from obsynth.symbolic.display import equations
 
 # Drawn in these colours, shown in the page's own, so that dark pages have light ink.
 _VARIABLES = {INK: "var(--ink)", SOFT: "var(--soft)"}
@@ -78,15 +79,8 @@ def _inline(text: str, key: str, label: str) -> str:
 
 def equations_html(plant: Plant, key: str) -> str:
     """Return dynamics and outputs as inline SVG formulas, plain text where that fails."""
-    rows = []
-    for signal, row in zip(plant.x, plant.rhs, strict=True):
-        name = sp.latex(signal.symbol)
-        left = _derivative(name) if plant.Ts is None else f"{name}^+"
-        rows.append((left, f"{signal.name}{chr(39) if plant.Ts is None else '+'}", row))
-    for name, row in zip(plant.output_names, plant.output, strict=True):
-        rows.append((sp.latex(sp.Symbol(name)), name, row))
     lines = []
-    for i, (left, plain, row) in enumerate(rows):
+    for i, (plain, left, row) in enumerate(equations(plant)):
         formula = math_svg(f"{left} = {sp.latex(row)}".replace(r"\frac", r"\dfrac"), f"{key}{i}")
         shown = formula or f"<code>{html.escape(f'{plain} = {row}')}</code>"
         width = re.search(r'<svg[^>]* width="([\d.]+)pt"', shown)
@@ -104,9 +98,3 @@ def constants_html(plant: Plant) -> str:
         unit = f" {signal.unit}".replace("^2", "²").replace("^3", "³") if signal.unit else ""
         items.append(f"<span>{html.escape(f'{signal.name} = {decimal}{unit}')}</span>")
     return f'<p class="constants">with {" ".join(items)}</p>' if items else ""
-
-
-def _derivative(name: str) -> str:
-    """Set the dot above the letter, not above letter and index."""
-    base, mark, index = name.partition("_")
-    return rf"\dot{{{base}}}{mark}{index}"

@@ -50,20 +50,27 @@ def plant_latex(plant: "Plant") -> str:
     if original is not None and plant.discretisation != "euler":
         step = sp.latex(plant.exact_Ts)
         note = rf"\text{{{plant.discretisation}, }} T_s &= {step}\,\mathrm{{s}}"
-        return aligned([note, *_equations(original)])
-    return aligned(_equations(plant))
+        return aligned([note, *_aligned(original)])
+    return aligned(_aligned(plant))
 
 
-def _equations(plant: "Plant") -> list[str]:
+def _aligned(plant: "Plant") -> list[str]:
+    return [f"{left} &= {sp.latex(right)}" for _, left, right in equations(plant)]
+
+
+def equations(plant: "Plant") -> list[tuple[str, str, sp.Expr]]:
+    """Return the left sides of all equations, in text and in LaTeX, and the right ones."""
     rows = []
     if plant.has_dynamics:
         for signal, row in zip(plant.x, plant.rhs, strict=True):
-            name = sp.latex(signal.symbol)
-            left = rf"\dot{{{_base(name)}}}{_index(name)}" if plant.Ts is None else rf"{name}^{{+}}"
-            rows.append(f"{left} &= {sp.latex(short(row))}")
+            # the dot stands above the letter, not above letter and index
+            base, mark, index = sp.latex(signal.symbol).partition("_")
+            name = f"{base}{mark}{index}"
+            left = rf"\dot{{{base}}}{mark}{index}" if plant.Ts is None else rf"{name}^{{+}}"
+            rows.append((f"{signal.name}{chr(39) if plant.Ts is None else '+'}", left, short(row)))
     if plant.has_outputs:
         for name, row in zip(plant.output_names, plant.output, strict=True):
-            rows.append(f"{sp.latex(sp.Symbol(name))} &= {sp.latex(short(row))}")
+            rows.append((name, sp.latex(sp.Symbol(name)), short(row)))
     return rows
 
 
@@ -101,11 +108,3 @@ def _cells(signal: Signal) -> tuple[str, ...]:
 
 def _span(lower: float, upper: float) -> str:
     return "unbounded" if lower == -upper == -math.inf else f"[{lower:g}, {upper:g}]"
-
-
-def _base(name: str) -> str:
-    return name.split("_{", 1)[0]
-
-
-def _index(name: str) -> str:
-    return name.removeprefix(_base(name))
