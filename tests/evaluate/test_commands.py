@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 
 import obsynth as ob
 from obsynth.cli import ORDER, app
-from obsynth.commands.told import EXAMPLES, Told, command, plain
-from obsynth.evaluate.progress import times
+from obsynth.commands.told import EXAMPLES, Told, command
+from obsynth.evaluate.progress import bar
 from obsynth.symbolic import Table
+from obsynth.symbolic.shown import plain
 
 runner = CliRunner()
 # So that each finds the files that those before it left; test_command has `run`.
@@ -170,7 +171,11 @@ def test_papers_computes_what_the_errata_say(paper, wrong):
         assert "0.49888" in str(told) and "1.0562" in str(told) and "2.1042" in str(told)
 
 
-def test_time_left_is_what_is_left_at_this_pace():
-    """Mutant: the share that is done in place of what is left."""
-    assert times(60.0, 0.25) == "1:00, 3:00 left"
-    assert times(60.0, None) == times(60.0, 0.0) == "1:00"
+def test_a_terminal_is_told_the_stage_and_the_time_left(monkeypatch, capsys):
+    """Others are told nothing. Mutant: a stage that is not shown."""
+    for terminal in ("1", ""):
+        monkeypatch.setenv("FORCE_COLOR", terminal)
+        with bar() as say:
+            say("designing", 0.5)
+        told = capsys.readouterr().err
+        assert ("designing" in told and "left" in told) if terminal else not told
