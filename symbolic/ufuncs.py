@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partialmethod, wraps
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from sympy.core.relational import Relational
 from obsynth.symbolic.functions import ALIASES, BY_NAME
 
 _OTHERS = {"maximum": "Max", "minimum": "Min", "fmax": "Max", "fmin": "Min", "absolute": "Abs"}
+_METHODS = ("sqrt", "exp", "log", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "tanh")
 _RELATIONS: dict[str, Callable[[Any, Any], Any]] = {
     "less": operator.lt,
     "less_equal": operator.le,
@@ -77,6 +78,9 @@ def _told(method: Callable[[Any], Any], mend: str) -> Callable[[Any], Any]:
 def allow() -> None:
     """Let expressions answer NumPy, and tell the mend where they are no numbers or conditions."""
     sp.Expr.__array_ufunc__ = _apply
+    for name in _METHODS:
+        # what NumPy calls on every entry of a list; `exp` of a power is SymPy's exponent and stays
+        setattr(sp.Expr, name, partialmethod(getattr(np, name)))
     for kind, method, mend in (
         (sp.Expr, "__float__", _NUMBER),
         (sp.Expr, "__int__", _NUMBER),

@@ -55,6 +55,7 @@ def test_functions_of_numpy_take_expressions():
     assert np.sqrt(2 * h) == sp.sqrt(2 * h) and np.maximum(h, 0) == sp.Max(h, 0)
     assert np.arctan2(h, np.float64(2)) == sp.atan2(h, 2.0) and (np.float64(2) < h) == (h > 2.0)
     assert list(np.array([1, 2]) * h) == [h, 2 * h] and np.add.reduce([h, h]) == 2 * h
+    assert list(np.sqrt([h, 1 - h])) == [sp.sqrt(h), sp.sqrt(1 - h)] and (h**3).exp == 3
     for function in (np.cbrt, lambda x: np.hypot(x, 1)):
         with pytest.raises(TypeError, match="has no form for the expression h: write it in SymPy"):
             function(h)
