@@ -25,6 +25,8 @@ from obsynth.symbolic.signals import Role, Signal
 _RTOL = 1e-2
 _QUOTIENTS = (sp.sinc, phi1, tanhc)
 _LONG = 150
+# Longer ones end the search with several times the width of their slopes: they are not tried.
+_SHORT = 100
 _MANY = 2
 
 
@@ -92,6 +94,12 @@ class Widths:
     def __getitem__(self, coefficient: sp.Expr) -> float:
         return self.known[coefficient]
 
+    def unlifted(self, shares: Sequence[Share]) -> dict[Share, Share]:
+        """Take lifted coefficients as they are where that can be tried, and has a bound."""
+        short = [s for s in shares if s.proxy is not None and s.coefficient.count_ops() <= _SHORT]
+        self.prepare([s.coefficient for s in short])
+        return {s: replace(s, proxy=None) for s in short if not self.singular(s.coefficient)}
+
     def singular(self, coefficient: sp.Expr) -> bool:
         """Tell whether a coefficient has no bound although all its signals have."""
         return not np.isfinite(self[coefficient]) and all(
@@ -153,6 +161,11 @@ class RowRanking:
     alternatives: tuple[Alternative, ...]
     total: int
 
+    @property
+    def score(self) -> float:
+        """The score of the chosen way."""
+        return self.alternatives[0].score
+
     def __str__(self) -> str:
         lines = [f"{self.row}: {self.total} ways"]
         lines += [f"  {k + 1}. {a}" for k, a in enumerate(self.alternatives)]
@@ -186,15 +199,12 @@ class _Chooser:
 
     def admissible(self, terms: list[Term]) -> list[Term]:
         """Drop options with a coefficient that has no bound over the box."""
-        shares = [share for t in terms for o in t.options for share in o.shares]
-        lifted = self.widths.lift(shares)
+        lifted = self.widths.lift(_all_shares(terms))
         hidden = {lift.signal.symbol: lift.meaning for lift in self.widths.lifts}
         self.unknown |= {s for s, e in hidden.items() if e.free_symbols & self.unknown}
         result = []
         for term in terms:
-            ways = [
-                replace(o, shares=tuple(lifted.get(s, s) for s in o.shares)) for o in term.options
-            ]
+            ways = _with_shares(term, lifted).options
             good = tuple(o for o in ways if self._singular(o) is None)
             if good:
                 result.append(replace(term, options=good))
@@ -203,6 +213,11 @@ class _Chooser:
             reason = f"{worst} has no finite bound over the box"
             result.append(replace(term, options=(kept(term.expression),), reason=reason))
         return result
+
+    def unlifted(self, terms: list[Term]) -> list[Term]:
+        """Return the terms with the secants themselves in place of what was lifted."""
+        plain = self.widths.unlifted(_all_shares(terms))
+        return [_with_shares(term, plain) for term in terms]
 
     def _singular(self, option: Option) -> sp.Expr | None:
         for share in option.shares:
@@ -265,19 +280,37 @@ def choose(
 ) -> tuple[list[Term], list[Option], tuple[RowRanking, ...], tuple[Lift, ...]]:
     """Choose one option for every term."""
     chooser = _Chooser(model, centre, rows, penalty, effort)
-    admissible = chooser.admissible(terms)
+    lifted = chooser.admissible(terms)
+    plain = chooser.unlifted(lifted)
     ordered: list[Term] = []
     chosen: list[Option] = []
     rankings = []
     for i in range(len(rows)):
-        own = [t for t in admissible if t.row == i]
+        own, other = ([t for t in way if t.row == i] for way in (lifted, plain))
         ranking, best = chooser.rank(i, own, alternatives)
+        if other != own:
+            tried = chooser.rank(i, other, alternatives)
+            # a secant as it is shares its variables with others, so it wins where none is narrower
+            if tried[0].score <= (1.0 + _TIE) * ranking.score:
+                own, (ranking, best) = other, tried
         ordered += own
         chosen += best
         rankings.append(ranking)
     used = {s.proxy for o in chosen for s in o.shares if s.proxy is not None}
     lifts = tuple(lift for lift in chooser.widths.lifts if lift.signal.symbol in used)
     return ordered, chosen, tuple(rankings), lifts
+
+
+def _all_shares(terms: list[Term]) -> list[Share]:
+    return [share for term in terms for option in term.options for share in option.shares]
+
+
+def _with_shares(term: Term, others: Mapping[Share, Share]) -> Term:
+    """Replace shares of all options; the term itself where there are none of them."""
+    if not any(share in others for share in _all_shares([term])):
+        return term
+    ways = [replace(o, shares=tuple(others.get(s, s) for s in o.shares)) for o in term.options]
+    return replace(term, options=tuple(ways))
 
 
 def _mean_distance(lower: float, upper: float, centre: float) -> float:

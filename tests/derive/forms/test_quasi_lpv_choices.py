@@ -6,7 +6,7 @@ import sympy as sp
 
 from obsynth.derive import DerivationError, UnboundedError
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
-from obsynth.symbolic import Plant
+from obsynth.symbolic import Plant, plants
 
 R = sp.Rational
 
@@ -100,6 +100,33 @@ def test_functions_of_a_difference_take_two_columns(product):
     form = quasi_lpv(product)
     assert form.A[2, 0] == sp.sinc(x1 - x3)
     assert sp.expand(form.A[2, 2] - (x3 - sp.sinc(x1 - x3))) == 0
+
+
+# -- secants, or symbols with the range of their slopes ------------------------------
+
+
+def test_secants_that_share_their_variables_are_not_lifted(check_samples):
+    """.72 for the slopes of two axles' side forces, four variables. Mutant: always lifted."""
+    plant = Plant("axles")
+    v, y, r = plant.states("v y r", range=[(10, 30), (-2, 2), (-R(3, 5), R(3, 5))])
+    front, rear = sp.atan((y + r) / v), sp.atan((y - r) / v)
+    plant.dynamics([-v / 10, -20 * (front + rear), -15 * (front - rear)])
+    plant.outputs([v, r])
+    form = quasi_lpv(plant, rtol=1e-2, effort="fast")
+    assert form.ranging.lifts == () and len(form.scheduling) == 2
+    assert form.ranking[2].alternatives[0].inflation < 0.19
+    check_samples(form)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("tyre", "variables", "inflation"), [("linear", 6, 0.093), ("pacejka", 8, 2.01)]
+)
+def test_a_bicycle_is_written_in_the_way_that_suits_its_tyres(tyre, variables, inflation):
+    """.27 and nine variables for linear tyres lifted, 2.44 for nonlinear ones that are not."""
+    form = quasi_lpv(plants.bicycle(tyre))
+    assert len(form.scheduling) == variables
+    assert form.ranking[2].alternatives[0].inflation == pytest.approx(inflation, rel=0.01)
 
 
 # -- singular choices ---------------------------------------------------------------

@@ -135,11 +135,11 @@ def test_declared_scheduling_tells_itself_whether_it_is_measured():
 
 @pytest.fixture(scope="module")
 def slip():
-    """A nested tyre-like force of three states; its closed secant has no natural bound."""
+    """A nested tyre-like force of three states; its slope has a narrower range than its secant."""
     plant = Plant("slip")
     v, r, s = plant.states("v r s", range=[(-1, 1), (-1, 1), (5, 10)])
     (u,) = plant.inputs("u", range=(-1, 1))
-    force = sp.sin(R(13, 10) * sp.atan(4 * sp.atan((v + r / 2) / s)))
+    force = sp.sin(R(13, 10) * sp.atan(9 * sp.atan(4 * sp.atan((v + r / 2) / s))))
     plant.dynamics([-force + u, -r, -s])
     plant.outputs([r, s])
     return quasi_lpv(plant)
