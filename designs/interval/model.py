@@ -9,12 +9,15 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import sympy as sp
 
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.forms.quasi_lpv.terms import row_names, stacked_rows
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.rigour import Exact, exact, nearest
+from obsynth.derive.rigour import Exact, exact
 from obsynth.derive.structure.conditions import scaled_rank
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.given import PlantClass
@@ -22,6 +25,7 @@ from obsynth.designs.core.record import Record
 from obsynth.designs.core.signals import finite_box
 from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
+from obsynth.symbolic.signals import Signal
 
 if TYPE_CHECKING:
     from obsynth.designs.interval.record import IntervalDesign
@@ -102,7 +106,11 @@ class IntervalModel(Record):
 
 def read(given: Plant | QuasiLPV, prefer: Prefer = None) -> IntervalModel:
     """Read the matrices of the quasi-LPV form of a plant and check their ranks."""
-    form = quasi_lpv(given if isinstance(given, Plant) else given.model, prefer=prefer)
+    plant = given if isinstance(given, Plant) else given.model
+    if plant.discretisation != "rk4":
+        # what equations alone tell comes first: a form can take a while
+        _check_ranks(plant, *_linear_parts(plant))
+    form = quasi_lpv(plant, prefer=prefer)
     if isinstance(given, QuasiLPV):
         if given.matrix != form.matrix or not given.centre.is_origin:
             raise ObsynthError(
@@ -115,9 +123,7 @@ def read(given: Plant | QuasiLPV, prefer: Prefer = None) -> IntervalModel:
         raise DerivationError(
             f"the quasi-LPV form of {form.model.name} is not proved to be the plant: {form.proof}"
         )
-    model = _matrices(form)
-    _check_ranks(model)
-    return model
+    return _matrices(form)
 
 
 def read_again(design: IntervalDesign) -> IntervalModel:
@@ -125,17 +131,52 @@ def read_again(design: IntervalDesign) -> IntervalModel:
     return read(CLASS.check(design.plant), design.options.get("prefer"))
 
 
+def _linear_parts(plant: Plant) -> tuple[FloatArray, FloatArray]:
+    """Return C (m, n) and F (n, q), or refuse what is not y = C x + W2 w, or gains that vary."""
+    rows, n = stacked_rows(plant), len(plant.x)
+    outputs = [sp.expand(row) for row in rows[n:]]
+    for name, row in zip(plant.output_names, outputs, strict=True):
+        inside = [s.name for kind in "ufd" for s in getattr(plant, kind) if row.has(s.symbol)]
+        rest = row - sum(sp.diff(row, s.symbol) * s.symbol for s in (*plant.x, *plant.w))
+        if inside or sp.expand(rest) != 0:
+            raise StructureError(
+                f"the output {name} = {text(row)} has "
+                f"{', '.join(inside) or 'more than multiples of states and disturbances'} in it; "
+                "this method needs y = C x + W2 w: take what is known of it away from the reading "
+                'and declare the rest, or take form="general", which has outputs of any form',
+                symbol=name,
+                row=name,
+                inputs=tuple(inside),
+            )
+    C = _constant_slopes(plant.x, plant.output_names, outputs)
+    _constant_slopes(plant.w, row_names(plant), rows)
+    return C, _constant_slopes((*plant.f, *plant.d), plant.names("x"), rows[:n])
+
+
+def _constant_slopes(
+    signals: Sequence[Signal], names: Sequence[str], rows: Sequence[sp.Expr]
+) -> FloatArray:
+    """Return slopes as doubles, (rows, signals), or refuse one that varies."""
+    found = np.zeros((len(rows), len(signals)))
+    for (i, row), (j, s) in product(enumerate(rows), enumerate(signals)):
+        slope = sp.diff(row, s.symbol)
+        slope = sp.expand(slope) if slope.free_symbols else slope
+        if varies := sorted(map(str, slope.free_symbols)):
+            raise StructureError(
+                f"{s.name} enters {names[i]} by {text(slope)}, which varies with "
+                f"{', '.join(varies)}; this method needs constant C, F, W1 and W2, "
+                'form="general" does not',
+                symbol=s.name,
+                row=names[i],
+                symbols=tuple(varies),
+                condition="constant block",
+            )
+        found[i, j] = float(slope)
+    return found
+
+
 def _matrices(form: QuasiLPV) -> IntervalModel:
     plant = form.model
-    for name in ("feedthrough", "D_y", "D_f", "output_offset"):
-        for i, output in enumerate(plant.output_names):
-            if any(entry != 0 for entry in form.block(name)[i, :]):
-                raise StructureError(
-                    f"the output {output} has more than states and disturbances in it ({name}); "
-                    "this method needs y = C x + W2 w",
-                    symbol=output,
-                    row=output,
-                )
     polytope = form.vertices()
     family = polytope.family
     rows = slice(0, len(plant.x))
@@ -189,10 +230,9 @@ def _rational_block(form: QuasiLPV, name: str) -> Exact:
     return exact(np.array(block.tolist(), dtype=object).reshape(block.shape))
 
 
-def _check_ranks(model: IntervalModel) -> None:
+def _check_ranks(plant: Plant, C: FloatArray, F: FloatArray) -> None:
     """Refuse rank(C F) < q, and rank(F) < q before it."""
-    plant, q, F = model.plant, model.q, nearest(model.F)
-    CF = nearest(model.C) @ F
+    q, CF = F.shape[1], C @ F
     names = (*plant.names("f"), *plant.names("d"))
     facts: dict[str, Any] = {"rank_F": scaled_rank(F), "rank_CF": scaled_rank(CF), "q": q}
     if facts["rank_F"] < q:

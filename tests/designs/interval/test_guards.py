@@ -114,6 +114,35 @@ def test_the_class_of_plants(example):
 
 
 @pytest.mark.parametrize(
+    ("row", "output", "words"),
+    [
+        (None, lambda x, u, f, w: x[0] + 2 * u, r"y1 = .*u.* has u in it.*take what is known"),
+        (None, lambda x, u, f, w: x[0] + f, r"y1 = .* has f in it"),
+        (None, lambda x, u, f, w: x[0] ** 2, "y1 = .*more than multiples"),
+        (None, lambda x, u, f, w: x[0] + 1, "y1 = .*more than multiples"),
+        (None, lambda x, u, f, w: x[0] * w, "y1 = .*more than multiples"),
+        (lambda x, u, f, w: x[1] * f, None, "f enters x1 by x2, which varies with x2"),
+        (lambda x, u, f, w: f + u * w, None, "w enters x1 by u, which varies with u"),
+        (lambda x, u, f, w: w, None, r"rank\(F\) = 0"),
+        (lambda x, u, f, w: f, lambda x, u, f, w: x[1], r"rank\(C F\) = 0"),
+    ],
+)
+def test_what_equations_tell_is_refused_before_anything_is_derived(row, output, words, monkeypatch):
+    """Mutants: any of them left to the form, which takes as long as it takes."""
+    plant = ob.Plant("outside")
+    x = plant.states("x1:3", range=(-1, 1))
+    (u,) = plant.inputs("u", range=(-1, 1))
+    (f,) = plant.faults("f")
+    (w,) = plant.disturbances("w", bound=0.1)
+    own = f if row is None else row(x, u, f, w)
+    plant.dynamics([x[0] / 2 + sp.sin(x[1]) + own, x[1] / 2], Ts=1)
+    plant.outputs([x[0] if output is None else output(x, u, f, w)])
+    monkeypatch.setattr("obsynth.designs.interval.model.quasi_lpv", None)
+    with pytest.raises(ob.StructureError, match=words):
+        ob.IntervalObserver(form="corrected", gains="search").design(plant)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"gains": "guess"}, "'sylvester' or a pair"),
