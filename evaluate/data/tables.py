@@ -15,8 +15,6 @@ from obsynth.symbolic.arrays import FloatArray
 DIMENSIONS = {"x": "state", "f": "fault", "y": "output", "u": "input", "d": "unknown_input"}
 DIMENSIONS |= {"w": "disturbance", "rho": "scheduling", "reference": "channel"}
 CLAIMS = {"xhat": "x", "x_lower": "x", "x_upper": "x", "fhat": "f", "f_lower": "f", "f_upper": "f"}
-ROWS = 8192
-"""Rows of a text that are made at once."""
 
 
 def to_dataset(run: Any, attrs: Mapping[str, Any]) -> Any:
@@ -51,8 +49,10 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, FloatArray
     if not target.parent.is_dir():
         raise ReportError(f"the folder {str(target.parent)!r} does not exist.", path=str(target))
     if target.suffix == ".csv":
+        import pandas as pd
+
         with replaced(target) as beside:
-            _write_text(beside, columns)
+            pd.DataFrame(dict(columns)).to_csv(beside, index=False, lineterminator="\n")
         return target
     try:
         import pyarrow as pa
@@ -65,13 +65,3 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, FloatArray
     with replaced(target) as beside:
         parquet.write_table(pa.table({key: np.asarray(v) for key, v in columns.items()}), beside)
     return target
-
-
-def _write_text(path: Path, columns: Mapping[str, FloatArray]) -> None:
-    """Write digits from which the same numbers are read; a missing number is an empty cell."""
-    with path.open("w", encoding="utf-8") as stream:
-        stream.write(",".join(columns) + "\n")
-        for k in range(0, len(next(iter(columns.values()))), ROWS):
-            cells = [map(repr, column[k : k + ROWS].tolist()) for column in columns.values()]
-            text = "\n".join(map(",".join, zip(*cells, strict=True))) + "\n"
-            stream.write(text.replace("nan", ""))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -244,12 +245,13 @@ def test_columns_files_and_frames_are_the_same_numbers(told, tmp_path):
 def test_a_file_is_replaced_only_when_it_is_complete(told, tmp_path, monkeypatch):
     path = tmp_path / "told.csv"
     path.write_text("old")
-    from obsynth.evaluate.data import tables
+    import pandas as pd
 
-    def breaks(*_):
+    def breaks(frame, beside, **_):
+        Path(beside).write_text("half")
         raise OSError("full")
 
-    monkeypatch.setattr(tables, "_write_text", breaks)
+    monkeypatch.setattr(pd.DataFrame, "to_csv", breaks)
     with pytest.raises(OSError, match="full"):
         told.write(path)
     assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["told.csv"]
