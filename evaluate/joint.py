@@ -61,7 +61,7 @@ def joint(
     z = march(system, observer, scenario, fields)
     n = len(model.x)
     x, memory = np.ascontiguousarray(z[:, :n]), np.ascontiguousarray(z[:, n:])
-    y = np.concatenate([_mapped(system.output, part)[0] for part in _parts(z, _samples(fields))])
+    (y,) = _mapped(system.output, z, _samples(fields))
     return Run.collect(
         model=model,
         observer=observer,
@@ -124,7 +124,7 @@ class _System:
         """Return z at k = 0: the scenario's x0 and the memory for the first measurement."""
         x0 = vector(scenario.x0, self.model.names("x"), "x0")
         z0 = np.concatenate([x0, np.zeros(self.n_memory)])
-        y0 = _mapped(self.output, [z0[None], v[None]])[0][0]
+        y0 = _mapped(self.output, z0[None], v[None])[0][0]
         return np.concatenate([x0, first_memory(observer, scenario, y0, self.n_memory)])
 
     def describe(self, scenario: Scenario) -> str:
@@ -149,20 +149,9 @@ def _scalar(function: ca.Function) -> ca.Function:
         return dense(function)
 
 
-def _parts(*arrays: FloatArray) -> Iterator[list[FloatArray]]:
-    """Yield the rows of several arrays in chunks."""
-    for k in range(0, len(arrays[0]), _CHUNK):
-        yield [array[k : k + _CHUNK] for array in arrays]
-
-
-def _mapped(function: ca.Function, arguments: list[FloatArray]) -> list[FloatArray]:
+def _mapped(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
     """Evaluate a function of columns for every row of its arguments."""
-    rows = len(arguments[0])
-    call = Call(dense(function).map(rows))
-    for buffer, argument in zip(call.args, arguments, strict=True):
-        buffer[:] = argument.ravel()
-    call.evaluate()
-    return [result.reshape(rows, -1) for result in call.results]
+    return [np.array(found).T for found in function.call([ca.DM(a.T) for a in arguments])]
 
 
 def _claims(
@@ -182,9 +171,7 @@ def _claims(
             f"{step.numel_in(0)}.",
             field="memory",
         )
-    results = [_mapped(step, part)[1:] for part in _parts(*arguments)]
-    columns = [np.concatenate(pieces) for pieces in zip(*results, strict=True)]
-    return dict(zip(step.name_out()[1:], columns, strict=True))
+    return dict(zip(step.name_out()[1:], _mapped(step, *arguments)[1:], strict=True))
 
 
 def _samples(fields: dict[str, FloatArray]) -> FloatArray:
