@@ -212,17 +212,9 @@ def _with_signals(
     z = np.empty((scenario.steps + 1, system.n_x + system.n_memory))
     z[0] = system.start(observer, scenario, samples[0])
     step = _runge_kutta(system)
-    marches: dict[int, Call] = {}
     for begin, end, stages in _stages(system, scenario, samples):
-        count = len(stages[0])
-        if count not in marches:
-            marches[count] = Call(dense(step if count == 1 else step.mapaccum(count)))
-        march = marches[count]
-        march.args[0][:] = z[begin]
-        for buffer, values in zip(march.args[1:], stages, strict=True):
-            buffer[:] = values.ravel()
-        march.evaluate()
-        z[begin + 1 : end + 1] = march.results[0].reshape(count, -1)[
+        march = step.mapaccum(len(stages[0]))
+        z[begin + 1 : end + 1] = _mapped(march, z[[begin]], *stages)[0][
             system.substeps - 1 :: system.substeps
         ]
     return z
