@@ -285,7 +285,7 @@ def riccati_starts(data: Scaled) -> Iterator[FloatArray]:
                 try:
                     X = solve_discrete_are(AT.T / decay, C.T, Q @ Q.T + least * np.eye(N), noise)
                     Z = X @ C.T @ np.linalg.inv(C @ X @ C.T + noise)
-                except np.linalg.LinAlgError:
+                except (np.linalg.LinAlgError, ValueError):
                     continue
                 yield Z
                 fast = spectral_radius(AT - Z @ (data.C0 @ AT)) < SLOWEST

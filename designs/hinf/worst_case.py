@@ -324,6 +324,6 @@ def holding_gain(jacobian: FloatArray, L: FloatArray) -> FloatArray:
     weight = 1e-6 * np.eye(L.shape[1])
     try:
         P = solve_discrete_are(jacobian, L, np.eye(len(L)), weight)
-    except np.linalg.LinAlgError:  # no fault reaches what grows
+    except (np.linalg.LinAlgError, ValueError):  # no fault reaches what grows
         return np.zeros((L.shape[1], len(L)))
     return np.asarray(-np.linalg.solve(L.T @ P @ L + weight, L.T @ P @ jacobian))

@@ -87,3 +87,21 @@ def test_starts_that_are_too_slow_are_asked_for_a_decay():
     assert not np.isfinite(found[0].mean)
     best = min(found, key=lambda value: value.mean)
     assert best.radius < 0.998 and best.b[-1] < 0.4  # of the range of f; .21 once searched
+
+
+def target() -> ob.Plant:
+    """A moving target seen by range, bearing with a drift, and one coordinate."""
+    plant = ob.Plant("target")
+    ranges = [(20, 100), (20, 100), (-10, 10), (-10, 10)]
+    x, y, vx, vy = plant.states("x y vx vy", range=ranges, nominal=[60, 60, 0, 0])
+    n1, n2, ax, ay = plant.disturbances("n1 n2 ax ay", bound=[0.2, 0.005, 0.5, 0.5])
+    plant.sensor_faults("drift", of="bearing", range=(-0.1, 0.1), rate=0.0005)
+    plant.dynamics({x: vx, y: vy, vx: ax, vy: ay})
+    range_ = sp.sqrt(x**2 + y**2) + n1
+    plant.outputs({"range": range_, "bearing": sp.atan2(y, x) + n2, "px": x + 5 * n1})
+    return plant.discretise("euler", Ts=0.1)
+
+
+def test_starts_whose_riccati_equation_scipy_gives_up_are_left_out():
+    """Mutant: SciPy's ValueError of some ends the design, in every method that begins from them."""
+    assert list(riccati_starts(scaled(read(target()).design)))
