@@ -123,13 +123,12 @@ def scheduling_columns(function: ca.Function, model: Plant, word: str) -> list[i
     columns = columns if "theta" in function.name_in() else []
     sizes = (function.numel_in(0), len(model.u), len(model.output_names), len(columns))
     names = ("memory", "u", "y", *(["theta"] if columns else []))
-    wanted = dict(zip(names, sizes, strict=False))
-    given = {name: function.numel_in(name) for name in function.name_in()}
+    found = ((name, function.numel_in(name)) for name in function.name_in())
+    pairs = found, zip(names, sizes, strict=False)
+    given, wanted = (", ".join(f"{name}: {size}" for name, size in part) for part in pairs)
     if given != wanted:
-        told = [", ".join(f"{name}: {size}" for name, size in d.items()) for d in (given, wanted)]
         raise SimulationError(
-            f"the observer's {word} takes ({told[0]}) numbers; ({told[1]}) are needed.",
-            given=tuple(given),
+            f"the observer's {word} takes ({given}) numbers; ({wanted}) are needed.", given=given
         )
     return columns
 

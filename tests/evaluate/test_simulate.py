@@ -270,6 +270,16 @@ def test_wrong_step_signatures_are_refused(toy):
     with pytest.raises(SimulationError, match=r"step takes \(i0: \d, i1: 1, i2: 1\)"):
         simulate(toy.plant, Renamed(toy.plant), toy.scenario())
 
+    class Swapped(toy.observer):
+        @property
+        def step(self):
+            (m, v, y), out = super().step.sx_in(), super().step.name_out()
+            found = super().step.call([m, y, v])
+            return ca.Function("s", [m, y, v], found, ["memory", "y", "u"], out)
+
+    with pytest.raises(SimulationError, match=r"takes \(memory: 6, y: 1, u: 1\) numbers"):
+        simulate(toy.plant, Swapped(toy.plant), toy.scenario())
+
     class Short(toy.observer):
         def memory0(self, guess, x_range=None, f_range=None, y0=None):
             return np.zeros(2)
