@@ -19,7 +19,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.step import Step
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.interval import claims, model, step, synthesis
-from obsynth.designs.interval.decoupling import check_detectable, find_transformation
+from obsynth.designs.interval.decoupling import check_detectable, find_transformation, shaped
 from obsynth.designs.interval.model import CLASS, IntervalModel, Prefer, read
 from obsynth.designs.interval.printed import refuse_printed
 from obsynth.designs.interval.record import Bound, IntervalDesign
@@ -156,7 +156,20 @@ class IntervalObserver(Method):
 
     def read(self, given: Plant | QuasiLPV) -> IntervalModel:
         """Read the matrices and check the ranks; a form has to be the one of `prefer`."""
+        self._check_shapes(given if isinstance(given, Plant) else given.model)
         return read(given, self.prefer)
+
+    def _check_shapes(self, plant: Plant) -> None:
+        """Refuse matrices of other shapes than the plant's before a form is derived."""
+        n, m, q = len(plant.x), len(plant.output), len(plant.f) + len(plant.d)
+        shapes = {"nominal": (n, n), "H": (n, n), "N": (m, m), "P": (n - q, n - q)}
+        shapes |= dict.fromkeys(("R0", "K0", "R1", "K1"), (q, q))
+        shapes |= {"R": shapes["P"], "Q": (n - q, m - q), "L": (n - q, m - q)}
+        pair = (None, None) if isinstance(self.gains, str) else self.gains
+        given = {**vars(self), "P": pair[0], "L": pair[1]}
+        for name, shape in shapes.items():
+            if given[name] is not None and min(shape) >= 0:
+                shaped(given[name], shape, name, "gains" if name in "PL" else name)
 
     def solve(self, model: IntervalModel) -> IntervalDesign:
         """Find gains whose bounds stay bounded, or complete the given ones."""
@@ -228,8 +241,6 @@ class IntervalObserver(Method):
         """Return the design without gains."""
         n, n2, m2 = model.n, model.n - model.q, len(model.C) - model.q
         nominal = model.middle if self.centred else np.array(self.nominal)
-        if nominal.shape != (n, n):
-            raise ObsynthError(f"nominal has to have the shape {(n, n)}", option="nominal")
         if self.bound == "paper" and model.family.directions[:, :, n:].any():
             raise ObsynthError(
                 "the input matrix or the offset varies with the scheduling variables, which the "

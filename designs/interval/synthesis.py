@@ -79,12 +79,6 @@ def sylvester_gain(
     """Solve P A2 - R P = Q C2 and return P and L = P^-1 Q, so that P (A2 - L C2) P^-1 = R."""
     from scipy.linalg import solve_sylvester
 
-    n2, m2 = len(A2), len(C2)
-    if R.shape != (n2, n2) or Q.shape != (n2, m2):
-        raise ObsynthError(
-            f"R has shape {R.shape} and Q {Q.shape}; this plant needs {(n2, n2)} and {(n2, m2)}",
-            option="R",
-        )
     gap = np.abs(np.linalg.eigvals(R)[:, None] - np.linalg.eigvals(A2)[None, :])
     if gap.min(initial=np.inf) < MODE:
         raise InfeasibleDesign(
