@@ -92,8 +92,9 @@ def _residual_functions(model: Plant) -> tuple[ca.Function, ca.Function]:
     """Return what is to vanish, and its derivative by the state."""
     sx = model.sx()
     residual = sx.rhs - sx.x if model.Ts is not None else sx.rhs
-    quiet = ca.vertcat(sx.d, sx.f, sx.w)
+    quiet = ca.vertcat(sx.f, sx.w)
     residual = ca.substitute(residual, quiet, ca.SX.zeros(quiet.numel()))
+    residual = ca.substitute(residual, sx.d, ca.SX(operating_values(model, "d")))
     arguments = [sx.x, sx.u, sx.p, sx.rho]
     slope = ca.cse(ca.jacobian(residual, sx.x))
     return ca.Function("residual", arguments, [residual]), ca.Function("slope", arguments, [slope])
@@ -138,7 +139,8 @@ def equilibrium(model: Plant, u: ArrayLike | None = None) -> Equilibrium:
     Parameters
     ----------
     model : Plant
-        Continuous or discrete plant. Unknown inputs, faults and disturbances are zero.
+        Continuous or discrete plant. Unknown inputs have their nominal values, the middle of their
+        range or zero, as they say; faults and disturbances are zero.
     u : array_like, shape (n_u,), optional
         Inputs; by default their nominal values, else the middle of their range.
 

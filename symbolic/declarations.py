@@ -38,9 +38,14 @@ def inputs(
     return self.declare(Role.INPUT, names, limits=range, unit=unit, nominal=nominal)
 
 
-def unknown_inputs(self: "Plant", names: Names, *, range: Any = None, unit: Any = "") -> Symbols:
-    """Declare unknown inputs, which observers decouple."""
-    return self.declare(Role.UNKNOWN_INPUT, names, limits=range, unit=unit)
+def unknown_inputs(
+    self: "Plant", names: Names, *, range: Any = None, unit: Any = "", nominal: Any = None
+) -> Symbols:
+    """Declare unknown inputs, which observers decouple; equilibria and scenarios use the nominal.
+
+    What they are is not asked: no guarantee rests on a nominal value.
+    """
+    return self.declare(Role.UNKNOWN_INPUT, names, limits=range, unit=unit, nominal=nominal)
 
 
 def params(

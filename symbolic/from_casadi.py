@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _METHODS = {
     "x": ("states", ("range", "unit", "nominal")),
     "u": ("inputs", ("range", "unit", "nominal")),
-    "d": ("unknown_inputs", ("range", "unit")),
+    "d": ("unknown_inputs", ("range", "unit", "nominal")),
     "f": ("process_faults", ("range", "rate", "constant", "unit")),
     "w": ("disturbances", ("bound", "range", "unit")),
     "p": ("params", ("value", "tolerance", "range", "unit", "constant")),

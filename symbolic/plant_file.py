@@ -53,7 +53,7 @@ _FAULT = {"range", "rate", "constant", "unit"}
 _ROLES: Mapping[str, tuple[Role, set[str]]] = {
     "states": (Role.STATE, {"range", "unit", "nominal"}),
     "inputs": (Role.INPUT, {"range", "unit", "nominal"}),
-    "unknown_inputs": (Role.UNKNOWN_INPUT, {"range", "unit"}),
+    "unknown_inputs": (Role.UNKNOWN_INPUT, {"range", "unit", "nominal"}),
     "parameters": (Role.PARAM, {"value", "tolerance", "range", "unit", "constant"}),
     "scheduling": (Role.SCHEDULING, {"range", "unit", "measured", "nominal"}),
     "disturbances": (Role.DISTURBANCE, {"bound", "range", "unit"}),
@@ -269,7 +269,8 @@ class PlantText:
     def table(self, path: Keys, value: Any) -> Any:
         """Return a table, or refuse what is none."""
         if not isinstance(value, dict):
-            self.fail(path, f"{path[-1]} is a table such as {{ unit = 'cm' }}, not {value!r}")
+            such = "bound = 0.1" if path[0] == "disturbances" else "unit = 'cm'"
+            self.fail(path, f"{path[-1]} is a table such as {{ {such} }}, not {value!r}")
         return value
 
     def known(self, path: Keys, given: Mapping[str, Any], words: Collection[str]) -> None:

@@ -132,7 +132,7 @@ class Study(Shown):
         names = {"t": _TIME, **outputs}
         said = []
         for signal in getattr(plant, kind):
-            value = signal.usual if kind in ("u", "rho") else 0.0
+            value = signal.usual if kind in ("u", "rho", "d") else 0.0
             text = given.get(signal.name, repr(value))
             said.append(self.told.expression((*path, signal.name), text, names))
         time, y = ca.SX.sym("t"), ca.SX.sym("y", len(outputs))

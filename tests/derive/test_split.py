@@ -18,6 +18,7 @@ from obsynth.derive.algebra.factorise import expand_terms, factorise
 from obsynth.derive.algebra.linear_parts import prove_identity, rounded
 from obsynth.derive.rigour import rational
 from obsynth.symbolic import Plant
+from obsynth.symbolic.scenarios.gentle import gentle
 
 x1, x2, x3, u1 = sp.symbols("x1:4 u1", real=True)
 X, U = [x1, x2, x3], [u1]
@@ -100,6 +101,19 @@ def test_equilibrium_of_a_continuous_plant():
 def test_equilibrium_with_an_integrator_is_found():
     plant = make(lambda s: [s["u"] - s["x"][0], s["x"][0] - s["u"]], nominal=0.5)
     assert equilibrium(plant).residual < 1e-12
+
+
+def test_equilibrium_under_the_nominal_unknown_input():
+    """Mutant: unknown inputs are zero."""
+    plant = Plant("shaft")
+    (speed,) = plant.states("speed", range=(0, 10))
+    (torque,) = plant.inputs("torque", nominal=1)
+    (load,) = plant.unknown_inputs("load", nominal=3)
+    plant.dynamics([load - torque - speed / 2])
+    plant.outputs([speed])
+    assert equilibrium(plant).x == pytest.approx([4.0], abs=1e-12)
+    scenario = gentle(plant)
+    assert np.all(scenario.unknown_inputs == 3.0) and scenario.guess == pytest.approx([5.0])
 
 
 def test_equilibrium_outside_the_range_is_refused():

@@ -36,7 +36,7 @@ def test_every_way_of_declaring():
         u.range = [0, 1]
         u.unit = "V"
         [unknown_inputs]
-        d = {}
+        d = { nominal = 3 }
         [scheduling.rho]
         range = [0, 1]
         measured = false
@@ -63,6 +63,7 @@ def test_every_way_of_declaring():
     plant = PlantText(text, "all.toml").plant()
     assert plant.exact_Ts == sp.Rational(1, 2)
     assert plant.box("x").tolist() == [[0, 1], [-2, 1 / 3]]
+    assert plant.d[0].nominal == 3
     assert plant.names("f") == ("s", "p") and plant.names("p") == ("b", "c")
     assert [s.unit for s in (*plant.u, *plant.f)] == ["V", "m", ""]
     assert plant.constant_values[sp.Symbol("a", real=True)] == sp.Rational(2, 3)
