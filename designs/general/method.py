@@ -78,8 +78,12 @@ class GeneralUIO(Method):
                 return self._otherwise(model, "divided")
         try:
             return super()._design(model, bounds)
-        except SolverTrouble as trouble:
-            for way in WAYS if followed and self.bounds == "peak" else ():
+        except (SolverTrouble, InfeasibleDesign) as trouble:
+            peak = self.bounds == "peak"
+            if not (peak or isinstance(trouble, SolverTrouble)):
+                raise
+            # what a search of peak bounds refuses says nothing of other gains, nor of other ways
+            for way in WAYS if followed and peak else ():
                 with suppress(StructureError, SolverTrouble, InfeasibleDesign):
                     return self._otherwise(model, way)
             where = hidden_somewhere(self.read(model).extended)

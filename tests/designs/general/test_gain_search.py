@@ -105,3 +105,17 @@ def target() -> ob.Plant:
 def test_starts_whose_riccati_equation_scipy_gives_up_are_left_out():
     """Mutant: SciPy's ValueError of some ends the design, in every method that begins from them."""
     assert list(riccati_starts(scaled(read(target()).design)))
+
+
+def test_a_fault_that_one_state_hides_is_divided_out():
+    """Where c = 0 nobody sees the leak. Mutant: what the search refuses is called infeasible."""
+    plant = ob.Plant("flask")
+    (c,) = plant.states("c", range=(0, 20), nominal=5)
+    (u,) = plant.inputs("u", range=(0, 5), nominal=1)
+    (leak,) = plant.process_faults("leak", range=(0, 0.5), rate=0.002)
+    (n,) = plant.disturbances("n", bound=0.05)
+    plant.dynamics([u - c / 5 - leak * c / 10])
+    plant.outputs([c + n])
+    observer = ob.BoundedErrorUIO(bounds="peak").design(plant.discretise("euler", Ts=0.1))
+    assert observer.performance["core_half_widths"][0] <= 0.0501
+    assert observer.performance["predicted_half_widths"][1] <= 0.251
