@@ -79,18 +79,15 @@ class GeneralUIO(Method):
         try:
             return super()._design(model, bounds)
         except (SolverTrouble, InfeasibleDesign) as trouble:
-            peak = self.bounds == "peak"
-            if not (peak or isinstance(trouble, SolverTrouble)):
-                raise
             # what a search of peak bounds refuses says nothing of other gains, nor of other ways
-            for way in WAYS if followed and peak else ():
+            for way in WAYS if followed and self.bounds == "peak" else ():
                 with suppress(StructureError, SolverTrouble, InfeasibleDesign):
                     return self._otherwise(model, way)
             where = hidden_somewhere(self.read(model).extended)
             if where is None:
                 raise trouble from None
             told = str(trouble).splitlines()[0].split(";")[0]
-            raise SolverTrouble(f"{model.name}: {where}", [told]) from None
+            raise type(trouble)(f"{model.name}: {where}", [told]) from None
 
     def _otherwise(self, model: Plant, way: Literal["divided", "bounded"]) -> Observer:
         """Design with another way for the faults than was asked for, which is what is stored."""

@@ -116,6 +116,9 @@ def test_a_fault_that_one_state_hides_is_divided_out():
     (n,) = plant.disturbances("n", bound=0.05)
     plant.dynamics([u - c / 5 - leak * c / 10])
     plant.outputs([c + n])
-    observer = ob.BoundedErrorUIO(bounds="peak").design(plant.discretise("euler", Ts=0.1))
+    sampled = plant.discretise("euler", Ts=0.1)
+    with pytest.raises(ob.InfeasibleDesign, match=r"where c = 0, leak = .* not decay"):
+        ob.HinfUIO().design(sampled)
+    observer = ob.BoundedErrorUIO(bounds="peak").design(sampled)
     assert observer.performance["core_half_widths"][0] <= 0.0501
     assert observer.performance["predicted_half_widths"][1] <= 0.251
