@@ -42,7 +42,7 @@ def test_a_new_plant_is_written_once(tmp_path):
         assert obsynth.read_plant(file).check()
         again = runner.invoke(app, ["new", str(file)])
         assert again.exit_code == 1 and "is there already" in said(again)
-    refused = runner.invoke(app, ["new", str(tmp_path / "x.toml"), "--like", "bicycle"])
+    refused = runner.invoke(app, ["new", str(tmp_path / "x.toml"), "--like", "planar_arm"])
     assert refused.exit_code == 1 and "no plant with a text; there are battery" in said(refused)
     assert not (tmp_path / "x.toml").exists()
 
