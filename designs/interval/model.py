@@ -107,8 +107,9 @@ class IntervalModel(Record):
 def read(given: Plant | QuasiLPV, prefer: Prefer = None) -> IntervalModel:
     """Read the matrices of the quasi-LPV form of a plant and check their ranks."""
     plant = given if isinstance(given, Plant) else given.model
+    # What equations alone tell comes first, as a form can take a while; a step of rk4 has no rows
+    # of terms to read, which `quasi_lpv` refuses at once.
     if plant.discretisation != "rk4":
-        # what equations alone tell comes first: a form can take a while
         _check_ranks(plant, *_linear_parts(plant))
     form = quasi_lpv(plant, prefer=prefer)
     if isinstance(given, QuasiLPV):
