@@ -24,10 +24,10 @@ from obsynth.codegen.kernel import DOUBLE, REALS, RESULTS, Kernel, Real
 from obsynth.codegen.single import machine_of
 from obsynth.codegen.tape import write_tape
 from obsynth.derive.rigour import inward
+from obsynth.designs.core.boxes import Rounding
 from obsynth.designs.core.core import Seen
+from obsynth.designs.core.half_widths import ROUND_UP, ULPS
 from obsynth.designs.core.observer import STEP_OUTPUTS
-from obsynth.designs.core.outwards import Rounding
-from obsynth.designs.core.running import ROUND_UP, ULPS
 from obsynth.designs.general.step import build_core, memory_sizes, running
 from obsynth.symbolic import Table
 

@@ -15,7 +15,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.boxes import LIMITS
 
 FARTHEST = LIMITS["single"].angle
 """Largest angle, below 2^12 quarter turns."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.codegen.kernel import DOUBLE, REALS, Real
 from obsynth.derive.equilibrium import operating_values
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.boxes import LIMITS
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.symbolic.arrays import FloatArray

@@ -2,7 +2,7 @@
 
 What runs is what CasADi's virtual machine runs, to the last bit but for which NaN a NaN is; what is
 written otherwise, and why no bit changes, stands in docs/c.md. Beyond some thousand statements
-there are several functions, see `parts`; functions that IEEE 754 does not define are in single
+there are several functions, see `kernel`; functions that IEEE 754 does not define are in single
 precision our own, see `functions`.
 """
 
@@ -24,9 +24,9 @@ from obsynth.codegen.kernel import (
     Kernel,
     Real,
     counted,
+    in_parts,
     scalar_function,
 )
-from obsynth.codegen.parts import in_parts
 
 _COMPARED = {"lt": "<", "le": "<=", "eq": "==", "ne": "!="}
 _TRUTH = {*_COMPARED, "and", "or", "not"}

@@ -10,8 +10,8 @@ from obsynth.derive.errors import StructureError as StructureError
 from obsynth.derive.errors import UnboundedError as UnboundedError
 from obsynth.derive.forms.qpv.build import qpv as qpv
 from obsynth.derive.forms.qpv.form import QPV as QPV
-from obsynth.derive.forms.quasi_lpv.build import quasi_lpv as quasi_lpv
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV as QuasiLPV
+from obsynth.derive.forms.quasi_lpv.form import quasi_lpv as quasi_lpv
 from obsynth.derive.intervals.ranges import Status as Status
 from obsynth.derive.jacobian.bounds import JacobianBounds as JacobianBounds
 from obsynth.derive.jacobian.bounds import jacobian_bounds as jacobian_bounds
@@ -23,6 +23,6 @@ from obsynth.derive.remainder.certify import discretisation_remainder as discret
 from obsynth.derive.remainder.enclosure import enclose_remainder as enclose_remainder
 from obsynth.derive.split import Split as Split
 from obsynth.derive.split import split as split
-from obsynth.derive.structure.excitation import excitation as excitation
+from obsynth.derive.structure.isolability import excitation as excitation
 from obsynth.derive.structure.isolability import fault_isolability as fault_isolability
 from obsynth.derive.structure.report import analyse as analyse

@@ -10,10 +10,13 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms, factorise
-from obsynth.derive.algebra.linear_parts import IdentityProof, constant_columns, prove_identity
-from obsynth.derive.algebra.sizes import LARGEST_ROW, size
-from obsynth.derive.algebra.slopes import jacobian
-from obsynth.derive.algebra.zero_test import is_zero
+from obsynth.derive.algebra.linear_parts import (
+    IdentityProof,
+    constant_columns,
+    jacobian,
+    prove_identity,
+)
+from obsynth.derive.algebra.zero_test import LARGEST_ROW, is_zero, size
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.rigour import rational, round_number, substitute

@@ -10,11 +10,8 @@ from obsynth.evaluate.choosing.choice import Choice as Choice
 from obsynth.evaluate.choosing.choose import choose as choose
 from obsynth.evaluate.control import from_control as from_control
 from obsynth.evaluate.control import to_control as to_control
-from obsynth.evaluate.coverage import coverage_table as coverage_table
 from obsynth.evaluate.data.estimate import estimate as estimate
 from obsynth.evaluate.data.estimated import Estimate as Estimate
-from obsynth.evaluate.domain import Domain as Domain
-from obsynth.evaluate.domain import StatusCount as StatusCount
 from obsynth.evaluate.errors import BoundsError as BoundsError
 from obsynth.evaluate.errors import ReportError as ReportError
 from obsynth.evaluate.errors import SimulationError as SimulationError
@@ -25,8 +22,11 @@ from obsynth.evaluate.plotting.plots import plot_run as plot_run
 from obsynth.evaluate.plotting.plots import plot_signal as plot_signal
 from obsynth.evaluate.report import report as report
 from obsynth.evaluate.run import Run as Run
+from obsynth.evaluate.run import coverage_table as coverage_table
 from obsynth.evaluate.simulate import simulate as simulate
 from obsynth.evaluate.studies.study import Study as Study
 from obsynth.evaluate.studies.study import read_study as read_study
+from obsynth.evaluate.trace import Domain as Domain
+from obsynth.evaluate.trace import StatusCount as StatusCount
 from obsynth.evaluate.trace import Trace as Trace
 from obsynth.evaluate.trace import Violation as Violation

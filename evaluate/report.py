@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from obsynth.designs.core.files import write_whole
 from obsynth.designs.core.observer import Observer
-from obsynth.evaluate.coverage import coverage_table
 from obsynth.evaluate.errors import ReportError
 from obsynth.evaluate.plotting.alarms import plot_widths
 from obsynth.evaluate.plotting.layout import style
 from obsynth.evaluate.plotting.plots import plot_errors, plot_run
-from obsynth.evaluate.run import Run, percent
+from obsynth.evaluate.run import Run, coverage_table, percent
 from obsynth.evaluate.svg import (
     colour_of,
     constants_html,

@@ -10,6 +10,7 @@ from obsynth.symbolic.errors import ObsynthError as ObsynthError
 from obsynth.symbolic.errors import ObsynthWarning as ObsynthWarning
 from obsynth.symbolic.errors import PlantError as PlantError
 from obsynth.symbolic.errors import RecordError as RecordError
+from obsynth.symbolic.from_casadi import from_tape as from_tape
 from obsynth.symbolic.functions import phi1 as phi1
 from obsynth.symbolic.functions import tanhc as tanhc
 from obsynth.symbolic.pieces import lookup as lookup
@@ -25,7 +26,6 @@ from obsynth.symbolic.sxmodel import ParityError as ParityError
 from obsynth.symbolic.sxmodel import SxModel as SxModel
 from obsynth.symbolic.sxmodel import check_parity as check_parity
 from obsynth.symbolic.table import Table as Table
-from obsynth.symbolic.tape import from_tape as from_tape
 from obsynth.symbolic.text import TextError as TextError
 from obsynth.symbolic.text import read_text as read_text
 from obsynth.symbolic.written import write_text as write_text

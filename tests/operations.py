@@ -6,7 +6,7 @@ import numpy as np
 
 from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
-from obsynth.designs.core.limits import FAR
+from obsynth.designs.core.boxes import FAR
 
 PRECISION = 400
 WHOLE, NEAR, UP, DOWN, OPEN = (-FAR, FAR), (-3.0, 5.0), (0.5, 3.0), (-3.0, -0.5), (-2.0, 0.0)

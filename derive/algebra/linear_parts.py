@@ -1,4 +1,4 @@
-"""Linear parts of expressions, and the proof that the parts of a split add up to the plant."""
+"""Derivatives off the jumps, linear parts, and the proof that the parts of a split add up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,14 +6,41 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.sizes import LARGEST_ROW, simplified, size, text
-from obsynth.derive.algebra.sizes import symbols as symbols_of
-from obsynth.derive.algebra.slopes import slope
-from obsynth.derive.algebra.zero_test import is_zero, varies
+from obsynth.derive.algebra.zero_test import LARGEST_ROW, is_zero, simplified, size, text, varies
+from obsynth.derive.algebra.zero_test import symbols as symbols_of
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import round_number, substitute
+from obsynth.derive.rigour.walks import once, replaced
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
+
+_FLAT = (sp.sign, sp.Heaviside, sp.floor, sp.ceiling)
+
+
+def slope(row: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
+    """Differentiate a row; what jumps is flat beside its jump."""
+    return jacobian(sp.Matrix([row]), [symbol])[0]
+
+
+def jacobian(rows: sp.Matrix, symbols: Sequence[sp.Symbol]) -> sp.Matrix:
+    """Differentiate rows; what jumps is flat beside its jump.
+
+    SymPy leaves the derivative of a sign or a floor undone, and later takes hours over what it
+    left.
+    """
+    if not symbols:
+        return sp.zeros(len(rows), 0)
+    flat: dict[sp.Basic, sp.Basic] = {}
+    back: dict[sp.Basic, sp.Basic] = {}
+    for node in once(*rows):
+        bent = isinstance(node, sp.Abs) and not node.args[0].is_extended_real
+        jump = sp.sign(node.args[0]) if bent else node
+        if isinstance(jump, _FLAT):
+            level = sp.Dummy(real=True)
+            back[level] = jump
+            flat[node] = level if jump is node else replaced(node.args[0], flat) * level
+    found = sp.Matrix([replaced(row, flat) for row in rows]).jacobian(symbols)
+    return found.applyfunc(lambda entry: replaced(entry, back))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
-from obsynth.derive.constants.symmetric_field import FieldRange, SymmetricField
+from obsynth.derive.constants.symmetric_field import (
+    FieldRange,
+    SymmetricField,
+    eigenvalue_over_interval,
+)
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.intervals.search.batch import Rows
 from obsynth.derive.rigour import (

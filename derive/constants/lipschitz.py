@@ -7,12 +7,12 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.constants.eigenvalue_search import Maximum
-from obsynth.derive.constants.interval_matrix import augment
 from obsynth.derive.constants.matrix_maximum import Hull, matrix_maximum
+from obsynth.derive.constants.symmetric_field import augment
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.ranges import Ends
 from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
-from obsynth.derive.jacobian.matrix_entries import MatrixEntries, exact_jacobian, matrix_entries
+from obsynth.derive.jacobian.entries import MatrixEntries, exact_jacobian, matrix_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.split import Split
 from obsynth.symbolic.plant import Plant

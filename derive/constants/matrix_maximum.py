@@ -7,10 +7,13 @@ import numpy as np
 
 from obsynth.derive.algebra.connected import connected
 from obsynth.derive.constants.eigenvalue_search import Maximum, largest_over_box
-from obsynth.derive.constants.interval_matrix import augment, eigenvalue_over_interval
-from obsynth.derive.constants.symmetric_field import SymmetricField
+from obsynth.derive.constants.symmetric_field import (
+    SymmetricField,
+    augment,
+    eigenvalue_over_interval,
+)
 from obsynth.derive.intervals.ranges import Ends, Status
-from obsynth.derive.jacobian.matrix_entries import MatrixEntries
+from obsynth.derive.jacobian.entries import MatrixEntries
 from obsynth.derive.rigour import UNIT_ROUNDOFF, down, largest_eigenvalue, perron_bound, up
 from obsynth.symbolic.arrays import FloatArray
 

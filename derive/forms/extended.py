@@ -13,8 +13,8 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.errors import StructureError
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.jacobian.family import find_dependences
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
 from obsynth.derive.rigour import round_number, substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant

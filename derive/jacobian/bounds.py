@@ -18,7 +18,7 @@ from obsynth.derive.algebra.zero_test import is_zero, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, Status, bound_ranges
-from obsynth.derive.jacobian.entries import COLUMNS, all_variables, jacobian_entries
+from obsynth.derive.jacobian.entries import COLUMNS, MatrixEntries, all_variables, jacobian_entries
 from obsynth.derive.jacobian.family import (
     AffineDependence,
     AffineFamily,
@@ -26,7 +26,6 @@ from obsynth.derive.jacobian.family import (
     entry_name,
     find_dependences,
 )
-from obsynth.derive.jacobian.matrix_entries import MatrixEntries
 from obsynth.derive.rigour import enclose_number, rational, substitute
 from obsynth.derive.split import Split
 from obsynth.symbolic.arrays import FloatArray

@@ -11,9 +11,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from obsynth.derive.algebra.slopes import slope
+from obsynth.derive.algebra.linear_parts import slope
 from obsynth.derive.errors import StructureError
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.rigour import substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.slopes import jacobian
+from obsynth.derive.algebra.linear_parts import jacobian
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.plant import Plant

@@ -5,12 +5,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.designs.bounded_error.record import UioDesign
-from obsynth.designs.core.boxes import Ends, select, some
+from obsynth.designs.core.boxes import Ends, Rounding, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.outwards import Rounding
-from obsynth.designs.core.running import SETTLED, UP, Running, above, all_around, settle, shaken
+from obsynth.designs.core.half_widths import SETTLED, UP, Running, above, all_around, settle, shaken
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -15,10 +15,8 @@ import numpy as np
 
 from obsynth.derive.intervals.program import CONSTANT_ULPS, constant_interval
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import FAR, Ends, Lifted, Rounding
 from obsynth.designs.core.equations import Before, Equations
-from obsynth.designs.core.limits import FAR
-from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
+from obsynth.designs.core.backward import Pair
 from obsynth.designs.core.boxes import Ends, every
-from obsynth.designs.core.sweeps import Pair
 from obsynth.symbolic.arrays import FloatArray
 
 Parts = Mapping[str, ca.SX]

@@ -8,10 +8,8 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import Program, evaluate
-from obsynth.designs.core.boxes import Ends, cut_box
+from obsynth.designs.core.boxes import FAR, Ends, Lifted, Rounding, cut_box
 from obsynth.designs.core.lifted import clamped, combine, lift
-from obsynth.designs.core.limits import FAR
-from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 

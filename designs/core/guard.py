@@ -16,15 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import near_box
+from obsynth.designs.core.backward import Sweeps
+from obsynth.designs.core.boxes import LIMITS, near_box
 from obsynth.designs.core.certificate import Guarantee
 from obsynth.designs.core.contractor import CUTS, EVERY_CUT, Contractor, Cut
 from obsynth.designs.core.errors import CertificateError
 from obsynth.designs.core.half_widths import MOST_PASSES, HalfWidths
-from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.record import Precision, precision_of
 from obsynth.designs.core.stepping import slices
-from obsynth.designs.core.sweeps import Sweeps
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 

@@ -18,8 +18,7 @@ from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import PARTIAL, RULES
 from obsynth.derive.rigour.interval import UNIT
-from obsynth.designs.core.limits import FAR
-from obsynth.designs.core.outwards import Lifted, Rounding
+from obsynth.designs.core.boxes import FAR, Lifted, Rounding
 
 _TWO_PI = 2.0 * np.pi
 

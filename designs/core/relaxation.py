@@ -16,9 +16,9 @@ from obsynth.derive.intervals.functions import ULPS
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import PARTIAL
 from obsynth.designs.core.backward import composed
+from obsynth.designs.core.boxes import Lifted, Rounding
 from obsynth.designs.core.lifted import clamped as between
 from obsynth.designs.core.lifted import combine, is_point, lift, needed
-from obsynth.designs.core.outwards import Lifted, Rounding
 
 
 @dataclass(frozen=True, eq=False)

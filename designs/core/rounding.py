@@ -41,7 +41,7 @@ from obsynth.derive.intervals.program import constant_interval
 from obsynth.derive.intervals.rules import NAMES, RULES
 from obsynth.derive.rigour import Interval, down, up
 from obsynth.derive.rigour.interval import TINY, UNIT, multiply, raised
-from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.boxes import LIMITS
 from obsynth.designs.core.rounding_rules import (
     NO_ROUNDING,
     ONE_ROUNDING,

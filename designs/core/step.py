@@ -5,6 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
+from obsynth.designs.core.backward import Pair
 from obsynth.designs.core.boxes import Ends, column, every, select, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before, covered_inputs
@@ -17,7 +18,6 @@ from obsynth.designs.core.stepping import (
     make_step,
     status_word,
 )
-from obsynth.designs.core.sweeps import Pair
 from obsynth.symbolic.arrays import FloatArray
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive import DerivationError, UnboundedError, jacobian_bounds
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.jacobian.slope_signs import with_ranges
 from obsynth.derive.rigour import substitute
 from obsynth.designs.core.certificate import Claim, Guarantee

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.boxes import Ends, column, every, some
+from obsynth.designs.core.boxes import LIMITS, Ends, column, every, some
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.filter_bank.record import UNKNOWN, BankDesign

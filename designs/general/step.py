@@ -5,12 +5,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.derive.rigour import add_up
-from obsynth.designs.core.boxes import Ends, column, every
+from obsynth.designs.core.boxes import LIMITS, Ends, column, every
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import curved_states
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.limits import LIMITS
-from obsynth.designs.core.running import (
+from obsynth.designs.core.half_widths import (
     ROUND_UP,
     SETTLED,
     UP,
@@ -23,8 +22,8 @@ from obsynth.designs.core.running import (
 )
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.lmis import rounding_in
+from obsynth.designs.general.model import error_system, magnitude
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
-from obsynth.designs.general.system import error_system, magnitude
 from obsynth.symbolic.arrays import FloatArray
 
 

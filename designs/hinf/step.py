@@ -3,10 +3,9 @@
 import casadi as ca
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends, select
+from obsynth.designs.core.boxes import LIMITS, Ends, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.limits import LIMITS
 from obsynth.designs.core.signals import noise_centre
 from obsynth.designs.core.stepping import all_finite, clip, inside
 from obsynth.designs.hinf.record import HinfDesign

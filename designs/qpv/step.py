@@ -6,16 +6,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends, select
+from obsynth.designs.core.boxes import LIMITS, Ends, Rounding, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
-from obsynth.designs.core.limits import LIMITS
-from obsynth.designs.core.outwards import Rounding
-from obsynth.designs.core.running import above
+from obsynth.designs.core.half_widths import above
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices
-from obsynth.designs.qpv.equations import Equations, build_update, symbols_of
+from obsynth.designs.qpv.equations import Equations, build_update, of_outputs, symbols_of
 from obsynth.designs.qpv.record import QPVDesign
-from obsynth.designs.qpv.rounding import of_outputs
 from obsynth.symbolic.arrays import FloatArray
 
 REAL = {"double": np.float64, "single": np.float32}

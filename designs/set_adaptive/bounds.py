@@ -15,9 +15,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from obsynth.derive.forms.measured import Known, readings
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV
+from obsynth.derive.forms.scheduling import Known, readings
 from obsynth.derive.intervals.ranges import bound_ranges
 from obsynth.derive.rigour import substitute
 from obsynth.designs.core.boxes import column

@@ -7,7 +7,7 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive import QuasiLPV, Split, StructureError, quasi_lpv
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.rigour import middle_and_radius, round_number, substitute
 from obsynth.designs.core.given import PlantClass
 from obsynth.designs.set_adaptive.bounds import EndBounds, derive_bounds

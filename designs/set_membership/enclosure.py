@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 
 from obsynth.derive.intervals.program import Program
+from obsynth.designs.core.backward import Sweeps
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.relaxation import Affine, relax
-from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.set_membership.zonotope import DOUBLE, Real, Zonotope, moved
 from obsynth.symbolic.arrays import IntArray
 

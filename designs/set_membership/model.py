@@ -7,12 +7,11 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.backward import Sweeps
+from obsynth.designs.core.boxes import FAR, Ends
 from obsynth.designs.core.contractor import EVERY_CUT, Contractor
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.given import PlantClass
-from obsynth.designs.core.limits import FAR
-from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.general.model import GeneralModel
 from obsynth.designs.set_membership.enclosure import Enclosures, told_by_rate
 from obsynth.symbolic import Plant, Role

@@ -11,14 +11,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.designs.core.boxes import Ends, every, select
+from obsynth.designs.core.backward import Sweeps
+from obsynth.designs.core.boxes import LIMITS, Ends, every, select
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.equations import Before
 from obsynth.designs.core.given import Start
 from obsynth.designs.core.guard import Watch
-from obsynth.designs.core.limits import LIMITS
-from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.general import step as general
 from obsynth.designs.general.record import GeneralDesign
 from obsynth.designs.set_membership.enclosure import Enclosures, middle_of

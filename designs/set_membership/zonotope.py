@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from obsynth.designs.core.boxes import Ends
-from obsynth.designs.core.outwards import Rounding
+from obsynth.designs.core.boxes import Ends, Rounding
 from obsynth.symbolic.arrays import FloatArray
 
 FEW = 12

@@ -11,8 +11,7 @@ import numpy as np
 
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.evaluate.campaigns.facts import Job, Row
-from obsynth.evaluate.campaigns.parts import Parts, fingerprint
+from obsynth.evaluate.campaigns.parts import Job, Parts, Row, fingerprint
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.progress import bar
 from obsynth.evaluate.run import percent

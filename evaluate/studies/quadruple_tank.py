@@ -12,12 +12,11 @@ from obsynth.codegen import CProject, generate_c
 from obsynth.codegen.folder import complete_folder
 from obsynth.derive import JacobianBounds, jacobian_bounds, split
 from obsynth.designs import BoundedErrorUIO, Observer
-from obsynth.evaluate.coverage import coverage_summary
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.papers.buciakowski import ask, claims_of, tank
 from obsynth.evaluate.papers.claim import Claim, claims_table
 from obsynth.evaluate.report import report
-from obsynth.evaluate.run import Run, percent
+from obsynth.evaluate.run import Run, coverage_summary, percent
 from obsynth.evaluate.simulate import simulate
 from obsynth.symbolic import Scenario, scenarios
 from obsynth.symbolic.arrays import FloatArray

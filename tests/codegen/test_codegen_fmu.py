@@ -21,7 +21,7 @@ from obsynth.codegen.kernel import REALS
 from obsynth.codegen.single import machine_of
 from obsynth.codegen.start import start_of
 from obsynth.derive.rigour import outward
-from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.boxes import LIMITS
 
 fmpy = pytest.importorskip("fmpy")
 from fmpy.fmi2 import FMU2Slave  # noqa: E402

@@ -20,8 +20,8 @@ from obsynth.codegen.functions import FARTHEST, ULPS, own_function
 from obsynth.codegen.kernel import EXACT, LIBRARY, SINGLE
 from obsynth.codegen.single import SingleMachine
 from obsynth.codegen.tape import write_function
+from obsynth.designs.core.boxes import Lifted, Rounding
 from obsynth.designs.core.lifted import combine
-from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.designs.core.rounding import rounding_bound
 
 NAMES = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "pow": "power"}

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from obsynth.codegen import CodegenError, find_compiler, generate_c
-from obsynth.codegen import parts as parts_module
+from obsynth.codegen import kernel as kernel_module
 from obsynth.codegen.casadi_text import generate_kernel
 from obsynth.codegen.kernel import DOUBLE, REALS, SINGLE, Real
 from obsynth.codegen.single import machine_of
@@ -219,8 +219,8 @@ def test_random_functions_are_those_of_the_machine(
     expected = virtual(step, rows)
     whole = write_tape(step, "p", place).functions
     assert differing(run(step, whole, rows, tmp_path / "whole"), expected) == 0
-    monkeypatch.setattr(parts_module, "_LONG", 20)
-    monkeypatch.setattr(parts_module, "_PART", 20)
+    monkeypatch.setattr(kernel_module, "_LONG", 20)
+    monkeypatch.setattr(kernel_module, "_PART", 20)
     cut = write_tape(step, "p", place).functions
     assert cut.count("static void p_part_") >= 5
     assert differing(run(step, cut, rows, tmp_path / "cut"), expected) == 0

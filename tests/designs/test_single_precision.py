@@ -12,18 +12,15 @@ import obsynth as ob
 from methods import METHODS, SINGLE, observer_of, two_tanks
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.rigour import inward
-from obsynth.designs.core.boxes import Ends, cut_box
+from obsynth.designs.core.boxes import LIMITS, Ends, Lifted, Rounding, cut_box
 from obsynth.designs.core.contractor import Contractor
 from obsynth.designs.core.core import Seen
-from obsynth.designs.core.half_widths import HalfWidths
+from obsynth.designs.core.half_widths import HalfWidths, Running, all_around
 from obsynth.designs.core.lifted import lift
-from obsynth.designs.core.limits import LIMITS
-from obsynth.designs.core.outwards import Lifted, Rounding
 from obsynth.designs.core.rounding import rounding_bound
-from obsynth.designs.core.running import Running, all_around
 from obsynth.designs.core.stepping import clip, inside
+from obsynth.designs.general.claims import settle, shown
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.general.rounding import settle, shown
 from obsynth.designs.general.step import build_core, memory_sizes, stages
 from obsynth.designs.set_membership.synthesis import frame
 from obsynth.designs.set_membership.zonotope import (

@@ -16,8 +16,7 @@ from obsynth.evaluate import (
     report,
     simulate,
 )
-from obsynth.evaluate.coverage import coverage_summary
-from obsynth.evaluate.run import Run
+from obsynth.evaluate.run import Run, coverage_summary
 from obsynth.symbolic import Plant, Table
 
 pytestmark = [pytest.mark.usefixtures("no_window"), pytest.mark.filterwarnings("error")]

@@ -11,8 +11,7 @@ from scipy.stats import binom
 
 import obsynth as ob
 from obsynth.evaluate.campaigns.campaign import interval
-from obsynth.evaluate.campaigns.facts import facts
-from obsynth.evaluate.campaigns.parts import Parts
+from obsynth.evaluate.campaigns.parts import Parts, facts
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +99,7 @@ def test_a_campaign_goes_on(tmp_path, observer, scenario, monkeypatch):
             raise KeyboardInterrupt
         return original(plant, observer, scenario, seed, substeps=substeps)
 
-    monkeypatch.setattr("obsynth.evaluate.campaigns.facts.simulate", counted)
+    monkeypatch.setattr("obsynth.evaluate.campaigns.parts.simulate", counted)
     monkeypatch.setattr("obsynth.evaluate.campaigns.campaign._TOGETHER", 201)
     with pytest.raises(KeyboardInterrupt):
         ob.campaign(observer, scenario, 4, folder=folder, workers=1)
@@ -132,7 +131,7 @@ def test_a_run_that_is_refused_is_a_row(observer, scenario, monkeypatch):
     def refuses(*args, **keywords):
         raise ob.SimulationError("the truth is no number")
 
-    monkeypatch.setattr("obsynth.evaluate.campaigns.facts.simulate", refuses)
+    monkeypatch.setattr("obsynth.evaluate.campaigns.parts.simulate", refuses)
     found = ob.campaign(observer, scenario, 1, workers=1)
     assert found.rows[0]["refused"] == "the truth is no number" and not found.rows[0]["kept"]
     assert "1 runs were refused" in found.table().note

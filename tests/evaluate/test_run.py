@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.evaluate import SimulationError, coverage_table, simulate
-from obsynth.evaluate.coverage import coverage_summary
-from obsynth.evaluate.run import percent
+from obsynth.evaluate.run import coverage_summary, percent
 
 
 def test_a_sound_observer_covers_every_instant(toy_run, toy):
@@ -159,7 +158,7 @@ def test_status_bits_are_counted_and_explained(toy_run):
 
 def test_every_bit_of_the_contract_has_a_sentence():
     from obsynth.designs.core.observer import STATUS
-    from obsynth.evaluate.domain import count_status
+    from obsynth.evaluate.trace import count_status
 
     counts = count_status(np.array([sum(STATUS.values())]))
     assert [c.bit for c in counts] == [1, 2, 4, 8, 16, 32, 64]

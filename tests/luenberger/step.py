@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from luenberger.record import LuenbergerDesign
 from luenberger.synthesis import prediction
-from obsynth.designs.core.boxes import Ends, select
+from obsynth.designs.core.boxes import Ends, Rounding, select
 from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start
-from obsynth.designs.core.outwards import Rounding
-from obsynth.designs.core.running import UP, above
+from obsynth.designs.core.half_widths import UP, above
 from obsynth.designs.core.signals import finite_box
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.symbolic.arrays import FloatArray

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.equations import canonical, read_rows
 from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.from_casadi import from_tape
 from obsynth.symbolic.functions import BY_NAME, phi1, tanhc
 from obsynth.symbolic.sxmodel import ParityError, check_parity, sample_box
-from obsynth.symbolic.tape import from_tape
 from obsynth.symbolic.text import read_text
 from obsynth.symbolic.written import write_text
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.designs.core.limits import LIMITS
+from obsynth.designs.core.boxes import LIMITS
 
 HERE = Path(__file__).parent
 

@@ -1,4 +1,4 @@
-"""Elementwise bounds A_lower <= A(rho) <= A_upper as functions of what is measured.
+"""Bounds of a form's matrices: constant, as functions of what is measured, and centred.
 
 An entry that is monotone in every unknown signal over the box takes its extremes where the unknown
 signals are at an end. Where a whole entry is not monotone, its terms are bounded one by one: by
@@ -6,17 +6,82 @@ monotonicity, as a known factor times an unknown one, or by a constant range.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
+import numpy as np
 import sympy as sp
+from numpy.typing import ArrayLike
 
 from obsynth.derive.algebra.factorise import expand_terms
-from obsynth.derive.errors import UnboundedError
-from obsynth.derive.forms.measured import Known
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
-from obsynth.derive.rigour import rational
+from obsynth.derive.errors import DerivationError, UnboundedError
+from obsynth.derive.forms.scheduling import Known, Lift
+from obsynth.derive.forms.varying import Vertices
+from obsynth.derive.jacobian.entries import matrix_entries
+from obsynth.derive.rigour import UNIT_ROUNDOFF, enclose_number, rational
+from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.plant import Plant
+from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.signals import Signal
+
+
+@dataclass(frozen=True, eq=False)
+class Ranging:
+    """How ranges of entries of a form are found; ``lifts`` are symbols with ranges of slopes."""
+
+    matrix: sp.Matrix
+    lifts: tuple[Lift, ...]
+    rtol: float
+    effort: str
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class IntervalForm(Shown):
+    """A_min <= A(rho) <= A_max elementwise over the box, and the same for B and the offset.
+
+    minimum, maximum: guaranteed bounds of ``"A"`` (n, n), ``"B"`` (n, n_u), ``"offset"`` (n, 1)
+    """
+
+    minimum: dict[str, FloatArray]
+    maximum: dict[str, FloatArray]
+
+    @property
+    def A_min(self) -> FloatArray:
+        """Lower bound of A, shape (n, n)."""
+        return self.minimum["A"]
+
+    @property
+    def A_max(self) -> FloatArray:
+        """Upper bound of A, shape (n, n)."""
+        return self.maximum["A"]
+
+    def __str__(self) -> str:
+        lines = ["bounds of A"]
+        for (i, j), low in np.ndenumerate(self.A_min):
+            if (high := self.A_max[i, j]) > low:
+                lines.append(f"  a{i + 1}{j + 1} in [{low:.8g}, {high:.8g}]")
+        return "\n".join(lines)
+
+
+def make_interval_form(blocks: dict[str, sp.Matrix], model: Plant, way: Ranging) -> IntervalForm:
+    """Bound the blocks of a form elementwise."""
+    minimum, maximum = {}, {}
+    for name, block in blocks.items():
+        low, high = np.zeros(block.shape), np.zeros(block.shape)
+        varying = {}
+        for place in np.ndindex(*block.shape):
+            if block[place].free_symbols:
+                varying[place] = block[place]
+            else:
+                low[place], high[place] = enclose_number(block[place])
+        entries = matrix_entries(varying, model, [lift.signal for lift in way.lifts])
+        if entries.places:
+            found = entries.ranges(way.rtol, way.effort, name)
+            for k, place in enumerate(entries.places):
+                low[place], high[place] = found.lower[k], found.upper[k]
+        minimum[name], maximum[name] = low, high
+    return IntervalForm(minimum, maximum)
+
 
 Entry = tuple[int, int]
 Ends = tuple[sp.Expr, sp.Expr]
@@ -160,3 +225,75 @@ def _times(factor: sp.Expr, low: sp.Expr, high: sp.Expr) -> Ends:
     if factor.is_number:
         return (factor * low, factor * high) if factor >= 0 else (factor * high, factor * low)
     return sp.Min(factor * low, factor * high), sp.Max(factor * low, factor * high)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CentredForm(Shown):
+    """Nominal matrices plus a remainder: A(rho) = A + Delta, Delta in a polytope and in a box.
+
+    The remainder has vertices (N, n, n), (N, n, n_u), and elementwise bounds, rounded outwards; the
+    radius is what rounding may add beyond the hull of the vertices, and exact tells whether that
+    hull is the remainder itself.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    A_vertices: FloatArray
+    B_vertices: FloatArray
+    A_lower: FloatArray
+    A_upper: FloatArray
+    B_lower: FloatArray
+    B_upper: FloatArray
+    A_radius: FloatArray
+    B_radius: FloatArray
+    exact: bool
+
+    def __str__(self) -> str:
+        width = self.A_vertices.max(axis=0) - self.A_vertices.min(axis=0)
+        return (
+            f"A nominal with {int((width > 0.0).sum())} varying entries of width at most "
+            f"{float(width.max(initial=0.0)):.6g}, "
+            f"{len(self.A_vertices)} vertices ({'exact' if self.exact else 'outer'})"
+        )
+
+
+def centre_form(polytope: Vertices, nominal: ArrayLike | None = None) -> CentredForm:
+    """Split a polytopic form into nominal matrices and a remainder."""
+    family, layout = polytope.family, polytope.layout
+    middle = family.midpoint
+    place_A, place_B = layout.place("A"), layout.place("B")
+    if nominal is not None:
+        given = np.asarray(nominal, dtype=float)
+        if given.shape != middle[place_A].shape or not np.isfinite(given).all():
+            raise DerivationError(
+                f"the nominal A needs finite entries and the shape {middle[place_A].shape}; given "
+                f"was {given.tolist()}",
+                given=given,
+            )
+        middle[place_A] = given
+    half = family.half_ranges
+    around = replace(
+        family, constant=family.midpoint - middle, ranges=np.stack([-half, half], axis=1)
+    )
+    vertices = around.vertices()
+    weights = np.abs(family.directions)
+    largest = np.abs(family.constant) + np.abs(middle)
+    largest += np.tensordot(np.abs(family.ranges).max(axis=1, initial=0.0), weights, axes=1)
+    varying = (np.tensordot(half, weights, axes=1) > 0.0) | (around.constant != 0.0)
+    steps = 4 * (len(family.ranges) + 4)
+    slack = family.radius + np.where(varying, steps * UNIT_ROUNDOFF * largest, 0.0)
+    lower = np.where(slack > 0.0, np.nextafter(vertices.min(axis=0) - slack, -np.inf), 0.0)
+    upper = np.where(slack > 0.0, np.nextafter(vertices.max(axis=0) + slack, np.inf), 0.0)
+    return CentredForm(
+        middle[place_A],
+        middle[place_B],
+        vertices[:, place_A[0], place_A[1]],
+        vertices[:, place_B[0], place_B[1]],
+        lower[place_A],
+        upper[place_A],
+        lower[place_B],
+        upper[place_B],
+        slack[place_A],
+        slack[place_B],
+        polytope.exact,
+    )

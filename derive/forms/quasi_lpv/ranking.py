@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.forms.measured import known_signals
 from obsynth.derive.forms.quasi_lpv.options import Option, Share, kept
 from obsynth.derive.forms.quasi_lpv.terms import Centre, Term, deviations, row_names
-from obsynth.derive.forms.scheduling import Lift
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.forms.scheduling import Lift, known_signals
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.symbolic.display import short
 from obsynth.symbolic.functions import phi1, tanhc
 from obsynth.symbolic.plant import Plant

@@ -11,7 +11,7 @@ from obsynth.derive.algebra.factorise import expand_terms
 from obsynth.derive.equilibrium import Equilibrium, equilibrium
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.forms.quasi_lpv.options import Option, kept, options
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.rigour import rational, substitute
 from obsynth.symbolic.equations import read_rows
 from obsynth.symbolic.plant import Plant

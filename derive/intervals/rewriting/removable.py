@@ -20,8 +20,8 @@ from obsynth.derive.rigour import substitute
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.errors import PlantError
+from obsynth.symbolic.from_casadi import from_tape
 from obsynth.symbolic.functions import BY_NAME
-from obsynth.symbolic.tape import from_tape
 
 # Inside this distance of zero the named functions switch to their Taylor polynomials.
 _PATCH = 1.0 / 8.0

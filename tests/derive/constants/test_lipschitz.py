@@ -10,10 +10,10 @@ import sympy as sp
 
 from obsynth.derive import Status, UnboundedError, jacobian_bounds, split
 from obsynth.derive.constants.eigenvalue_search import Maximum
-from obsynth.derive.constants.interval_matrix import eigenvalue_over_interval
 from obsynth.derive.constants.lipschitz import _inner, lipschitz
+from obsynth.derive.constants.symmetric_field import eigenvalue_over_interval
 from obsynth.derive.errors import DerivationError
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.symbolic import Plant, plants
 
 

@@ -9,12 +9,11 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import Status, split
-from obsynth.derive.constants import majorant_parts
+from obsynth.derive.constants import majorant as module
 from obsynth.derive.constants.eigenvalue_search import Maximum
-from obsynth.derive.constants.majorant import majorant
-from obsynth.derive.constants.majorant_parts import largest_together, scaled
+from obsynth.derive.constants.majorant import largest_together, majorant, scaled
 from obsynth.derive.errors import DerivationError, UnboundedError
-from obsynth.derive.jacobian.matrix_entries import matrix_entries
+from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.rigour import UNIT_ROUNDOFF
 from obsynth.derive.rigour.interval import smallest_above
 from obsynth.symbolic import Plant, plants
@@ -344,7 +343,7 @@ def test_the_root_of_the_diagonal_is_not_lost(monkeypatch):
     (x,) = plant.states("x", range=(-1, 1))
     plant.dynamics([x**2], Ts=1)
     plant.outputs([x])
-    monkeypatch.setattr(majorant_parts, "matrix_maximum", tight)
+    monkeypatch.setattr(module, "matrix_maximum", tight)
     for d in np.random.default_rng(0).uniform(0.5, 40.0, 100):
         entries = matrix_entries({(0, 0): 2 * x}, plant)
         found = largest_together(entries, np.full((1, 1), 2.0), (0,), np.array([d]), 1e-6, "fast")

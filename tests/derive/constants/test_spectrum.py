@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive.constants import eigenvalue_search as search
-from obsynth.derive.constants import interval_matrix
+from obsynth.derive.constants import symmetric_field
 from obsynth.derive.constants.eigenvalue_search import largest_over_box
-from obsynth.derive.constants.interval_matrix import (
+from obsynth.derive.constants.symmetric_field import (
+    SymmetricField,
     augment,
     eigenvalue_over_interval,
 )
-from obsynth.derive.constants.symmetric_field import SymmetricField
 from obsynth.derive.intervals.ranges import Status, bound_ranges, make_problem
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
@@ -63,7 +63,7 @@ def test_sign_matrices_find_the_largest_eigenvalue_of_all_corners(seed):
 
 def test_one_sign_pattern_is_not_enough(monkeypatch):
     monkeypatch.setattr(
-        interval_matrix, "sign_patterns", lambda coupled, most=16: np.ones((1, len(coupled)))
+        symmetric_field, "sign_patterns", lambda coupled, most=16: np.ones((1, len(coupled)))
     )
     short = 0
     for seed in range(6):
@@ -98,8 +98,8 @@ def test_signs_of_separate_parts_are_not_multiplied():
     coupled = np.zeros((6, 6), dtype=bool)
     for i, j in ((0, 1), (2, 3), (4, 5)):
         coupled[i, j] = coupled[j, i] = True
-    assert len(interval_matrix.sign_patterns(coupled)) == 8
-    assert len(interval_matrix.sign_patterns(np.diag(np.ones(30, dtype=bool)))) == 1
+    assert len(symmetric_field.sign_patterns(coupled)) == 8
+    assert len(symmetric_field.sign_patterns(np.diag(np.ones(30, dtype=bool)))) == 1
 
 
 @pytest.mark.parametrize("size", [2, 9])

@@ -8,9 +8,9 @@ import pytest
 import sympy as sp
 
 from obsynth.derive import DerivationError, UnboundedError
-from obsynth.derive.forms.measured import Known, readings
-from obsynth.derive.forms.quasi_lpv.build import quasi_lpv
 from obsynth.derive.forms.quasi_lpv.elementwise import bound_elements
+from obsynth.derive.forms.quasi_lpv.form import quasi_lpv
+from obsynth.derive.forms.scheduling import Known, readings
 from obsynth.symbolic import Plant, plants
 
 REFERENCE = Path(__file__).parents[2] / "reference"

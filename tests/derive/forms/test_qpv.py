@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, StructureError, UnboundedError
-from obsynth.derive.forms.qpv import build
-from obsynth.derive.forms.qpv.augment import augment_plant
+from obsynth.derive.forms.qpv import build as module
 from obsynth.derive.forms.qpv.build import prove_quadratic, qpv
+from obsynth.derive.forms.qpv.form import augment_plant
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational
@@ -333,7 +333,7 @@ def test_a_changed_coefficient_is_caught(plant, data):
 
 
 def test_a_product_on_the_wrong_place_never_leaves_the_room(monkeypatch):
-    right = build.read_coefficients
+    right = module.read_coefficients
 
     def shifted(plant, layout, form_of_N):
         entries = right(plant, layout, form_of_N)
@@ -341,7 +341,7 @@ def test_a_product_on_the_wrong_place_never_leaves_the_room(monkeypatch):
         entries[(0, column + 1)] = entries.pop((0, column))
         return entries
 
-    monkeypatch.setattr(build, "read_coefficients", shifted)
+    monkeypatch.setattr(module, "read_coefficients", shifted)
     with pytest.raises(DerivationError, match="row of x1 is not the plant's"):
         qpv(plants.qpv_example())
 

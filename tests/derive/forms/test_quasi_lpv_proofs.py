@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError
 from obsynth.derive.algebra.zero_test import NUMERIC, FormProof
-from obsynth.derive.forms.quasi_lpv import build
-from obsynth.derive.forms.quasi_lpv.build import prove_form, quasi_lpv
+from obsynth.derive.forms.quasi_lpv import form as module
+from obsynth.derive.forms.quasi_lpv.form import prove_form, quasi_lpv
 from obsynth.derive.forms.quasi_lpv.terms import stacked_rows
 from obsynth.symbolic import Plant, plants
 
@@ -45,12 +45,12 @@ def test_a_dropped_or_moved_term_is_caught(name):
 
 
 def test_a_wrong_assembly_never_leaves_the_room(monkeypatch):
-    right = build.assemble
+    right = module.assemble
 
     def forgetful(model, layout, centre, terms, chosen):
         return right(model, layout, centre, terms[1:], chosen[1:])
 
-    monkeypatch.setattr(build, "assemble", forgetful)
+    monkeypatch.setattr(module, "assemble", forgetful)
     with pytest.raises(DerivationError, match="is not the plant's"):
         quasi_lpv(plants.quadruple_tank())
 

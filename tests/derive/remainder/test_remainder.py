@@ -8,11 +8,17 @@ import sympy as sp
 from obsynth.derive import StructureError, UnboundedError
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.program import Program, evaluate
-from obsynth.derive.remainder import flow, work
+from obsynth.derive.remainder import certify
 from obsynth.derive.remainder.certify import discretisation_remainder
-from obsynth.derive.remainder.flow import FlowError, flow_box
 from obsynth.derive.remainder.result import Remainder
-from obsynth.derive.remainder.system import step_derivatives, system, time_derivatives
+from obsynth.derive.remainder.system import (
+    FlowError,
+    flow_box,
+    flow_tubes,
+    step_derivatives,
+    system,
+    time_derivatives,
+)
 from obsynth.derive.remainder.trees import difference_term, trees
 from obsynth.symbolic import Plant, plants
 from obsynth.symbolic.discretise import step_formula
@@ -196,15 +202,15 @@ def test_box_that_is_not_inflated_fails(monkeypatch):
         n = len(dynamics.names)
         return dynamics.lower[:n], dynamics.upper[:n]
 
-    monkeypatch.setattr(work, "flow_box", still)
+    monkeypatch.setattr(certify, "flow_box", still)
     assert grown("euler") > 0
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 def test_wrong_power_of_the_step_fails(monkeypatch, method):
     """Ts in place of Ts^2 for a step of more than one second, one power too many below."""
-    whole = work.step_factor
-    monkeypatch.setattr(work, "step_factor", lambda Ts, k, *parts: whole(Ts, k + 1, *parts))
+    whole = certify.step_factor
+    monkeypatch.setattr(certify, "step_factor", lambda Ts, k, *parts: whole(Ts, k + 1, *parts))
     assert grown(method) > 0
 
 
@@ -219,19 +225,19 @@ def test_Ts_in_place_of_its_square_fails(monkeypatch):
         return exceeded(found, *local_errors(found, 300))
 
     assert check() == 0
-    whole = work.step_factor
-    monkeypatch.setattr(work, "step_factor", lambda Ts, k, *parts: whole(Ts, k - 1, *parts))
+    whole = certify.step_factor
+    monkeypatch.setattr(certify, "step_factor", lambda Ts, k, *parts: whole(Ts, k - 1, *parts))
     # a factorial less makes up for a power of 4 less only in part
     assert check() > 0
 
 
 def test_a_tree_left_out_fails(monkeypatch):
-    whole = work.difference_term
+    whole = certify.difference_term
 
     def short(x, rhs, method, order):
         return ca.SX.zeros(rhs.numel()) if order == 2 else whole(x, rhs, method, order)
 
-    monkeypatch.setattr(work, "difference_term", short)
+    monkeypatch.setattr(certify, "difference_term", short)
     assert grown("euler") > 0
 
 
@@ -290,7 +296,7 @@ def test_solution_that_escapes_is_refused():
 def test_tubes_hold_the_exact_solution():
     dynamics = system(growing())
     start = np.array([[1.0, 1.5, 2.0]])
-    lower, upper = flow.flow_tubes(dynamics, start, start, np.zeros((0, 3)), 0.1)
+    lower, upper = flow_tubes(dynamics, start, start, np.zeros((0, 3)), 0.1)
     for s in np.linspace(0, 0.1, 11):
         exact = 1 / (1 / start - s)
         assert (lower <= exact).all()

@@ -25,7 +25,7 @@ from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
 from obsynth.derive.intervals.rules import RULES
 from obsynth.designs.core.backward import contract
-from obsynth.designs.core.outwards import Lifted, Rounding
+from obsynth.designs.core.boxes import Lifted, Rounding
 from obsynth.designs.core.relaxation import relax
 
 

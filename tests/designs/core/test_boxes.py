@@ -4,8 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from obsynth.designs.core.boxes import Ends
-from obsynth.designs.core.limits import FAR
+from obsynth.designs.core.boxes import FAR, Ends
 
 NAN, INF = np.nan, np.inf
 

@@ -13,9 +13,8 @@ from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program, constant_interval, evaluate
 from obsynth.derive.intervals.rules import RULES
 from obsynth.designs.core import lifted
+from obsynth.designs.core.boxes import FAR, Lifted, Rounding
 from obsynth.designs.core.lifted import lift
-from obsynth.designs.core.limits import FAR
-from obsynth.designs.core.outwards import Lifted, Rounding
 
 ROUNDED = [
     *("add", "subtract", "multiply", "divide", "power_int", "power_const", "power", "sqrt"),

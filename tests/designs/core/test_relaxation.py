@@ -11,7 +11,7 @@ from operations import FAR, NEAR, PRECISION, TRIED, UP, drawn, points, program_o
 
 from obsynth.derive.intervals.graph import Node
 from obsynth.derive.intervals.program import Program
-from obsynth.designs.core.outwards import Lifted, Rounding
+from obsynth.designs.core.boxes import Lifted, Rounding
 from obsynth.designs.core.relaxation import relax
 
 

@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 import obsynth as ob
-from obsynth.designs.core.running import Running, settle
+from obsynth.designs.core.half_widths import Running, settle
 from obsynth.designs.general.method import GeneralUIO
 from obsynth.designs.general.step import running, settling
 
@@ -53,7 +53,7 @@ def test_half_widths_that_grow_to_their_limit_are_said_to_be_the_limit():
 
 def test_nothing_is_said_of_what_is_not_shown_to_fall(monkeypatch):
     """Errors that go round in a circle."""
-    monkeypatch.setattr("obsynth.designs.core.running.MOST_CALLS", 99)
+    monkeypatch.setattr("obsynth.designs.core.half_widths.MOST_CALLS", 99)
     circle = Running(0.9999 * np.roll(np.eye(3), 1, axis=0), NONE, np.eye(3)[:1], ONE, root=False)
     for calls in (5, None):
         _, widths = settle([circle], np.array([10.0, 0.0, 0.0]), calls)

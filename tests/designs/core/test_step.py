@@ -9,10 +9,9 @@ import sympy as sp
 from contracted import made
 
 import obsynth as ob
-from obsynth.designs.core.boxes import Ends
+from obsynth.designs.core.boxes import FAR, Ends
 from obsynth.designs.core.core import Core, Known
 from obsynth.designs.core.guard import YOUNG, Guard, Watch
-from obsynth.designs.core.limits import FAR
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import all_finite, clip, extended, fill, largest_level
 

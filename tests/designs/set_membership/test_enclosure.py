@@ -8,10 +8,10 @@ import pytest
 import sympy as sp
 
 import obsynth as ob
+from obsynth.designs.core.backward import Sweeps
 from obsynth.designs.core.boxes import Ends
 from obsynth.designs.core.contractor import EVERY_CUT, Contractor
 from obsynth.designs.core.equations import Before
-from obsynth.designs.core.sweeps import Sweeps
 from obsynth.designs.set_membership.enclosure import Enclosures, middle_of, told_by_rate
 
 R = sp.Rational

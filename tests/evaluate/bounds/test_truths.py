@@ -13,10 +13,9 @@ import pytest
 from exactly import BITS
 from witness import PLANTS, exact_of, happened
 
-from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.certified import least, narrowed
 from obsynth.evaluate.bounds.least_bounds import LeastBounds
-from obsynth.evaluate.bounds.problem import pose
+from obsynth.evaluate.bounds.problem import enclose, pose
 
 
 def asked(truth):
