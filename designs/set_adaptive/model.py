@@ -143,7 +143,6 @@ def output_of_fault(
     C: FloatArray, flow: FloatArray, G: FloatArray, names: tuple[str, ...]
 ) -> list[int]:
     """Return for every fault the output that shows it first, by derivatives, then by size."""
-    flow = flow - np.diag(np.diag(flow))
     found = []
     for j, name in enumerate(names):
         reached = G[:, j]
@@ -198,12 +197,13 @@ def _speed(plant: Plant, C: FloatArray) -> tuple[FloatArray, FloatArray]:
     rows: dict[tuple[int, int], sp.Expr] = {}
     for k, output in enumerate(C):
         i = int(np.flatnonzero(output)[0])
-        row = sp.expand(sp.Rational(float(output[i])) * rhs[i])
+        # as typed: written out, a root of a sum of squares is one of a difference
+        row = sp.Rational(float(output[i])) * rhs[i]
         for j, symbol in enumerate(u):
-            factor = sp.diff(row, symbol)
+            factor = sp.diff(sp.expand(row), symbol)
             if factor.is_number:
                 input_rate[k, j] = round_number(factor)[0]
-                row = sp.expand(row - factor * symbol)
+                row = substitute(row, {symbol: sp.Integer(0)})
         rows[(k, 0)] = row
     rate = np.zeros((len(C), 2))
     entries = matrix_entries(rows, plant)

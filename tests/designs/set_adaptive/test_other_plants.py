@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import obsynth as ob
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.model import read
 
 NOISE = 0.02
 
@@ -124,3 +126,21 @@ def test_unstable_and_decoupled_states_are_designed_or_refused(A, measured, word
             SetAdaptiveObserver().design(coupled(A, measured))
         # a measured state is not called unmeasured because another output does not show it
         assert "unmeasured states (x1)" in str(refusal.value)
+
+
+def test_outputs_move_as_typed_not_as_written_out():
+    """Air between two zones: written out, the root of 1 + (a - b)^2 is one of a difference."""
+    plant = ob.Plant("two zones")
+    a, b = plant.states("a b", range=(15, 28))
+    (u,) = plant.inputs("u", range=(0, 3))
+    plant.actuator_faults("f", of=u, range=(-1, 0))
+    flow = 0.05 * (a - b) * sp.sqrt(1 + (a - b) ** 2)
+    plant.dynamics([u / 2 - flow - 0.1 * a, flow - 0.1 * b])
+    v, w = plant.disturbances("v w", bound=0.1)
+    plant.outputs([a + v, b + w])
+    found = read(plant)
+    assert found.input_rate == pytest.approx(np.array([[0.5], [0.0]]))
+    # less u / 2: f = -1, a = 28, b = 15 at the one end, f = 0, a = 15, b = 28 at the other
+    steep = 0.05 * 13 * np.sqrt(170)
+    assert found.rate[0] == pytest.approx([-0.5 - steep - 2.8, steep - 1.5], rel=1e-2)
+    assert found.rate[1] == pytest.approx([-steep - 2.8, steep - 1.5], rel=1e-2)
