@@ -6,13 +6,16 @@ of pieces with a sign each.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import cached_property
 
 import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.derive.algebra.linear_parts import slope
-from obsynth.derive.errors import StructureError
+from obsynth.derive.errors import StructureError, UnboundedError
+from obsynth.derive.jacobian.bounds import JacobianBounds, jacobian_bounds
 from obsynth.derive.jacobian.entries import matrix_entries
 from obsynth.derive.rigour import substitute
 from obsynth.symbolic.arrays import FloatArray
@@ -43,17 +46,33 @@ class Monotone:
         for j, signal in enumerate(signals):
             parts = self._parts(self.rows[row], signal.symbol)
             signs = {sign for sign in map(self._sign, parts) if sign != 0}
+            if None in signs and signal.name in self.plant.names("x"):
+                signs = {self._typed_sign(row, self.plant.names("x").index(signal.name))}
             if len(signs) > 1 or None in signs:
                 state = self.plant.names("x")[row]
                 raise StructureError(
-                    f"the equation of {state} is not monotone in {signal.name} over the region; "
-                    "narrow the region or the ranges",
+                    f"the equation of {state} is not proved to be monotone in {signal.name} over "
+                    "the region; narrow the region or the ranges",
                     symbol=signal.name,
                     row=state,
                     condition="monotone equations",
                 )
             found[j] = sum(sign for sign in signs if sign is not None)
         return found
+
+    def _typed_sign(self, row: int, column: int) -> int | None:
+        """Return the sign of a slope in a state of the equations as typed, not written out."""
+        if self._jacobian is None:
+            return None
+        low, high = self._jacobian.min[row, column], self._jacobian.max[row, column]
+        return 1 if low >= 0.0 else -1 if high <= 0.0 else None
+
+    @cached_property
+    def _jacobian(self) -> JacobianBounds | None:
+        """Bounds of all slopes in states; None of equations that jump or get steep without end."""
+        with suppress(StructureError, UnboundedError):
+            return jacobian_bounds(self.plant, rtol=1e-2, effort="fast")
+        return None
 
     def _parts(self, row: sp.Expr, symbol: sp.Symbol) -> list[list[sp.Expr]]:
         """Return the slope as a sum of products, each listed by its factors."""

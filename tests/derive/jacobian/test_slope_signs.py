@@ -27,7 +27,7 @@ def test_a_flow_that_turns_has_no_sign():
     """Mutants: one of its ends taken twice."""
     for ends in ((-1, 4), (-4, 1)):
         found = Monotone(times_a_flow(*ends))
-        with pytest.raises(StructureError, match="not monotone in y") as refused:
+        with pytest.raises(StructureError, match="not proved to be monotone in y") as refused:
             found.signs(0, found.plant.x)
         assert refused.value.symbol == "y" and refused.value.row == "x"
 
@@ -38,7 +38,7 @@ def test_slopes_that_take_both_signs_in_sum_are_refused():
     x, z = plant.states("x z", range=[(0, 1), (1, 4)])
     plant.dynamics([sp.sign(z) * sp.sqrt(sp.Abs(z)) - 2 * z, -z])
     plant.outputs([x])
-    with pytest.raises(StructureError, match="not monotone in z"):
+    with pytest.raises(StructureError, match="not proved to be monotone in z"):
         Monotone(plant).signs(0, plant.x)
 
 
@@ -53,3 +53,21 @@ def test_other_ranges_belong_to_signals_of_the_kind_alone():
 def test_slopes_have_the_rationals_that_doubles_are():
     x = sp.Symbol("x", real=True)
     assert exact_slope(0.1 * x * sp.Abs(x), x) == sp.Rational(0.1) * (sp.Abs(x) + x * sp.sign(x))
+
+
+def test_a_slope_is_bounded_as_typed_not_as_written_out():
+    """Air between two zones, whose slopes are told through a - b; -flow - 5 b falls and rises."""
+
+    def zones(loss):
+        plant = ob.Plant("two zones")
+        a, b = plant.states("a b", range=(15, 28))
+        flow = (a - b) * sp.sqrt(1 + (a - b) ** 2)
+        plant.dynamics([-flow - a, -flow - loss * b])
+        plant.outputs([a])
+        return Monotone(plant), plant.x
+
+    found, x = zones(30)
+    assert [found.signs(row, x).tolist() for row in (0, 1)] == [[-1, 1], [-1, -1]]
+    turning, x = zones(5)
+    with pytest.raises(StructureError, match="equation of b is not proved to be monotone in b"):
+        turning.signs(1, x)
