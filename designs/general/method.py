@@ -86,7 +86,8 @@ class GeneralUIO(Method):
             if where is None:
                 raise trouble from None
             told = str(trouble).splitlines()[0].split(";")[0]
-            raise type(trouble)(f"{model.name}: {where}", [told]) from None
+            facts = {**trouble.facts, "headline": f"{model.name}: {where}", "details": (told,)}
+            raise type(trouble)(**facts) from None
 
     def _otherwise(self, model: Plant, way: Literal["divided", "bounded"]) -> Observer:
         """Design with another way for the faults than was asked for, which is what is stored."""
