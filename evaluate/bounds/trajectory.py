@@ -79,7 +79,8 @@ class Search:
             k = np.flatnonzero(read).tolist()
             if k:
                 equal.append((shown[i, k] - ca.DM(problem.y[k, i]).T).T)
-        still = np.flatnonzero(problem.still).tolist()
+        loose = problem.box[:, 0] < problem.box[:, 1]
+        still = np.flatnonzero(problem.still & loose).tolist()
         equal.append(ca.vec(v[still, 1:] - v[still, :-1]))
         rates = [ca.MX(0, 1)]
         for j, signal in enumerate(problem.plant.f, problem.places["f"].start):

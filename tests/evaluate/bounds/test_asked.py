@@ -261,3 +261,18 @@ def test_a_range_that_is_too_narrow_is_told() -> None:
     fit = ob.least_bounds(plant.with_ranges({"h2": (0.0, 0.3)}), record)
     assert set(fit.pressed) == {"h2"}
     assert f"h2 at {fit.pressed['h2']} instants" in str(fit) and fit.refuted
+
+
+def test_a_constant_that_is_held_asks_nothing(capfd):
+    """CasADi would warn of equations without a variable: of two constants between ten readings."""
+    plant = ob.Plant("line")
+    (x,), (a, b) = plant.states("x", range=(-9, 9)), plant.params("a b", range=(0.5, 1.5))
+    w, r = plant.disturbances("w r", bound=(0.1, 0.1))
+    plant.dynamics([x * a * b + w], Ts=1)
+    plant.outputs([x + r])
+    told = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0])
+    record = ob.read_record({"y1": told}, plant)
+    fit = ob.least_bounds(plant, record, free=[])
+    assert abs(fit.upper - 0.5) < 1e-6
+    shown = capfd.readouterr()
+    assert "overconstrained" not in shown.out + shown.err
