@@ -408,7 +408,8 @@ class FaultDetector(Shown):
         smallest = self.smallest_detectable
         for i, (signal, count) in enumerate(zip(self.model.f, self.counts, strict=True)):
             unit = f" {signal.unit}" if signal.unit else ""
-            size = "of no size" if smallest is None else f"above {smallest[i]:.4g}{unit}"
+            least = np.inf if smallest is None else smallest[i]
+            size = f"above {least:.4g}{unit}" if np.isfinite(least) else "of no size"
             mean = " for the mean" if self._of_mean else ""
             lines.append(f"  {signal.name}: alarm after {count} samples, promised {size}{mean}")
         return "\n".join(lines)
