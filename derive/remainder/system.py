@@ -294,9 +294,9 @@ def _failure(
 ) -> FlowError:
     name = dynamics.names[row]
     return FlowError(
-        f"no box holds the solutions over a step of {step:g} s: next to the range of {name} "
+        f"no box holds the solutions over {step:g} s: next to the range of {name} "
         f"(tried [{bottom[row]:.6g}, {top[row]:.6g}]) the rates are undefined, unbounded or too "
-        f"fast. Take a shorter step, or keep the range of {name} away from there",
+        f"fast. Take a shorter Ts, or keep the range of {name} away from there",
         symbol=name,
         step=step,
         tried=(float(bottom[row]), float(top[row])),

@@ -202,7 +202,7 @@ class PlantClass:
 
     def check(self, plant: Plant) -> Plant:
         """Return the plant in the method's time, or refuse it by the user's own names."""
-        plant = self._in_time(plant)
+        plant = self._in_time(plant.check())
         for kind, clause in self.forbids.items():
             self._refuse(kind, plant.names(kind), clause)
         sensors = [s.name for s in plant.f if s.role not in self.faults]

@@ -80,7 +80,7 @@ def choose(
     >>> choose(ob.plants.cruise_control(), Ts=0.1, methods=few).best.name
     "BoundedErrorUIO(bounds='peak')"
     """
-    if (model.Ts is None) == (Ts is None):
+    if (model.check().Ts is None) == (Ts is None):
         what = "a continuous plant" if Ts is None else f"sampled every {model.Ts:g} s"
         mend = "give Ts=, the sample time of the observers" if Ts is None else "leave Ts out"
         raise SimulationError(f"{model.name} is {what}: {mend}.")

@@ -149,6 +149,14 @@ def test_a_plant_outside_the_class_is_refused_by_its_names(entry):
     assert any(name in str(refusal.value) for name in names)
 
 
+def test_a_plant_without_equations_is_told_that_before_anything_else(entry):
+    plant = ob.Plant("pump")
+    (x,) = plant.states("x", range=(0, 1))
+    plant.outputs([x])
+    with pytest.raises(ob.PlantError, match="'pump' has no dynamics yet"):
+        entry.method.design(plant)
+
+
 def test_an_option_that_is_not_one_is_refused_by_its_name(entry):
     if entry.option is None:
         pytest.skip("no options")

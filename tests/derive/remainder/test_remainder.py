@@ -289,7 +289,7 @@ def test_solution_that_leaves_the_domain_is_refused():
 
 
 def test_solution_that_escapes_is_refused():
-    with pytest.raises(FlowError, match="shorter step"):
+    with pytest.raises(FlowError, match="shorter Ts"):
         flow_box(system(growing()), 2.0)
 
 
