@@ -44,6 +44,10 @@ OPERATIONS = {
 """CasADi's names of operations by their numbers."""
 
 _MOVES = frozenset({"input", "output", "const", "assign"})
+_LONG = 1500
+_PART = 500
+_NAME = re.compile(r"\bt\d+\b")
+_DEFINED = re.compile(r"const (?P<kind>\w+) (?P<name>t\d+) = ")
 
 
 @dataclass(frozen=True)
@@ -211,12 +215,6 @@ class Machine(Call):
             array[:] = value
         self.evaluate()
         return [result.copy() for result in self.results]
-
-
-_LONG = 1500
-_PART = 500
-_NAME = re.compile(r"\bt\d+\b")
-_DEFINED = re.compile(r"const (?P<kind>\w+) (?P<name>t\d+) = ")
 
 
 def in_parts(

@@ -17,6 +17,9 @@ from obsynth.codegen.single import lane_operations
 from obsynth.codegen.tape import read_tape
 
 _NEAR = 0.01
+_COMPARED = ("lt", "le", "eq", "ne", "fmax", "fmin")
+_LANES = 1000
+_AROUND = (-30.0, -1.0, -0.03, -1e-3, 1e-3, 0.03, 1.0, 30.0)
 
 
 def differ(a: Any, b: Any) -> Any:
@@ -116,11 +119,6 @@ class Lanes:
                     for place, through in zip(places, passed, strict=True):
                         told[place] |= seen & through
         return told
-
-
-_COMPARED = ("lt", "le", "eq", "ne", "fmax", "fmin")
-_LANES = 1000
-_AROUND = (-30.0, -1.0, -0.03, -1e-3, 1e-3, 0.03, 1.0, 30.0)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,10 @@ PAYS = 50_000
 FLAGS = ("-O1", "-ffp-contract=off", "-fPIC", "-shared")
 _SECONDS = 600
 _PROBES = 40
+BLOCK = 4096
+"""Instants whose states are held at a time."""
+_TOGETHER, _BASE = 64, 8
+Before = Callable[[int, FloatArray, FloatArray], None]
 
 
 def compiled(function: ca.Function, calls: int) -> ca.Function:
@@ -102,13 +106,6 @@ def _equal(function: ca.Function, other: ca.Function) -> bool:
 def _bits(values: FloatArray) -> bytes:
     """Return the bits of numbers, one NaN like another."""
     return np.where(np.isnan(values), np.nan, values).tobytes()
-
-
-BLOCK = 4096
-"""Instants whose states are held at a time."""
-_TOGETHER, _BASE = 64, 8
-
-Before = Callable[[int, FloatArray, FloatArray], None]
 
 
 def in_rows(function: ca.Function) -> ca.Function:

@@ -14,6 +14,17 @@ from obsynth.symbolic.arrays import BoolArray, FloatArray
 from obsynth.symbolic.shown import Shown, card
 from obsynth.symbolic.table import Table, Tabled
 
+_WORDS = {
+    1: "not initialised: no measurement has been processed yet",
+    2: "an input or scheduling variable was not finite: the sets start anew",
+    4: "the returned set is not inside the domain of the guarantee",
+    VOID: "void: a set is empty or a measurement impossible, so an assumption has failed since the "
+    "last void or the start; the sets start anew",
+    16: "the fault interval is not valid at this instant",
+    32: "a measurement was missing or outside its declared range, and left out",
+    RECOVERING: "recovering: soon after a void",
+}
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trace(Tabled):
@@ -143,18 +154,6 @@ class Violation:
             f"{self.signal}: {self.count} instants outside ({first}{more}; "
             f"worst {self.worst:.3g} at k = {self.worst_at})"
         )
-
-
-_WORDS = {
-    1: "not initialised: no measurement has been processed yet",
-    2: "an input or scheduling variable was not finite: the sets start anew",
-    4: "the returned set is not inside the domain of the guarantee",
-    VOID: "void: a set is empty or a measurement impossible, so an assumption has failed since the "
-    "last void or the start; the sets start anew",
-    16: "the fault interval is not valid at this instant",
-    32: "a measurement was missing or outside its declared range, and left out",
-    RECOVERING: "recovering: soon after a void",
-}
 
 
 @dataclass(frozen=True)

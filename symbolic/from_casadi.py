@@ -17,6 +17,19 @@ from obsynth.symbolic.sxmodel import check_parity, sample_box
 if TYPE_CHECKING:
     from obsynth.symbolic.plant import Plant
 
+_NAMED = (
+    "exp log sqrt sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh sign floor erf"
+)
+_METHODS = {
+    "x": ("states", ("range", "unit", "nominal")),
+    "u": ("inputs", ("range", "unit", "nominal")),
+    "d": ("unknown_inputs", ("range", "unit", "nominal")),
+    "f": ("process_faults", ("range", "rate", "constant", "unit")),
+    "w": ("disturbances", ("bound", "range", "unit")),
+    "p": ("params", ("value", "tolerance", "range", "unit", "constant")),
+    "rho": ("scheduling", ("range", "unit", "measured", "nominal")),
+}
+
 
 def _lift(function: Callable[..., Any]) -> Callable[..., Any]:
     """Let a function of numbers take conditions, which CasADi counts as 0 and 1."""
@@ -55,9 +68,6 @@ def _guarded(value: sp.Expr) -> tuple[sp.Expr, sp.Basic] | None:
     return None
 
 
-_NAMED = (
-    "exp log sqrt sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh sign floor erf"
-)
 _OPERATIONS: dict[int, Callable[..., Any]] = {
     **{getattr(ca, f"OP_{n.upper()}"): _lift(getattr(sp, n)) for n in _NAMED.split()},
     ca.OP_ASSIGN: lambda a: a,
@@ -185,17 +195,6 @@ def _culprit(function: ca.Function) -> str | None:
             inner = _culprit(called) if called.is_a("MXFunction") else None
             return inner or f"{called.name()} ({called.class_name()})"
     return None
-
-
-_METHODS = {
-    "x": ("states", ("range", "unit", "nominal")),
-    "u": ("inputs", ("range", "unit", "nominal")),
-    "d": ("unknown_inputs", ("range", "unit", "nominal")),
-    "f": ("process_faults", ("range", "rate", "constant", "unit")),
-    "w": ("disturbances", ("bound", "range", "unit")),
-    "p": ("params", ("value", "tolerance", "range", "unit", "constant")),
-    "rho": ("scheduling", ("range", "unit", "measured", "nominal")),
-}
 
 
 class CasadiSystem:

@@ -28,6 +28,26 @@ _TANHC = (
     21844.0 / 6081075.0,
     -929569.0 / 638512875.0,
 )
+_NAMED = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh sign floor erf"
+ALIASES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "fabs": "Abs", "ceil": "ceiling"}
+"""Other spellings the reader of text accepts."""
+_OTHERS = {"maximum": "Max", "minimum": "Min", "fmax": "Max", "fmin": "Min", "absolute": "Abs"}
+_METHODS = ("sqrt", "exp", "log", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "tanh")
+_RELATIONS: dict[str, Callable[[Any, Any], Any]] = {
+    "less": operator.lt,
+    "less_equal": operator.le,
+    "greater": operator.gt,
+    "greater_equal": operator.ge,
+}
+_NUMBER = (
+    "{0} is an expression and no number, which math.sqrt, float and their like take: write NumPy's "
+    "function (np.sqrt) or SymPy's (sp.sqrt); obsynth.lookup in place of np.interp"
+)
+_CHOICE = (
+    "{0} is neither true nor false while equations are written, so that if, and, min and np.where "
+    "cannot choose: write both cases, sp.Piecewise((a, {0}), (b, True)), or sp.Min, sp.Max, "
+    "obsynth.sat"
+)
 
 
 class _Quotient(sp.Function):  # type: ignore[misc]
@@ -140,7 +160,6 @@ class NamedFunction:
     most: int | None = 1
 
 
-_NAMED = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh sign floor erf"
 _TABLE = (
     *(NamedFunction(name, getattr(sp, name), getattr(ca, name)) for name in _NAMED.split()),
     NamedFunction("atan2", sp.atan2, ca.atan2, 2, 2),
@@ -159,19 +178,6 @@ BY_NAME = {function.name: function for function in _TABLE}
 
 BY_CLASS = {function.sympy: function for function in _TABLE if isinstance(function.sympy, type)}
 """The same under the SymPy class; ``sqrt`` is a power there and has none."""
-
-ALIASES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "fabs": "Abs", "ceil": "ceiling"}
-"""Other spellings the reader of text accepts."""
-
-
-_OTHERS = {"maximum": "Max", "minimum": "Min", "fmax": "Max", "fmin": "Min", "absolute": "Abs"}
-_METHODS = ("sqrt", "exp", "log", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "tanh")
-_RELATIONS: dict[str, Callable[[Any, Any], Any]] = {
-    "less": operator.lt,
-    "less_equal": operator.le,
-    "greater": operator.gt,
-    "greater_equal": operator.ge,
-}
 
 
 def _apply(_: sp.Expr, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
@@ -201,17 +207,6 @@ class Refused(TypeError):
     def __str__(self) -> str:
         error, expression, mend = self.args
         return mend.format(expression) if expression.free_symbols else str(error)
-
-
-_NUMBER = (
-    "{0} is an expression and no number, which math.sqrt, float and their like take: write NumPy's "
-    "function (np.sqrt) or SymPy's (sp.sqrt); obsynth.lookup in place of np.interp"
-)
-_CHOICE = (
-    "{0} is neither true nor false while equations are written, so that if, and, min and np.where "
-    "cannot choose: write both cases, sp.Piecewise((a, {0}), (b, True)), or sp.Min, sp.Max, "
-    "obsynth.sat"
-)
 
 
 def _told(method: Callable[[Any], Any], mend: str) -> Callable[[Any], Any]:

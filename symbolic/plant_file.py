@@ -56,24 +56,6 @@ _TOKEN = re.compile(
     re.DOTALL,
 )
 _PAIR = {"]": "[", "}": "{"}
-
-
-def unclosed(text: str) -> tuple[str, int] | None:
-    """Return the bracket or quote that stays open, and where; None if none or one too few does."""
-    stack: list[tuple[str, int]] = []
-    for token in _TOKEN.finditer(text):
-        opening, closing = token["open"], token["close"]
-        if opening is not None:
-            stack.append((opening, token.start()))
-            if opening not in "[{":
-                return stack[-1]
-        elif closing is not None:
-            last = stack.pop() if stack else ("", 0)
-            if last[0] != _PAIR[closing]:
-                return last if _PAIR[closing] in (bracket for bracket, _ in stack) else None
-    return stack[-1] if stack else None
-
-
 _FAULT = {"range", "rate", "constant", "unit"}
 _ROLES: Mapping[str, tuple[Role, set[str]]] = {
     "states": (Role.STATE, {"range", "unit", "nominal"}),
@@ -96,8 +78,23 @@ _TEXTS = {"unit", "of", "method", "is"}
 _HEADER = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.-]+|\"[^\"]*\"|'[^']*')\s*=")
 _MOST = 1_000_000
-
 Keys = tuple[str, ...]
+
+
+def unclosed(text: str) -> tuple[str, int] | None:
+    """Return the bracket or quote that stays open, and where; None if none or one too few does."""
+    stack: list[tuple[str, int]] = []
+    for token in _TOKEN.finditer(text):
+        opening, closing = token["open"], token["close"]
+        if opening is not None:
+            stack.append((opening, token.start()))
+            if opening not in "[{":
+                return stack[-1]
+        elif closing is not None:
+            last = stack.pop() if stack else ("", 0)
+            if last[0] != _PAIR[closing]:
+                return last if _PAIR[closing] in (bracket for bracket, _ in stack) else None
+    return stack[-1] if stack else None
 
 
 def read_plant(path: str | os.PathLike[str]) -> Plant:

@@ -11,6 +11,8 @@ from obsynth.symbolic.errors import RecordError
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.record import Record
 
+Spec = str | tuple[Any, ...] | Callable[[Columns], Any] | None
+
 
 def when(there: BoolArray, time: FloatArray) -> str:
     """Say at how many instants something is true, and from when on."""
@@ -190,9 +192,6 @@ def hold_last(
         notes.append(f"input {name} is missing at {when(missing, time)}: {what}")
         rows = np.maximum.accumulate(np.where(missing, 0, np.arange(len(column))))
         column[:] = column[rows] if hold else column
-
-
-Spec = str | tuple[Any, ...] | Callable[[Columns], Any] | None
 
 
 def read_record(

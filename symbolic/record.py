@@ -13,6 +13,8 @@ from obsynth.symbolic.errors import RecordError
 from obsynth.symbolic.shown import card
 from obsynth.symbolic.table import Table
 
+GROUPS = ("u", "rho", "y", "reference")
+
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -142,9 +144,6 @@ def _runs(v: FloatArray, step: float, moved: BoolArray) -> Iterator[tuple[int, i
             why = "and comes and goes without slowing down"
         if why:
             yield int(a), int(b), extreme, why
-
-
-GROUPS = ("u", "rho", "y", "reference")
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,19 @@ LARGEST_SUM = 20_000
 """Terms up to which products are multiplied out."""
 _ENDLESS = 10**12
 _LONGEST = 300
+Box = Mapping[sp.Symbol, tuple[float, float]]
+NUMERIC = "numerically zero at 60 digits"
+_DIGITS = 60
+_WORKING = 100
+_POINTS = 6
+_TRIES = 40
+# Beyond these sizes a proof takes minutes, and numbers are the better evidence.
+_LARGEST_CANCEL = 6000
+_LARGEST_EXPONENTIAL = 2000
+_LARGEST_NUMERATOR = 3000
+_LARGEST_POWER = 8
+_LARGEST_NUMERIC = 100_000
+_GRID = 10**6
 
 
 def size(expression: Any) -> int:
@@ -109,21 +122,6 @@ def text(expression: sp.Expr) -> str:
     if parts > _LONGEST:
         return f"(an expression of {parts:,} parts)"
     return str(sp.sstr(short(expression), full_prec=False))
-
-
-Box = Mapping[sp.Symbol, tuple[float, float]]
-NUMERIC = "numerically zero at 60 digits"
-_DIGITS = 60
-_WORKING = 100
-_POINTS = 6
-_TRIES = 40
-# Beyond these sizes a proof takes minutes, and numbers are the better evidence.
-_LARGEST_CANCEL = 6000
-_LARGEST_EXPONENTIAL = 2000
-_LARGEST_NUMERATOR = 3000
-_LARGEST_POWER = 8
-_LARGEST_NUMERIC = 100_000
-_GRID = 10**6
 
 
 def is_zero(expression: sp.Expr) -> str:

@@ -26,6 +26,8 @@ from obsynth.derive.rigour import (
 )
 from obsynth.symbolic.arrays import BoolArray, FloatArray
 
+MOST_SIGNS = 16
+
 
 @dataclass(frozen=True, eq=False)
 class FieldRange:
@@ -115,9 +117,6 @@ class SymmetricField:
             np.swapaxes(self._place(slope_radius), 0, 1),
             smooth,
         )
-
-
-MOST_SIGNS = 16
 
 
 def augment(matrix: FloatArray) -> FloatArray:

@@ -23,6 +23,11 @@ from obsynth.derive.rigour import substitute
 from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.signals import Signal
 
+Entry = tuple[int, int]
+Affine = tuple[sp.Expr, dict[int, sp.Expr]]
+_SAMPLES = 96
+_PREFIXES = ("rho", "sigma", "zeta", "varrho")
+
 
 @dataclass(frozen=True, eq=False)
 class Reading:
@@ -76,12 +81,6 @@ class Known:
     def exact(self) -> bool:
         """True when both ends are the same."""
         return bool(self.ends[0] == self.ends[1])
-
-
-Entry = tuple[int, int]
-Affine = tuple[sp.Expr, dict[int, sp.Expr]]
-_SAMPLES = 96
-_PREFIXES = ("rho", "sigma", "zeta", "varrho")
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,13 @@ _EXACT_BITS = 24
 _SAMPLES = 96
 # Parts of an expression that is written out in a refusal.
 _SHORT = 60
+# Expanding a longer entry costs more than the zeros it may show.
+_LONG = 1000
+COLUMNS = {"states": ("x",), "inputs": ("u",), "joint": ("x", "w")}
+"""Kinds of signals that a Jacobian is taken by."""
+# Two forms of a row are compared on boxes of this share of the ranges.
+_SHARE, _BOXES = 0.25, 24
+_GAIN = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,15 +238,6 @@ def _hoist(expression: sp.Basic, numbers: dict[sp.Expr, sp.Dummy]) -> sp.Basic:
 def _is_short(number: sp.Rational) -> bool:
     power_of_two = int(number.q) & (int(number.q) - 1) == 0
     return power_of_two and abs(int(number.p)) < 2**_EXACT_BITS and int(number.q) <= 2**60
-
-
-# Expanding a longer entry costs more than the zeros it may show.
-_LONG = 1000
-COLUMNS = {"states": ("x",), "inputs": ("u",), "joint": ("x", "w")}
-"""Kinds of signals that a Jacobian is taken by."""
-# Two forms of a row are compared on boxes of this share of the ranges.
-_SHARE, _BOXES = 0.25, 24
-_GAIN = 0.9
 
 
 def jacobian_entries(split_or_model: Split | Plant, wrt: str) -> MatrixEntries:

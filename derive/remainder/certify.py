@@ -38,6 +38,7 @@ from obsynth.symbolic.taking import takes
 _QUARTERS = 4
 _PARTS = 16
 _ZERO, _ONE = sp.Integer(0), sp.Integer(1)
+_RANDOM = 32
 
 
 def step_factor(
@@ -207,9 +208,6 @@ class Work:
             kinked.reshape(_PARTS, count).any(axis=0) | np.isnan(total[0]) | np.isnan(total[1])
         )
         return np.where(unknown, -np.inf, total[0]), np.where(unknown, np.inf, total[1])
-
-
-_RANDOM = 32
 
 
 @takes(plant="Plant")

@@ -24,6 +24,9 @@ from obsynth.symbolic.discretise import Step, composed
 from obsynth.symbolic.plant import Plant
 
 _HELD = ("u", "d", "f", "w", "p", "rho")
+PIECES = {"fast": 256, "normal": 4096, "tight": 65536}
+_ATTEMPTS = 40
+_RTOL = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +182,6 @@ def step_derivatives(dynamics: System, step: Step, order: int) -> list[ca.SX]:
     return found
 
 
-PIECES = {"fast": 256, "normal": 4096, "tight": 65536}
-
-
 def hull_over_pieces(
     program: Program, box: FloatArray, pieces: int, cuts: Sequence[int] | None = None
 ) -> tuple[FloatArray, FloatArray]:
@@ -228,10 +228,6 @@ def _halve(lower: FloatArray, upper: FloatArray, axis: int) -> tuple[FloatArray,
     left, right = upper.copy(), lower.copy()
     left[axis], right[axis] = middle, middle
     return np.hstack([lower, right]), np.hstack([left, upper])
-
-
-_ATTEMPTS = 40
-_RTOL = 1e-2
 
 
 class FlowError(DerivationError):

@@ -20,6 +20,8 @@ from obsynth.symbolic.table import Table
 from obsynth.symbolic.taking import takes
 
 _MOST_POINTS = 6
+# Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
+_FREQUENCIES = (1.3717, -0.8391, 2.1173)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,10 +181,6 @@ def _shown(points: list[Frozen], discrete: bool) -> int:
             without.append(row)
             with_faults.append([*row, *(right[i, j] for j in range(right.ncols()))])
     return rank(with_faults) - rank(without)
-
-
-# Real numbers off the usual poles and zeros; a rank below the generic one has probability zero.
-_FREQUENCIES = (1.3717, -0.8391, 2.1173)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -32,6 +32,9 @@ _UNITS = 2.0 * ULPS
 _LOGARITHM = 745.0  # of any double, in size
 _Map = Callable[[ca.SX], ca.SX]
 _OPEN = {"select": (1, 2), "if_else_zero": (1,), "meet": (0, 1)}
+_PAIRS = (("exp", ca.log), ("expm1", ca.log1p), ("log", ca.exp), ("log1p", ca.expm1))
+_HYPERBOLIC = (("sinh", ca.asinh), ("asinh", ca.sinh), ("tanh", ca.atanh), ("atanh", ca.tanh))
+_OWN = ("power_int", "power_const", "select", "cosine", "atan")
 
 
 def contract(
@@ -232,9 +235,6 @@ def _branch(inverse: _Map) -> _Form:
     )
 
 
-_PAIRS = (("exp", ca.log), ("expm1", ca.log1p), ("log", ca.exp), ("log1p", ca.expm1))
-_HYPERBOLIC = (("sinh", ca.asinh), ("asinh", ca.sinh), ("tanh", ca.atanh), ("atanh", ca.tanh))
-_OWN = ("power_int", "power_const", "select", "cosine", "atan")
 _INVERSES: Mapping[str, _Form] = {
     "add": lambda self, k, z, args, n: self.do("subtract", z, args[1 - k]),
     "subtract": lambda self, k, z, args, n: (

@@ -18,6 +18,8 @@ from obsynth.symbolic.arrays import FloatArray
 
 FAR = 1e100
 """Numbers from which on a signal is not bounded at all, whatever the precision of code."""
+_NUMBER = 2.0**120
+"""Estimates beyond count as no number, in either precision."""
 
 
 class Limits(NamedTuple):
@@ -146,10 +148,6 @@ class Rounding:
         if high == 0.0:
             above = ca.fmin(above, 0.0)
         return Lifted(below, above, low, high)
-
-
-_NUMBER = 2.0**120
-"""Estimates beyond count as no number, in either precision."""
 
 
 def cut_box(

@@ -30,6 +30,12 @@ UNDERFLOW = 2.0**-900
 SETTLED = 0.01
 """Half widths have settled where they stay within this share of their limits."""
 MOST_CALLS = 100_000
+MOST_PASSES = 200
+_UP = 1.0 + 2.0**-30
+# Of ranges: above what the few roundings of an end take.
+_ENDS = {"double": 2.0**-30, "single": 2.0**-18}
+# How often an end steps outwards by what rounding an operation takes, at most.
+_STEPS = 8.0
 
 
 def above(precision: str, terms: int) -> float:
@@ -142,14 +148,6 @@ def settle(
 def _least(bounds: Sequence[Running], s: Sequence[FloatArray]) -> FloatArray:
     pairs = zip(bounds, s, strict=True)
     return np.asarray(np.min([bound.half_widths(part) for bound, part in pairs], axis=0))
-
-
-MOST_PASSES = 200
-_UP = 1.0 + 2.0**-30
-# Of ranges: above what the few roundings of an end take.
-_ENDS = {"double": 2.0**-30, "single": 2.0**-18}
-# How often an end steps outwards by what rounding an operation takes, at most.
-_STEPS = 8.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from obsynth.symbolic.errors import ObsynthError
 from obsynth.symbolic.taking import labelled
 
 _KINDS = {"u": "inputs", "y": "outputs", "theta": "measured scheduling variables"}
+MOST_CORNERS = 14
 
 
 class StepFunction(ca.Function):
@@ -94,9 +95,6 @@ def named_step(function: ca.Function, plant: Plant) -> StepFunction:
     measured = tuple(signal.name for signal in plant.rho if signal.measured)
     step.labels = {"u": plant.names("u"), "y": plant.output_names, "theta": measured}
     return step
-
-
-MOST_CORNERS = 14
 
 
 def slices(sizes: Mapping[str, int]) -> dict[str, slice]:

@@ -27,6 +27,14 @@ from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.convert import to_sx
 
+MOST = 3
+"""Relations that are kept for a fault, the narrowest."""
+LONGEST = 100
+"""How often a state may enter a row of a step of higher order, about, to be written out."""
+_UNKNOWN = 1e9  # half width of a state of which nothing is known beforehand
+_JOINED = tuple(name for name in STATUS if name != "fault_not_valid")
+_CHUNK = 512
+
 
 class Handed(property):
     """What a detector has of its observer, under the same name."""
@@ -89,15 +97,6 @@ def whole_numbers(given: Any, names: tuple[str, ...], what: str = "persistence")
             **{what: given},
         )
     return whole
-
-
-MOST = 3
-"""Relations that are kept for a fault, the narrowest."""
-LONGEST = 100
-"""How often a state may enter a row of a step of higher order, about, to be written out."""
-_UNKNOWN = 1e9  # half width of a state of which nothing is known beforehand
-_JOINED = tuple(name for name in STATUS if name != "fault_not_valid")
-_CHUNK = 512
 
 
 def relations(

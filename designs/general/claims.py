@@ -39,6 +39,7 @@ CELLS = 256
 UP = 1.0 + 2.0**-40
 # What is stored above what was found, so that another library finds it proved too.
 ROOM = 1.0 + 2.0**-10
+LOST = "no gain was found that follows it"
 
 
 def shown(design: GeneralDesign) -> FloatArray:
@@ -101,9 +102,6 @@ def prove_rounding(design: GeneralDesign) -> Claim:
         room,
         "interval analysis of the rounding of every instruction",
     )
-
-
-LOST = "no gain was found that follows it"
 
 
 def claims(design: GeneralDesign) -> Iterator[Claim]:

@@ -34,6 +34,18 @@ from obsynth.symbolic.convert import to_sx
 from obsynth.symbolic.signals import Signal
 from obsynth.symbolic.text import read_text
 
+STAGES = (0.0, 0.5, 0.5, 1.0)
+"""Where in a sample the Runge-Kutta formula of order four evaluates."""
+WEIGHTS = (1.0, 2.0, 2.0, 1.0)
+"""What it weighs each by, in sixths."""
+# Of the error set: above it a bound of rounding is no help.
+USEFUL = {"double": 2.0**-20, "single": 0.25}
+# Above the rounding of the formulas here, all of whose terms are nonnegative.
+UP = 1.0 + 2.0**-40
+# What is stored above what was found, so that another library finds it proved too.
+ROOM = 1.0 + 2.0**-10
+_CELLS = 256
+
 
 def measured_schedule(plant: Plant) -> tuple[Signal, ...]:
     """Scheduling signals whose values the step is given, in the order of declaration."""
@@ -127,12 +139,6 @@ def symbols_of(plant: Plant) -> dict[str, ca.SX]:
     return {name: ca.SX.sym(name, size) for name, size in names.items()}
 
 
-STAGES = (0.0, 0.5, 0.5, 1.0)
-"""Where in a sample the Runge-Kutta formula of order four evaluates."""
-WEIGHTS = (1.0, 2.0, 2.0, 1.0)
-"""What it weighs each by, in sixths."""
-
-
 def build_update(design: QPVDesign) -> ca.Function:
     """(state, u, y, theta) -> estimates after a Runge-Kutta step, nu and rates of its stages."""
     equations, inputs = Equations(design), symbols_of(design.plant)
@@ -150,15 +156,6 @@ def build_update(design: QPVDesign) -> ca.Function:
     return ca.Function(
         "update", [state, u, y, theta], [*found.values()], ["state", *inputs], [*found]
     )
-
-
-# Of the error set: above it a bound of rounding is no help.
-USEFUL = {"double": 2.0**-20, "single": 0.25}
-# Above the rounding of the formulas here, all of whose terms are nonnegative.
-UP = 1.0 + 2.0**-40
-# What is stored above what was found, so that another library finds it proved too.
-ROOM = 1.0 + 2.0**-10
-_CELLS = 256
 
 
 def _boxes(design: QPVDesign, half: FloatArray) -> dict[str, Interval]:

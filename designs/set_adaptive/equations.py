@@ -18,6 +18,25 @@ LARGEST_PRODUCT = 64.0
 """Largest h mu: beyond it the sum has too many terms for one step."""
 # What is left out stays below the rounding of the sum itself.
 _TAIL = 2.0**-64
+_PARTS = {
+    "zeta_m": "n",
+    "zeta_M": "n",
+    "Omega_m": "nq",
+    "Omega_M": "nq",
+    "theta_m": "q",
+    "theta_M": "q",
+    "xi_m": "n",
+    "xi_M": "n",
+    "R_m": "qq",
+    "R_M": "qq",
+    "b_m": "q",
+    "b_M": "q",
+    "weight": "1",
+}
+MONITORS = ("R_m", "R_M", "b_m", "b_M", "weight")
+"""Integrals that no bound is made of."""
+Pair = tuple[ca.SX, ca.SX]
+"""Lower and upper ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,25 +88,6 @@ def apply(weights: Weights, M: ca.SX, state: ca.SX, drive: ca.SX) -> ca.SX:
         result = Q @ result + chance * state + tail * drive
     moved: ca.SX = ca.densify(result)
     return moved
-
-
-_PARTS = {
-    "zeta_m": "n",
-    "zeta_M": "n",
-    "Omega_m": "nq",
-    "Omega_M": "nq",
-    "theta_m": "q",
-    "theta_M": "q",
-    "xi_m": "n",
-    "xi_M": "n",
-    "R_m": "qq",
-    "R_M": "qq",
-    "b_m": "q",
-    "b_M": "q",
-    "weight": "1",
-}
-MONITORS = ("R_m", "R_M", "b_m", "b_M", "weight")
-"""Integrals that no bound is made of."""
 
 
 def memory_sizes(design: SetDesign) -> dict[str, int]:
@@ -150,10 +150,6 @@ def ends(design: SetDesign, low: ca.SX, high: ca.SX, clipped: bool) -> tuple[ca.
         first.append(a)
         second.append(b)
     return ca.vertcat(*first), ca.vertcat(*second)
-
-
-Pair = tuple[ca.SX, ca.SX]
-"""Lower and upper ends."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,8 @@ from obsynth.symbolic import Plant, Record
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 
 Groups = Mapping[str, Sequence[str]]
+PASSES = 3
+"""Times that the record is gone through, forth and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,10 +235,6 @@ def default_groups(plant: Plant) -> dict[str, tuple[str, ...]]:
     given = {key: tuple(names[k] for k in places) for key, places in found.items()}
     given = {key: tuple(n for n in members if n not in derived) for key, members in given.items()}
     return {key: members for key, members in given.items() if members}
-
-
-PASSES = 3
-"""Times that the record is gone through, forth and back."""
 
 
 @dataclass(frozen=True, eq=False)

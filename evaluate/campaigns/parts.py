@@ -23,6 +23,7 @@ from obsynth.symbolic.arrays import FloatArray
 
 Row = dict[str, Any]
 KEYS = ("design", "scenario", "truth", "seed")
+_PLAN = "campaign.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +89,6 @@ def _alarms(trace: Trace) -> dict[str, float]:
     raised = np.flatnonzero(alarm[first:])
     delay = float(raised[0]) if raised.size else (np.inf if there.size else np.nan)
     return {"delay": delay, "false alarms": int(np.sum(alarm[:first]))}
-
-
-_PLAN = "campaign.json"
 
 
 def fingerprint(jobs: Sequence[Job]) -> dict[str, str]:

@@ -32,6 +32,20 @@ from obsynth.symbolic import ObsynthError, Plant
 from obsynth.symbolic.arrays import FloatArray
 
 SIGMAS = 3.0
+METHODS: tuple[Method, ...] = (
+    IntervalObserver(),
+    IntervalObserver(gains="search"),
+    BoundedErrorUIO(bounds="peak"),
+    BoundedErrorUIO(),
+    HinfUIO(),
+    SetAdaptiveObserver(coordinates="auto"),
+    FilterBank(),
+    QPVObserver(),
+    SetMembershipObserver(),
+)
+"""What is tried by default; a further method is a further line."""
+CLASSES = {type(method).__name__: method.CLASS for method in METHODS}
+"""The class of plants of every method, as data."""
 
 
 class ExtendedKalman:
@@ -107,23 +121,6 @@ class ExtendedKalman:
         """Return the memory for a first state, with the variances of the declared ranges."""
         mean = np.append(guess, self.middle[len(guess) : self.kept])
         return np.concatenate([mean, np.eye(self.kept).ravel() / 3.0])
-
-
-METHODS: tuple[Method, ...] = (
-    IntervalObserver(),
-    IntervalObserver(gains="search"),
-    BoundedErrorUIO(bounds="peak"),
-    BoundedErrorUIO(),
-    HinfUIO(),
-    SetAdaptiveObserver(coordinates="auto"),
-    FilterBank(),
-    QPVObserver(),
-    SetMembershipObserver(),
-)
-"""What is tried by default; a further method is a further line."""
-
-CLASSES = {type(method).__name__: method.CLASS for method in METHODS}
-"""The class of plants of every method, as data."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,9 @@ from obsynth.symbolic.shown import aligned, card, formulas
 from obsynth.symbolic.signals import KINDS, Role, Signal
 from obsynth.symbolic.table import Table
 
+_DYNAMICS = {"c": "1", "A": "x", "N": "xx", "M": "ux", "B": "u", "D": "d", "B_f": "f", "G": "w"}
+_OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset": "1"}
+
 
 @dataclass(frozen=True, eq=False)
 class Augmented:
@@ -101,10 +104,6 @@ def _losses(
         )
         scaled[inputs[name].symbol] = inputs[name].symbol * (1 - symbol)
     return tuple(losses), scaled
-
-
-_DYNAMICS = {"c": "1", "A": "x", "N": "xx", "M": "ux", "B": "u", "D": "d", "B_f": "f", "G": "w"}
-_OUTPUTS = {"C": "x", "feedthrough": "u", "D_f": "f", "H": "w", "output_offset": "1"}
 
 
 class QPVLayout(Layout):

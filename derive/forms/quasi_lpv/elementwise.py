@@ -24,6 +24,11 @@ from obsynth.symbolic.plant import Plant
 from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.signals import Signal
 
+Entry = tuple[int, int]
+Ends = tuple[sp.Expr, sp.Expr]
+_RTOL = 1e-2
+_EFFORT = "fast"
+
 
 @dataclass(frozen=True, eq=False)
 class Ranging:
@@ -81,12 +86,6 @@ def make_interval_form(blocks: dict[str, sp.Matrix], model: Plant, way: Ranging)
                 low[place], high[place] = found.lower[k], found.upper[k]
         minimum[name], maximum[name] = low, high
     return IntervalForm(minimum, maximum)
-
-
-Entry = tuple[int, int]
-Ends = tuple[sp.Expr, sp.Expr]
-_RTOL = 1e-2
-_EFFORT = "fast"
 
 
 def bound_elements(

@@ -45,6 +45,12 @@ from obsynth.symbolic.taking import takes
 
 _DYNAMICS = ("A", "B", "D", "B_f", "W1", "offset")
 _OUTPUTS = ("C", "feedthrough", "D_y", "D_f", "W2", "output_offset")
+_LONGEST = 60
+UNMEASURED_NOTE = (
+    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
+    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
+    "for every value (vertices, interval)."
+)
 
 
 def linear_layout(model: Plant) -> Layout:
@@ -52,14 +58,6 @@ def linear_layout(model: Plant) -> Layout:
     widths = {kind: len(model.names(kind)) for kind in "xudfw"} | {"1": 1}
     dynamics, outputs = (dict(zip(b, widths, strict=True)) for b in (_DYNAMICS, _OUTPUTS))
     return Layout((dynamics, outputs), (widths["x"], len(model.output_names)), widths)
-
-
-_LONGEST = 60
-UNMEASURED_NOTE = (
-    "With unmeasured scheduling A(x) x - A(xhat) xhat is not A(x) (x - xhat): an observer that "
-    "schedules with its estimate needs the Jacobian form (jacobian_bounds), or bounds that hold "
-    "for every value (vertices, interval)."
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
