@@ -263,7 +263,7 @@ def moved(design, x, xhat, u, v, w, rng):
     after = np.array(step(x, u, none, none, noise[0], none, none)[0])
     after = after + D0 @ rng.standard_normal((D0.shape[1], count))
     y = step(after, u, none, none, noise[1], none, none)[1]
-    moved = third(xhat, u, np.zeros_like(y))
+    moved = third(xhat, u, np.zeros(y.shape))
     return after - np.array(second(first(moved, u, y), u, y)[0])
 
 
