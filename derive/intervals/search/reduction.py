@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from obsynth.derive.intervals.graph import reached
 from obsynth.symbolic.arrays import FloatArray
@@ -199,7 +200,8 @@ def preimage(
 
     def off(share: float) -> float:
         there = low_at + share * (high_at - low_at)
-        return float(function(there).nonzeros()[number]) - value
+        # zero where it is no number: any point will do there, nothing is attained at it
+        return float(np.nan_to_num(float(function(there).nonzeros()[number]) - value))
 
     if off(0.0) >= 0.0:
         return low_at

@@ -98,6 +98,13 @@ def test_random_expressions_stay_inside_and_reach_what_is_attained(exactly, expr
     assert not wrong_bounds(exactly, expression, box)
 
 
+def test_a_quantity_that_is_no_number_at_an_end_is_no_way_to_a_point(exactly):
+    """Mutant: NaN goes on to the search for a root, which ends in SciPy's own error."""
+    steep = X[0] + ca.atan(1 / ca.atan(1 / ca.sqrt(X[1] + 1.5)))
+    box = np.array([[-2.0, -2.0], [-2.0, -1.99], [-2.0, -2.0]])
+    assert not wrong_bounds(exactly, ca.atan(1 / steep), box)
+
+
 @pytest.mark.long
 @settings(max_examples=3000, deadline=None, derandomize=True)
 @given(expression=expressions(depth=5), box=boxes())
