@@ -12,7 +12,8 @@ from obsynth.codegen.description import Description
 from obsynth.codegen.drive import Drive, spread
 from obsynth.codegen.errors import CodegenError
 from obsynth.codegen.kernel import DOUBLE, SINGLE
-from obsynth.codegen.limits import Lanes, Limit, Limits
+from obsynth.codegen.lanes import Lanes
+from obsynth.codegen.limits import Limit, Limits
 from obsynth.codegen.recording import Recorder, Step, Vectors
 from obsynth.codegen.single import machine_of
 from obsynth.symbolic.arrays import FloatArray

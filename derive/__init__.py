@@ -23,6 +23,6 @@ from obsynth.derive.remainder.certify import discretisation_remainder as discret
 from obsynth.derive.remainder.enclosure import enclose_remainder as enclose_remainder
 from obsynth.derive.split import Split as Split
 from obsynth.derive.split import split as split
-from obsynth.derive.structure.isolability import excitation as excitation
+from obsynth.derive.structure.excitation import excitation as excitation
 from obsynth.derive.structure.isolability import fault_isolability as fault_isolability
 from obsynth.derive.structure.report import analyse as analyse

@@ -16,7 +16,8 @@ from obsynth.derive.algebra.linear_parts import (
     jacobian,
     prove_identity,
 )
-from obsynth.derive.algebra.zero_test import LARGEST_ROW, is_zero, size
+from obsynth.derive.algebra.sizes import LARGEST_ROW, size
+from obsynth.derive.algebra.zero_test import is_zero
 from obsynth.derive.equilibrium import Equilibrium, operating_point
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.rigour import rational, round_number, substitute

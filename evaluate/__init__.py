@@ -12,6 +12,8 @@ from obsynth.evaluate.control import from_control as from_control
 from obsynth.evaluate.control import to_control as to_control
 from obsynth.evaluate.data.estimate import estimate as estimate
 from obsynth.evaluate.data.estimated import Estimate as Estimate
+from obsynth.evaluate.domain import Domain as Domain
+from obsynth.evaluate.domain import StatusCount as StatusCount
 from obsynth.evaluate.errors import BoundsError as BoundsError
 from obsynth.evaluate.errors import ReportError as ReportError
 from obsynth.evaluate.errors import SimulationError as SimulationError
@@ -26,7 +28,5 @@ from obsynth.evaluate.run import coverage_table as coverage_table
 from obsynth.evaluate.simulate import simulate as simulate
 from obsynth.evaluate.studies.study import Study as Study
 from obsynth.evaluate.studies.study import read_study as read_study
-from obsynth.evaluate.trace import Domain as Domain
-from obsynth.evaluate.trace import StatusCount as StatusCount
 from obsynth.evaluate.trace import Trace as Trace
 from obsynth.evaluate.trace import Violation as Violation

@@ -9,9 +9,9 @@ import numpy as np
 
 from obsynth.designs.core.observer import FURTHER_OUTPUTS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
-from obsynth.designs.detection.window import core_of
+from obsynth.designs.detection.observed import core_of
+from obsynth.evaluate.domain import outside_box
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.trace import outside_box
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 

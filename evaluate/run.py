@@ -13,8 +13,9 @@ from obsynth.designs.detection.comparison import list_voids
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import broken_assumptions, finite, state_box
 from obsynth.evaluate.data.tables import to_dataset
+from obsynth.evaluate.domain import Domain
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.trace import Domain, Trace, Violation, as_told, take
+from obsynth.evaluate.trace import Trace, Violation, as_told, take
 from obsynth.symbolic import Plant, Scenario
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.shown import card

@@ -17,9 +17,10 @@ from obsynth.evaluate.checked import (
     step_function,
     vector,
 )
-from obsynth.evaluate.compiled import PAYS, Before, compiled, in_rows, march
+from obsynth.evaluate.compiled import PAYS, compiled
 from obsynth.evaluate.errors import SimulationError
 from obsynth.evaluate.joint import joint
+from obsynth.evaluate.march import Before, in_rows, march
 from obsynth.evaluate.run import Run
 from obsynth.evaluate.truth import Truth
 from obsynth.symbolic import Plant, Scenario

@@ -8,9 +8,9 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from obsynth.symbolic.errors import PlantError
-from obsynth.symbolic.functions import allow
 from obsynth.symbolic.signals import KINDS, Role, Signal, exact_number, expand_names, make_signals
 from obsynth.symbolic.taking import Symbols
+from obsynth.symbolic.ufuncs import allow
 
 
 class SignalTable:

@@ -21,7 +21,7 @@ import numpy as np
 
 from obsynth.codegen.description import describe
 from obsynth.codegen.kernel import Real
-from obsynth.codegen.limits import Lanes, differ
+from obsynth.codegen.lanes import Lanes, differ
 from obsynth.codegen.vectors import COUNT, as_ports, record
 from obsynth.designs.core.loading import load
 from obsynth.designs.core.observer import Observer

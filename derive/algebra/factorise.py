@@ -13,7 +13,8 @@ from functools import lru_cache
 
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import LARGEST_ROW, is_short, simplified, size, varies
+from obsynth.derive.algebra.sizes import LARGEST_ROW, is_short, simplified, size
+from obsynth.derive.algebra.zero_test import varies
 
 _LARGEST_SUM = 200
 # The stages of a Runge-Kutta step stand in it many times over.

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import LARGEST_ROW, is_zero, simplified, size, text, varies
-from obsynth.derive.algebra.zero_test import symbols as symbols_of
+from obsynth.derive.algebra.sizes import LARGEST_ROW, simplified, size, text
+from obsynth.derive.algebra.sizes import symbols as symbols_of
+from obsynth.derive.algebra.zero_test import is_zero, varies
 from obsynth.derive.errors import StructureError
 from obsynth.derive.rigour import round_number, substitute
 from obsynth.derive.rigour.walks import once, replaced

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import FormProof, prove_zero, text
+from obsynth.derive.algebra.sizes import text
+from obsynth.derive.algebra.zero_test import FormProof, prove_zero
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.scheduling import AffineSchedule, SchedulingVariable
 from obsynth.derive.jacobian.family import AffineFamily

@@ -14,7 +14,7 @@ import sympy as sp
 
 from obsynth.derive.algebra.factorise import cancel_common_factors, expand_terms, products_to_sums
 from obsynth.derive.algebra.linear_parts import jacobian, slope
-from obsynth.derive.algebra.zero_test import LARGEST_ROW, size, symbols, text
+from obsynth.derive.algebra.sizes import LARGEST_ROW, size, symbols, text
 from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.program import Program, evaluate
 from obsynth.derive.intervals.ranges import Ranges, bound_ranges, make_problem

@@ -15,7 +15,8 @@ import numpy as np
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
-from obsynth.derive.algebra.zero_test import expanded, is_zero, simplified, varies
+from obsynth.derive.algebra.sizes import expanded, simplified
+from obsynth.derive.algebra.zero_test import is_zero, varies
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.rigour import UNIT_ROUNDOFF, round_number, up
 from obsynth.symbolic.arrays import FloatArray

@@ -15,18 +15,9 @@ from obsynth.derive.errors import UnboundedError
 from obsynth.derive.intervals.program import evaluate
 from obsynth.derive.intervals.ranges import Status
 from obsynth.derive.jacobian.bounds import refuse_jumps
+from obsynth.derive.remainder.flow import PIECES, flow_box, flow_tubes, hull_over_pieces, plan_cuts
 from obsynth.derive.remainder.result import Remainder
-from obsynth.derive.remainder.system import (
-    PIECES,
-    System,
-    flow_box,
-    flow_tubes,
-    hull_over_pieces,
-    plan_cuts,
-    step_derivatives,
-    system,
-    time_derivatives,
-)
+from obsynth.derive.remainder.system import System, step_derivatives, system, time_derivatives
 from obsynth.derive.remainder.trees import difference_term
 from obsynth.derive.rigour import Interval, down, enclose_number, up
 from obsynth.derive.rigour.interval import add, multiply, subtract

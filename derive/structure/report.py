@@ -15,8 +15,9 @@ from obsynth.derive.structure.conditions import (
     unknown_input_condition,
     weakest_member,
 )
+from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.following import Following, follow
-from obsynth.derive.structure.isolability import excitation, fault_isolability
+from obsynth.derive.structure.isolability import fault_isolability
 from obsynth.derive.structure.zeros import (
     invariant_zeros,
     list_zeros,

@@ -28,7 +28,8 @@ from obsynth.designs.core.given import Number, PlantClass, Start, check_options
 from obsynth.designs.core.guard import MOST_CALLS, MOST_COUNTED, YOUNG, Guard, Watch, monitored
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.core.record import Precision, plain, precision_of
-from obsynth.designs.core.signals import held_in_single, of_continuous, prove_remainder
+from obsynth.designs.core.remainder import of_continuous, prove_remainder
+from obsynth.designs.core.signals import held_in_single
 from obsynth.designs.core.step import Step
 from obsynth.designs.core.stepping import extended, fill
 from obsynth.symbolic import Plant

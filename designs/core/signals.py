@@ -1,16 +1,15 @@
-"""What methods read and say of ranges, and what a remainder of the discretisation adds."""
+"""What methods read and say of ranges: sizes where there is none, the nominal w."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from obsynth.derive.jacobian.family import AffineFamily
-from obsynth.derive.remainder.enclosure import carries_remainder
 from obsynth.derive.rigour import outward
 from obsynth.designs.core.boxes import LIMITS
-from obsynth.designs.core.certificate import Claim, Guarantee
+from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.equations import covered_inputs, curved_states
 from obsynth.symbolic import Plant, Signal
 from obsynth.symbolic.arrays import FloatArray
@@ -152,45 +151,3 @@ def at_centre(plant: Plant, centre: FloatArray) -> str:
     """Say that w is at the centre in the user's names, ``w1 = 2.5, w2 = 0``."""
     pairs = zip(plant.names("w"), centre.tolist(), strict=True)
     return ", ".join(f"{w} = {c:.17g}" for w, c in pairs)
-
-
-def prove_remainder(plant: Plant) -> Iterator[Claim]:
-    """Prove that the stored ranges hold what the step leaves out of the continuous plant."""
-    if plant.remainder is None:
-        return
-    wrong = carries_remainder(plant)
-    yield Claim(
-        "remainder",
-        f"what a step of {plant.discretisation} leaves out of the continuous plant lies in the "
-        f"ranges of {_names(plant)}",
-        not wrong,
-        -np.inf if wrong else np.inf,
-        wrong or "terms of Taylor's formula over a box that no solution leaves within a step",
-    )
-
-
-def of_continuous(guarantee: Guarantee, plant: Plant) -> Guarantee:
-    """Add that a guarantee speaks of the continuous plant, and of which motions within a step."""
-    if plant.remainder is None:
-        return guarantee
-    said = (
-        f"states and readings are those of the continuous plant at the instants k Ts, Ts = "
-        f"{plant.Ts:g} s: what a step of {plant.discretisation} leaves out is a disturbance "
-        f"({_names(plant)})"
-    )
-    moving = [s.name for s in plant.f if s.rate is not None and not s.constant]
-    still = [s.name for k in ("u", "d", "w", "rho") for s in getattr(plant, k)]
-    still = [name for name in still if name not in {s.name for s in plant.remainder}]
-    still += [s.name for s in plant.f if s.name not in moving]
-    within = []
-    if still:
-        within.append(f"{', '.join(still)} held over every step")
-    if moving:
-        within.append(
-            f"{', '.join(moving)} within range and rate at all times, between the instants too"
-        )
-    return Guarantee((*guarantee.claims, said), (*guarantee.assumptions, *within))
-
-
-def _names(plant: Plant) -> str:
-    return ", ".join(s.name for s in plant.remainder or ()) or "no disturbance: nothing is left out"

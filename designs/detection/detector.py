@@ -21,7 +21,8 @@ from obsynth.designs.core.observer import (
 )
 from obsynth.designs.core.stepping import StepFunction, counter, named_step
 from obsynth.designs.detection.comparison import Detection, compare
-from obsynth.designs.detection.window import Handed, Window, bounded_faults, core_of, whole_numbers
+from obsynth.designs.detection.observed import Handed, bounded_faults, core_of, whole_numbers
+from obsynth.designs.detection.window import Window
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.shown import Shown
 from obsynth.symbolic.taking import check_kind

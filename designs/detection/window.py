@@ -1,11 +1,10 @@
-"""The mean of every fault over the last m instants, and what a detector asks of its observer.
+"""The mean of every fault over the last m instants, for any course of the fault.
 
 docs/step.md, Means of faults over a window. D of a relation is simplified as text before it is
 enclosed: what x, f and ``c'F`` have in common is gone. Every operation is rounded outwards, and
 sums are formed anew at every call from what is remembered of m-1 instants.
 """
 
-import operator
 from functools import cached_property, reduce
 from itertools import combinations
 from typing import Any
@@ -13,15 +12,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from obsynth.derive.rigour.interval import rational
 from obsynth.designs.core.boxes import Ends, Lifted, Rounding
-from obsynth.designs.core.core import Core
 from obsynth.designs.core.equations import Before, Equations
-from obsynth.designs.core.errors import DetectorError
 from obsynth.designs.core.lifted import combine
-from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS, Observer
+from obsynth.designs.core.observer import MEAN_OUTPUTS, STATUS, STEP_OUTPUTS
 from obsynth.designs.core.stepping import counter, inside, slices
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
@@ -34,69 +30,6 @@ LONGEST = 100
 _UNKNOWN = 1e9  # half width of a state of which nothing is known beforehand
 _JOINED = tuple(name for name in STATUS if name != "fault_not_valid")
 _CHUNK = 512
-
-
-class Handed(property):
-    """What a detector has of its observer, under the same name."""
-
-    def __init__(self, doc: str) -> None:
-        super().__init__(doc=doc)
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        return self if instance is None else getattr(instance.observer, self.name)
-
-
-def core_of(observer: Any) -> Core | None:
-    """Return the core of an observer's step; None for a stand-in without a certificate."""
-    contract = getattr(getattr(observer, "certificate", None), "contract", None)
-    if contract is None or contract.build_core is None:
-        return None
-    core: Core = contract.build_core(observer.certificate.design)
-    return core
-
-
-def bounded_faults(observer: Observer) -> NDArray[np.bool_]:
-    """Return which faults have an interval that anything measured can make narrower."""
-    step, n_f = observer.step, len(observer.model.f)
-    ports = [ca.SX.sym(name, step.numel_in(i)) for i, name in enumerate(step.name_in())]
-    try:
-        outputs = step.call(ports) if step.is_a("SXFunction") else step.expand().call(ports)
-    except RuntimeError:
-        # A step that has no scalar form cannot be looked into; its bounds are then taken as such.
-        return np.ones(n_f, dtype=bool)
-    layout = observer.memory_layout.items()
-    own = [part for name, part in layout if not name.startswith(("f_lower", "f_upper"))]
-    told = ca.vertcat(*ports[1:], *(ports[0][part] for part in own))
-    lower, upper = (outputs[STEP_OUTPUTS.index(key)] for key in ("f_lower", "f_upper"))
-    return np.array([_told(lower[i], told) and _told(upper[i], told) for i in range(n_f)])
-
-
-def _told(bound: ca.SX, told: ca.SX) -> bool:
-    slopes = ca.gradient(bound, told)
-    return not all(slopes[i].is_zero() for i in range(slopes.numel()))
-
-
-def whole_numbers(given: Any, names: tuple[str, ...], what: str = "persistence") -> tuple[int, ...]:
-    """Return a number of samples for each fault."""
-    values = tuple(given) if np.ndim(given) else (given,) * len(names)
-    if len(values) != len(names):
-        raise DetectorError(
-            f"{what} has {len(values)} numbers for the {len(names)} faults {', '.join(names)}.",
-            **{what: given},
-        )
-    try:
-        whole = tuple(operator.index(value) for value in values)
-    except TypeError:
-        whole = (0,)
-    if any(isinstance(value, bool) for value in values) or min(whole) < 1:
-        raise DetectorError(
-            f"{what}={given!r} is not a whole number of samples from 1 on.",
-            **{what: given},
-        )
-    return whole
 
 
 def relations(

@@ -7,7 +7,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from obsynth.derive import Split, StructureError
-from obsynth.derive.algebra.zero_test import text
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.forms.scheduling import Reading, readings
 from obsynth.derive.jacobian.slope_signs import Monotone, exact_slope, with_ranges
 from obsynth.derive.rigour import round_number, substitute

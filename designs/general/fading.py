@@ -23,9 +23,9 @@ from obsynth.derive.rigour import (
 )
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.general.model import ErrorSystem, magnitude
 from obsynth.designs.general.peak import power_sum, response, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import Fading, Modes
+from obsynth.designs.general.system import ErrorSystem, magnitude
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
 # Between the spectral radius of G and 1: the decay that is stored and proved.

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.designs.core.errors import SolverTrouble
-from obsynth.designs.general.model import error_system
 from obsynth.designs.general.peak import absolute_sums, spectral_radius
 from obsynth.designs.general.record import GeneralDesign
+from obsynth.designs.general.system import error_system
 from obsynth.symbolic.arrays import FloatArray, IntArray
 
 # Responses are followed until they have decayed so far; the bound found is proved afterwards.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.derive.rigour import Enclosure, add_up, product_up
-from obsynth.designs.general.model import Channels, ErrorSystem, magnitude
 from obsynth.designs.general.record import Rounding
+from obsynth.designs.general.system import Channels, ErrorSystem, magnitude
 from obsynth.designs.lmi.problem import he, symmetric_block
 from obsynth.symbolic.arrays import FloatArray, IntArray
 

@@ -17,14 +17,15 @@ from obsynth.designs.core.given import CONTRACTION, WEIGHTS, read_gains, read_we
 from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.core.observer import Observer
 from obsynth.designs.general import claims, model, step
-from obsynth.designs.general.claims import settle
 from obsynth.designs.general.fading import fade
 from obsynth.designs.general.gain import find_gain
-from obsynth.designs.general.model import CLASS, GeneralModel, error_system, extra_inputs, of
+from obsynth.designs.general.model import CLASS, GeneralModel, of
 from obsynth.designs.general.peak import error_sums, small_gain_solution, spectral_radius
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
+from obsynth.designs.general.rounding import settle
 from obsynth.designs.general.storage import attained_gain, with_ellipsoid, with_energy
 from obsynth.designs.general.synthesis import Units, solve_ellipsoid, solve_energy, units
+from obsynth.designs.general.system import error_system, extra_inputs
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -15,7 +15,7 @@ from scipy.linalg import matrix_balance
 from obsynth.derive.rigour import TINY, Enclosure, add_up, gamma_bound, lowered, product_up, raised
 from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import InfeasibleDesign
-from obsynth.designs.general.model import ErrorSystem, Extra, magnitude
+from obsynth.designs.general.system import ErrorSystem, Extra, magnitude
 from obsynth.symbolic.arrays import FloatArray
 
 # A quarter of a gigabyte of powers.

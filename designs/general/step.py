@@ -22,8 +22,8 @@ from obsynth.designs.core.half_widths import (
 )
 from obsynth.designs.core.stepping import clip, inside
 from obsynth.designs.general.lmis import rounding_in
-from obsynth.designs.general.model import error_system, magnitude
 from obsynth.designs.general.record import EllipsoidBound, GeneralDesign, PeakBound
+from obsynth.designs.general.system import error_system, magnitude
 from obsynth.symbolic.arrays import FloatArray
 
 

@@ -14,9 +14,9 @@ from obsynth.designs.core.certificate import Claim
 from obsynth.designs.core.errors import CertificateError, SolverTrouble
 from obsynth.designs.core.frequency import peak_gain
 from obsynth.designs.general.lmis import Loop, closed_rows, error_loop, storage_block
-from obsynth.designs.general.model import error_system
 from obsynth.designs.general.record import EllipsoidBound, EnergyBound, GeneralDesign
 from obsynth.designs.general.synthesis import Found
+from obsynth.designs.general.system import error_system
 from obsynth.designs.lmi.proof import RUMP, inverse_bounds, prove_inverse
 from obsynth.symbolic.arrays import FloatArray
 

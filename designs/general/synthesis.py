@@ -13,9 +13,9 @@ import numpy as np
 from obsynth.designs.core.errors import InfeasibleDesign, SolverTrouble
 from obsynth.designs.general.gain import GainSearch, riccati_starts, scaled
 from obsynth.designs.general.lmis import Loop, error_loop, storage_block
-from obsynth.designs.general.model import error_system
 from obsynth.designs.general.peak import spectral_radius
 from obsynth.designs.general.record import GeneralDesign
+from obsynth.designs.general.system import error_system
 from obsynth.designs.lmi.conic import Solution
 from obsynth.designs.lmi.expression import Affine, diagonal, full, scalar, symmetric, trace
 from obsynth.designs.lmi.problem import Problem

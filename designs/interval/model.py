@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import sympy as sp
 
-from obsynth.derive.algebra.zero_test import text
+from obsynth.derive.algebra.sizes import text
 from obsynth.derive.errors import DerivationError, StructureError
 from obsynth.derive.forms.quasi_lpv.form import QuasiLPV, quasi_lpv
 from obsynth.derive.forms.quasi_lpv.terms import row_names, stacked_rows

@@ -19,11 +19,12 @@ from obsynth.designs.core.signals import IEEE, about_centre, at_centre, noise_ce
 from obsynth.designs.lmi.problem import Arithmetic, lift
 from obsynth.designs.lmi.proof import RUMP, FamilyProof, prove_family, prove_inverse
 from obsynth.designs.qpv import lmis
-from obsynth.designs.qpv.equations import measured_schedule, needed
+from obsynth.designs.qpv.equations import measured_schedule
 from obsynth.designs.qpv.error_matrix import ErrorSets, psi_family
 from obsynth.designs.qpv.lmis import PolyaTerm
 from obsynth.designs.qpv.model import Derived
 from obsynth.designs.qpv.record import ASSUMED, FASTEST, NoiseBound, QPVDesign, VertexData
+from obsynth.designs.qpv.rounding import needed
 from obsynth.designs.qpv.step import SETTLED, found_again
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.written import write_text

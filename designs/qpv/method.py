@@ -17,7 +17,6 @@ from obsynth.designs.core.method import Contract, Method
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.qpv import claims, model, step
 from obsynth.designs.qpv.claims import prove_rounding
-from obsynth.designs.qpv.equations import settle
 from obsynth.designs.qpv.model import (
     CLASS,
     QPVModel,
@@ -36,6 +35,7 @@ from obsynth.designs.qpv.model import (
 )
 from obsynth.designs.qpv.printed import printed_refusal
 from obsynth.designs.qpv.record import FormOfN, Norm, QPVDesign
+from obsynth.designs.qpv.rounding import settle
 from obsynth.designs.qpv.sets import Ellipsoid
 from obsynth.designs.qpv.step import SETTLED, found_again
 from obsynth.designs.qpv.synthesis import Setting, search_eta, state_problem, synthesise

@@ -11,8 +11,9 @@ from obsynth.designs.core.core import Core, Known, Parts, Seen
 from obsynth.designs.core.given import Start, read_vector
 from obsynth.designs.core.half_widths import above
 from obsynth.designs.core.stepping import all_finite, largest_level, make_ode, slices
-from obsynth.designs.qpv.equations import Equations, build_update, of_outputs, symbols_of
+from obsynth.designs.qpv.equations import Equations, build_update, symbols_of
 from obsynth.designs.qpv.record import QPVDesign
+from obsynth.designs.qpv.rounding import of_outputs
 from obsynth.symbolic.arrays import FloatArray
 
 REAL = {"double": np.float64, "single": np.float32}

@@ -9,10 +9,10 @@ from obsynth.designs.core.certificate import Claim, Guarantee
 from obsynth.designs.core.method import Numbers
 from obsynth.designs.core.signals import prove_boxes, within
 from obsynth.designs.set_adaptive.bounds import BLOCKS
-from obsynth.designs.set_adaptive.equations import LARGEST_PRODUCT
 from obsynth.designs.set_adaptive.gain import settled_response
 from obsynth.designs.set_adaptive.model import SetModel
 from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT
 from obsynth.symbolic.arrays import FloatArray
 
 _EXACT = "exact rational arithmetic on the stored numbers"

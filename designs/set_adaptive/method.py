@@ -15,7 +15,7 @@ from obsynth.designs.core.observer import Observer
 from obsynth.designs.filter_bank.method import FilterBank
 from obsynth.designs.lmi.problem import Problem
 from obsynth.designs.set_adaptive import claims, equations, model, step
-from obsynth.designs.set_adaptive.equations import MONITORS, uniformisation
+from obsynth.designs.set_adaptive.equations import MONITORS
 from obsynth.designs.set_adaptive.gain import (
     Choice,
     Gain,
@@ -38,6 +38,7 @@ from obsynth.designs.set_adaptive.record import (
     build_frame,
     read_coordinates,
 )
+from obsynth.designs.set_adaptive.transition import uniformisation
 from obsynth.symbolic import Plant
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError

@@ -18,11 +18,9 @@ from obsynth.designs.core.given import Start
 from obsynth.designs.core.stepping import make_ode, slices
 from obsynth.designs.set_adaptive.equations import (
     MONITORS,
-    SHOWN,
     Drive,
     Memory,
     Pair,
-    apply,
     carried,
     columns,
     drives,
@@ -34,9 +32,9 @@ from obsynth.designs.set_adaptive.equations import (
     responses,
     speeds,
     theta_rates,
-    uniformisation,
 )
 from obsynth.designs.set_adaptive.record import SetDesign
+from obsynth.designs.set_adaptive.transition import SHOWN, apply, uniformisation
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.errors import ObsynthError
 

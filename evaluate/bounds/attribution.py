@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.certified import Least, least
 from obsynth.evaluate.bounds.linear import assemble
-from obsynth.evaluate.bounds.problem import Problem, enclose
+from obsynth.evaluate.bounds.problem import Problem
 from obsynth.symbolic import Record
 from obsynth.symbolic.arrays import FloatArray
 from obsynth.symbolic.shown import Shown, card

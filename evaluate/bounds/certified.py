@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from obsynth.evaluate.bounds.boxes import Boxes, enclose
 from obsynth.evaluate.bounds.linear import Linear, Solution, assemble
-from obsynth.evaluate.bounds.problem import Boxes, Problem, enclose
+from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.bounds.trajectory import Trajectory, explain
 from obsynth.symbolic.arrays import FloatArray
 

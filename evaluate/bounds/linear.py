@@ -18,7 +18,8 @@ from obsynth.derive.intervals.graph import Schedule
 from obsynth.derive.rigour import Interval
 from obsynth.derive.rigour.rationals import number
 from obsynth.designs.core.boxes import FAR
-from obsynth.evaluate.bounds.problem import Boxes, Problem
+from obsynth.evaluate.bounds.boxes import Boxes
+from obsynth.evaluate.bounds.problem import Problem
 from obsynth.evaluate.bounds.relaxation import relax
 from obsynth.evaluate.errors import BoundsError
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray

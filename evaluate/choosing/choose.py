@@ -13,7 +13,8 @@ from obsynth.derive import DerivationError, equilibrium
 from obsynth.derive.equilibrium import operating_values
 from obsynth.designs.core.method import Method
 from obsynth.evaluate.choosing.choice import Choice
-from obsynth.evaluate.choosing.tries import METHODS, ExtendedKalman, Try, attempt, in_time, named
+from obsynth.evaluate.choosing.kalman import ExtendedKalman
+from obsynth.evaluate.choosing.tries import METHODS, Try, attempt, in_time, named
 from obsynth.evaluate.data.estimate import estimate
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError

@@ -10,9 +10,10 @@ from obsynth.codegen.kernel import Call, dense
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS, Observer
 from obsynth.designs.detection.detector import FaultDetector
 from obsynth.evaluate.checked import claims_of, scheduling_columns, step_function
-from obsynth.evaluate.compiled import compiled, in_rows, march
+from obsynth.evaluate.compiled import compiled
 from obsynth.evaluate.data.estimated import Estimate
 from obsynth.evaluate.errors import SimulationError
+from obsynth.evaluate.march import in_rows, march
 from obsynth.evaluate.trace import as_told
 from obsynth.evaluate.truth import sample_time
 from obsynth.symbolic import Plant, Record, read_record

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from obsynth.designs.core.observer import STATUS
 from obsynth.designs.detection.comparison import find_voids, list_voids
 from obsynth.designs.detection.detector import SKIPPED
-from obsynth.designs.detection.window import core_of
+from obsynth.designs.detection.observed import core_of
 from obsynth.evaluate.data.allowed import allowed
 from obsynth.evaluate.data.meter import compare
 from obsynth.evaluate.data.tables import to_dataset, write_columns
+from obsynth.evaluate.domain import count_status
 from obsynth.evaluate.errors import SimulationError
-from obsynth.evaluate.trace import Trace, count_status, take
+from obsynth.evaluate.trace import Trace, take
 from obsynth.symbolic import Record
 from obsynth.symbolic.arrays import BoolArray, FloatArray, IntArray
 from obsynth.symbolic.shown import plain

@@ -11,7 +11,7 @@ from methods import METHODS, observer_of
 from obsynth.codegen.description import describe
 from obsynth.codegen.drive import Drive
 from obsynth.codegen.kernel import DOUBLE, RESULTS, Machine
-from obsynth.codegen.limits import Lanes
+from obsynth.codegen.lanes import Lanes
 from obsynth.codegen.numbers import prove_numbers
 from obsynth.codegen.tape import read_tape
 

@@ -16,7 +16,7 @@ import obsynth as ob
 from obsynth.codegen import ComparisonError, build_and_compare, find_compiler, generate_c, tape
 from obsynth.codegen.description import describe
 from obsynth.codegen.kernel import DOUBLE, SINGLE
-from obsynth.codegen.limits import Lanes, differ
+from obsynth.codegen.lanes import Lanes, differ
 from obsynth.codegen.recording import Step
 from obsynth.codegen.vectors import COUNT, record
 from obsynth.designs.core.observer import STATUS

@@ -21,7 +21,7 @@ from obsynth.designs.core.errors import CertificateError, DetectorError
 from obsynth.designs.core.files import CLAIMS
 from obsynth.designs.core.method import CONTRACTS, VERSION
 from obsynth.designs.core.observer import STATUS, STEP_OUTPUTS
-from obsynth.designs.detection.window import core_of
+from obsynth.designs.detection.observed import core_of
 
 ALONE = """
 import importlib, sys

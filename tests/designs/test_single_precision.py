@@ -19,8 +19,8 @@ from obsynth.designs.core.half_widths import HalfWidths, Running, all_around
 from obsynth.designs.core.lifted import lift
 from obsynth.designs.core.rounding import rounding_bound
 from obsynth.designs.core.stepping import clip, inside
-from obsynth.designs.general.claims import settle, shown
 from obsynth.designs.general.method import GeneralUIO
+from obsynth.designs.general.rounding import settle, shown
 from obsynth.designs.general.step import build_core, memory_sizes, stages
 from obsynth.designs.set_membership.synthesis import frame
 from obsynth.designs.set_membership.zonotope import (

@@ -13,7 +13,7 @@ from records import damaged_record
 import obsynth as ob
 from methods import observer_of
 from obsynth.designs.core.observer import STATUS
-from obsynth.evaluate import compiled
+from obsynth.evaluate import march
 from obsynth.evaluate.data import allowed, estimated
 from obsynth.evaluate.data.estimated import Estimate
 
@@ -90,7 +90,7 @@ def test_a_reading_that_is_off_refutes_the_record_and_is_named(told, monkeypatch
         assert broken.first["void"] == 64 and broken.status_shares["void"] < 0.02
         assert np.array_equal(broken.x_lower[90:], told.x_lower[90:])
         with monkeypatch.context() as patched:
-            patched.setattr(compiled, "BLOCK", 50)
+            patched.setattr(march, "BLOCK", 50)
             again = ob.estimate(told.observer, broken.record)
         assert again.blamed == (name,) and np.array_equal(again.f_lower, broken.f_lower)
     assert told.status_shares["ok"] == 180 / 181 and told.first["fault_not_valid"] == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import obsynth as ob
-from obsynth.evaluate.choosing.tries import ExtendedKalman
+from obsynth.evaluate.choosing.kalman import ExtendedKalman
 
 A = np.array([[0.9, 0.2], [-0.1, 0.7]])
 F = np.array([0.3, 1.0])

@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from obsynth.evaluate import compiled as module
-from obsynth.evaluate.compiled import in_rows, march
+from obsynth.evaluate import march as module
+from obsynth.evaluate.march import in_rows, march
 
 
 def rotation() -> ca.Function:

@@ -158,7 +158,7 @@ def test_status_bits_are_counted_and_explained(toy_run):
 
 def test_every_bit_of_the_contract_has_a_sentence():
     from obsynth.designs.core.observer import STATUS
-    from obsynth.evaluate.trace import count_status
+    from obsynth.evaluate.domain import count_status
 
     counts = count_status(np.array([sum(STATUS.values())]))
     assert [c.bit for c in counts] == [1, 2, 4, 8, 16, 32, 64]

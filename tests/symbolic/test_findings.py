@@ -9,7 +9,7 @@ from gallery import TIMES
 from records import damaged_record
 
 import obsynth as ob
-from obsynth.symbolic.record import find, quantum
+from obsynth.symbolic.findings import find, quantum
 
 LEAK = ob.records.three_tank_leak()
 K = np.arange(400.0)

@@ -12,7 +12,7 @@ from libgcc import soft_sum
 
 from obsynth.codegen.description import describe
 from obsynth.codegen.kernel import DOUBLE, RESULTS
-from obsynth.codegen.limits import Lanes
+from obsynth.codegen.lanes import Lanes
 from obsynth.codegen.vectors import as_ports, record
 
 HERE = Path(__file__).parent

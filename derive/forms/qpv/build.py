@@ -6,9 +6,11 @@ from typing import Any, Literal
 import sympy as sp
 
 from obsynth.derive.algebra.factorise import expand_terms
-from obsynth.derive.algebra.zero_test import FormProof, text
+from obsynth.derive.algebra.sizes import text
+from obsynth.derive.algebra.zero_test import FormProof
 from obsynth.derive.errors import DerivationError, StructureError
-from obsynth.derive.forms.qpv.form import QPV, Augmented, QPVLayout, augment_plant
+from obsynth.derive.forms.qpv.augment import Augmented, augment_plant
+from obsynth.derive.forms.qpv.form import QPV, QPVLayout
 from obsynth.derive.forms.scheduling import make_schedule
 from obsynth.derive.forms.varying import prove_rows
 from obsynth.symbolic.plant import Plant

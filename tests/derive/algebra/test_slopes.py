@@ -10,7 +10,7 @@ import sympy as sp
 
 import obsynth as ob
 from obsynth.derive.algebra.linear_parts import jacobian, slope
-from obsynth.derive.algebra.zero_test import simplified, size
+from obsynth.derive.algebra.sizes import simplified, size
 from obsynth.derive.jacobian.entries import jacobian_entries
 from obsynth.derive.rigour import substitute
 from obsynth.derive.rigour.walks import once, replaced

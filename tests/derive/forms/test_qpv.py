@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from obsynth.derive import DerivationError, StructureError, UnboundedError
 from obsynth.derive.forms.qpv import build as module
+from obsynth.derive.forms.qpv.augment import augment_plant
 from obsynth.derive.forms.qpv.build import prove_quadratic, qpv
-from obsynth.derive.forms.qpv.form import augment_plant
 from obsynth.symbolic import Plant, plants
 
 R = sp.Rational

@@ -8,17 +8,11 @@ import sympy as sp
 from obsynth.derive import StructureError, UnboundedError
 from obsynth.derive.errors import DerivationError
 from obsynth.derive.intervals.program import Program, evaluate
-from obsynth.derive.remainder import certify
+from obsynth.derive.remainder import certify, flow
 from obsynth.derive.remainder.certify import discretisation_remainder
+from obsynth.derive.remainder.flow import FlowError, flow_box
 from obsynth.derive.remainder.result import Remainder
-from obsynth.derive.remainder.system import (
-    FlowError,
-    flow_box,
-    flow_tubes,
-    step_derivatives,
-    system,
-    time_derivatives,
-)
+from obsynth.derive.remainder.system import step_derivatives, system, time_derivatives
 from obsynth.derive.remainder.trees import difference_term, trees
 from obsynth.symbolic import Plant, plants
 from obsynth.symbolic.discretise import step_formula
@@ -296,7 +290,7 @@ def test_solution_that_escapes_is_refused():
 def test_tubes_hold_the_exact_solution():
     dynamics = system(growing())
     start = np.array([[1.0, 1.5, 2.0]])
-    lower, upper = flow_tubes(dynamics, start, start, np.zeros((0, 3)), 0.1)
+    lower, upper = flow.flow_tubes(dynamics, start, start, np.zeros((0, 3)), 0.1)
     for s in np.linspace(0, 0.1, 11):
         exact = 1 / (1 / start - s)
         assert (lower <= exact).all()

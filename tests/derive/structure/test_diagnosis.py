@@ -11,8 +11,9 @@ from obsynth.derive import StructureError, analyse, jacobian_bounds, split
 from obsynth.derive.structure import isolability
 from obsynth.derive.structure import zeros as zeros_module
 from obsynth.derive.structure.conditions import pair_margin, unknown_input_condition, weakest_member
+from obsynth.derive.structure.excitation import excitation
 from obsynth.derive.structure.frozen import balls, precision, rank
-from obsynth.derive.structure.isolability import excitation, fault_isolability
+from obsynth.derive.structure.isolability import fault_isolability
 from obsynth.derive.structure.zeros import system_zeros, zeros_over_polytope
 from obsynth.symbolic import Plant, plants
 

@@ -5,7 +5,7 @@ import pytest
 
 import obsynth as ob
 from obsynth.designs.core.certificate import Guarantee
-from obsynth.designs.core.signals import of_continuous, prove_remainder
+from obsynth.designs.core.remainder import of_continuous, prove_remainder
 
 
 @pytest.fixture(scope="module")

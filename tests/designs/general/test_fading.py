@@ -26,9 +26,10 @@ from obsynth.designs.general.fading import (
     single,
 )
 from obsynth.designs.general.method import bound_peak
-from obsynth.designs.general.model import error_system, read
+from obsynth.designs.general.model import read
 from obsynth.designs.general.record import Modes
 from obsynth.designs.general.step import running, start_bound
+from obsynth.designs.general.system import error_system
 
 # -- how long, how soon ------------------------------------------------------------------------
 

@@ -18,9 +18,10 @@ from methods import motor
 from obsynth.designs.core.errors import InfeasibleDesign
 from obsynth.designs.general.fading import exponential, fade, prove_fading, recursion
 from obsynth.designs.general.method import GeneralUIO, bound_peak
-from obsynth.designs.general.model import error_system, extra_inputs, read
+from obsynth.designs.general.model import read
 from obsynth.designs.general.peak import error_sums, prove_peak, small_gain_solution
 from obsynth.designs.general.record import Rounding
+from obsynth.designs.general.system import error_system, extra_inputs
 
 # of one state: Z and K
 GAINS = [(0.2, 0.0), (0.45, 0.0), (0.8, 0.0), (0.0, 0.3), (0.0, 0.5), (0.3, 0.2)]

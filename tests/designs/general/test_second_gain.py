@@ -14,12 +14,13 @@ import sympy as sp
 import obsynth as ob
 from methods import PEAK_GAINS
 from obsynth.designs.core.errors import CertificateError, InfeasibleDesign
-from obsynth.designs.general.claims import needed, settle
 from obsynth.designs.general.method import GeneralUIO, bound_peak
-from obsynth.designs.general.model import error_system, extra_inputs, read
+from obsynth.designs.general.model import read
 from obsynth.designs.general.peak import error_sums, spectral_radius
 from obsynth.designs.general.record import EllipsoidBound
+from obsynth.designs.general.rounding import needed, settle
 from obsynth.designs.general.step import stages
+from obsynth.designs.general.system import error_system, extra_inputs
 from obsynth.symbolic.errors import ObsynthError
 
 

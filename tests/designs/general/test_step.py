@@ -12,9 +12,10 @@ from methods import motor, observer_of
 from obsynth.derive.forms.extended import extend
 from obsynth.derive.structure.following import follow, hidden_somewhere
 from obsynth.designs.core.equations import curved_states
-from obsynth.designs.general.claims import claims, needed, settle
+from obsynth.designs.general.claims import claims
 from obsynth.designs.general.method import GeneralUIO, bound_peak
 from obsynth.designs.general.model import read
+from obsynth.designs.general.rounding import needed, settle
 from obsynth.designs.general.step import stages, steady
 from obsynth.symbolic.errors import ObsynthError
 

@@ -21,10 +21,10 @@ from obsynth.designs.core.errors import CertificateError, InfeasibleDesign, Solv
 from obsynth.designs.general.claims import claims
 from obsynth.designs.general.lmis import rounding_in
 from obsynth.designs.general.method import GeneralUIO
-from obsynth.designs.general.model import error_system
 from obsynth.designs.general.record import Rounding
 from obsynth.designs.general.step import running, stages, start_bound
 from obsynth.designs.general.storage import attained_gain, prove_storage
+from obsynth.designs.general.system import error_system
 
 ELLIPSOID, L2 = GeneralUIO(bounds="ellipsoid"), GeneralUIO(bounds="l2")
 R = sp.Rational

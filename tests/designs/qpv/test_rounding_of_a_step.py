@@ -13,8 +13,9 @@ from methods import METHODS
 from obsynth.designs.core.core import Seen
 from obsynth.designs.qpv import claims as proofs
 from obsynth.designs.qpv.claims import guarantee
-from obsynth.designs.qpv.equations import build_update, needed, of_step, settle
+from obsynth.designs.qpv.equations import build_update
 from obsynth.designs.qpv.record import ASSUMED
+from obsynth.designs.qpv.rounding import needed, of_step, settle
 from obsynth.designs.qpv.step import build_core
 
 ENTRY = METHODS["qpv_observer"]

@@ -9,8 +9,8 @@ from scipy.linalg import expm
 
 import obsynth as ob
 from obsynth.designs.set_adaptive import step as step_module
-from obsynth.designs.set_adaptive.equations import LARGEST_PRODUCT, apply, uniformisation
 from obsynth.designs.set_adaptive.method import SetAdaptiveObserver
+from obsynth.designs.set_adaptive.transition import LARGEST_PRODUCT, apply, uniformisation
 
 BOUND = 4.5e-3
 LEVELS = np.array([(0.44, 0.56), (0.04, 0.16), (0.24, 0.36)])

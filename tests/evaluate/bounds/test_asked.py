@@ -11,8 +11,9 @@ from witness import happened, record_of
 import obsynth as ob
 from obsynth.evaluate.bounds import certified
 from obsynth.evaluate.bounds.attribution import attribute
+from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.linear import Linear, assemble
-from obsynth.evaluate.bounds.problem import enclose, pose
+from obsynth.evaluate.bounds.problem import pose
 from obsynth.evaluate.bounds.trajectory import measured
 
 

@@ -13,9 +13,10 @@ import pytest
 from exactly import BITS
 from witness import PLANTS, exact_of, happened
 
+from obsynth.evaluate.bounds.boxes import enclose
 from obsynth.evaluate.bounds.certified import least, narrowed
 from obsynth.evaluate.bounds.least_bounds import LeastBounds
-from obsynth.evaluate.bounds.problem import enclose, pose
+from obsynth.evaluate.bounds.problem import pose
 
 
 def asked(truth):
