@@ -1,10 +1,12 @@
 """How wide the sets of a step are, at most: contractor and core followed call by call.
 
-``s+ = decay s + offset``, all nonnegative, and half widths ``reach s + add``. The map is monotone:
-from an s that it maps below itself nothing that follows exceeds what that s says.
+A core (`Running`): ``s+ = decay s + offset``, all nonnegative, and half widths ``reach s + add``.
+The map is monotone: from an s that it maps below itself nothing that follows exceeds what that s
+says.
 
-The map of one call, in the order of the step, is monotone: from an envelope that it maps into
-itself it falls with every call, so what p calls make of it holds for every copy that is as old.
+The contractor (`HalfWidths`): the map of one call, in the order of the step, is monotone: from an
+envelope that it maps into itself it falls with every call, so what p calls make of it holds for
+every copy that is as old.
 """
 
 from collections.abc import Sequence
@@ -31,7 +33,8 @@ SETTLED = 0.01
 """Half widths have settled where they stay within this share of their limits."""
 MOST_CALLS = 100_000
 MOST_PASSES = 200
-_UP = 1.0 + 2.0**-30
+# Of half widths that slopes and strips give: far above what their formulas round.
+_WIDER = 1.0 + 2.0**-30
 # Of ranges: above what the few roundings of an end take.
 _ENDS = {"double": 2.0**-30, "single": 2.0**-18}
 # How often an end steps outwards by what rounding an operation takes, at most.
@@ -244,7 +247,7 @@ class HalfWidths:
         fixed = 0.5 * np.diff(equations.box[held.size :], axis=1)[:, 0]
         x = self.ranges[:n].copy()
         for i in np.flatnonzero(equations.usable).tolist() if "image" in cuts else ():
-            x[i] = min(x[i], _times(slopes[i], np.append(held, fixed)) * _UP + self.lost[0][i])
+            x[i] = min(x[i], _times(slopes[i], np.append(held, fixed)) * _WIDER + self.lost[0][i])
         x = np.minimum(self._strips(x), core[:n])
         late = held[n:].copy()
         for j, i in equations.invertible if "inversion" in cuts else ():
@@ -252,7 +255,7 @@ class HalfWidths:
             halves = np.concatenate([held[:n], late, fixed])
             told = x[i] + _times(rest, halves) + self.lost[0][i]
             told = self._divided(i, j, told, halves)
-            late[j] = min(late[j], told * _UP)
+            late[j] = min(late[j], told * _WIDER)
         late = np.minimum(late, core[n:]) if self.delay else late
         now = np.minimum(
             self.ranges[n:], late + self.contractor.rates if "rates" in cuts else np.inf
@@ -288,7 +291,7 @@ class HalfWidths:
             for j in np.flatnonzero(strip.row).tolist():
                 others = np.where(np.arange(len(x)) == j, 0.0, np.abs(strip.row))
                 told = 0.5 * (strip.high - strip.low) + _times(others, x) + lost
-                x[j] = min(x[j], told / abs(strip.row[j]) * _UP)
+                x[j] = min(x[j], told / abs(strip.row[j]) * _WIDER)
         return x
 
 
